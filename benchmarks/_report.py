@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -52,6 +53,7 @@ class Results:
 
 def markdown(results: Results) -> str:
     lines = ["# Figures", "", "Made by `python -m benchmarks`; do not edit.", ""]
+    lines.append(f"- written: {datetime.date.today()}")
     lines += [f"- {what}: {told}" for what, told in results.machine.items()]
     lines += [f"- not installed, and left out: {name} ({how})" for name, how in results.missing.items()]
     lines += ["", _PREFACE, ""]

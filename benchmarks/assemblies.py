@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxkane as jk
-from jaxkane._kane.rhs import _vector_field, vector_field
+from jaxkane._kane.right_hand_side import _vector_field, vector_field
 from jaxkane.bicycles import Bicycle, LateralSlip, LeaningRider, SteeringMotor, Tyre, separate_rider
 
 from ._bicycle import agree

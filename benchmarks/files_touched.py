@@ -80,7 +80,7 @@ def report(name: str) -> None:
     import jaxkane
 
     for module in pkgutil.walk_packages(jaxkane.__path__, "jaxkane."):
-        if not module.name.endswith(("__main__", "probe_worker")):  # these are programs
+        if not module.name.endswith("__main__"):  # these are programs
             importlib.import_module(module.name)
     files = files_of(prepared(name), Path(jaxkane.__file__).parent)
     print(f"{name}: {len(files)} files (at most {AT_MOST[name]})")

@@ -20,11 +20,23 @@ import numpy as np
 
 import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.fit import Gain, LeastSquares, Problem, Trial, cross_validate, fit_bicycle, minimize, multi_start, report
+from jaxkane.fit import (
+    Gain,
+    LeastSquares,
+    Offset,
+    Problem,
+    Trial,
+    cross_validate,
+    fit_bicycle,
+    minimize,
+    multi_start,
+    report,
+)
 
 jax.config.update("jax_enable_x64", True)
 
 NOISE = {"roll_rate": 0.01, "steer": 0.003, "steer_rate": 0.02}  # [rad/s], [rad], [rad/s]
+OFFSETS = [Offset(channel, each="trial") for channel in NOISE]
 OFFSET = {"roll_rate": 0.02, "steer": -0.01, "steer_rate": 0.03}
 UNKNOWN = ("roll", "steer", "roll_rate", "steer_rate", "rear_wheel_rate")
 
@@ -61,14 +73,14 @@ def noisy(t, channels, torque, rng, name, speed, offset=OFFSET):
 def unstable():
     truth, names = WhippleBicycle.benchmark(), ("IBxx", "zB", "c")
     trial = noisy(*ride(truth, 3.0, 10.0, 1), np.random.default_rng(0), "3 m/s", 3.0)
-    options = {"unknown": UNKNOWN, "sensor_bias": tuple(NOISE), "zero_order_hold": ("steer_torque",)}
+    options = {"unknown": UNKNOWN, "zero_order_hold": ("steer_torque",)}
     tight = {"roll": 1e-4, "steer": 1e-4, "roll_rate": 1e-3, "steer_rate": 1e-3, "rear_wheel_rate": 1e-4}
     for what, more in {
         "windows of 1 s with free starts": {"window": 1.0},
         "windows of 1 s, chained": {"window": 1.0, "defect_std": tight},
         "a single shoot": {},
     }.items():
-        problem = Problem.of(truth, trial, names, **more, **options)
+        problem = Problem.of(truth, trial, (*names, *OFFSETS), **more, **options)
         began = time.perf_counter()
         try:
             found = multi_start(problem, 10, spread=0.3, seed=2)
@@ -90,13 +102,13 @@ def coverage(repetitions):
     for i, name in enumerate(EIGHT):
         value = getattr(truth, name) * (1.05 if i % 2 else 0.95)
         guess = eqx.tree_at(lambda b, name=name: getattr(b, name), guess, value)
-    options = {"unknown": UNKNOWN, "sensor_bias": tuple(NOISE), "zero_order_hold": ("steer_torque",)}
+    options = {"unknown": UNKNOWN, "zero_order_hold": ("steer_torque",)}
     first = None
     hits, scores, began = np.zeros(len(EIGHT), int), [], time.perf_counter()
     for k in range(repetitions):
         rng = np.random.default_rng(100 + k)
         trials = [noisy(*r, rng, f"{speed:g} m/s", speed) for r, speed in rides]
-        problem = Problem.of(guess, trials, EIGHT, window=1.0, **options)
+        problem = Problem.of(guess, trials, (*EIGHT, *OFFSETS), window=1.0, **options)
         # What matters is where it ends: after the first time it starts there.
         result = first = minimize(problem, LeastSquares(), start=first.point if first else None)
         assert result.status == "converged", result
@@ -118,15 +130,12 @@ def coverage(repetitions):
 def measured():
     recording = jk.data.steer_by_wire()
     rides, bicycle = recording.trials, WhippleBicycle.from_parameters(recording.parameters)
-    options = {
-        "input_bias": ("roll_torque", "steer_torque"),
-        "zero_order_hold": ("steer_torque",),
-        "optimizer": LeastSquares(),
-    }
+    options = {"zero_order_hold": ("steer_torque",), "optimizer": LeastSquares()}
+    offsets = [Offset(name, each="trial") for name in ("roll_torque", "steer_torque")]
     four = (Gain("steer_torque"), "steer_damping", "IHzz", "c")
     for free in (("steer_damping",), four, four, (*four, "IBxx")):
         began = time.perf_counter()
-        result = fit_bicycle(rides, bicycle, free, **options)
+        result = fit_bicycle(rides, bicycle, (*free, *offsets), **options)
         print(f"\n{time.perf_counter() - began:.1f} s\n{result}")
         if free == ("steer_damping",):
             print(cross_validate(result))

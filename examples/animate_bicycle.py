@@ -1,8 +1,8 @@
-"""What does a bicycle do that is pushed sideways at a speed at which it rights itself?
+"""How does a bicycle move after a sideways push at a stable speed?
 
-The benchmark bicycle of Meijaard et al. (2007) rides for ten seconds in the middle of its own stable range of speeds,
-nobody touches it, and it starts with a roll rate, as after a sideways push. The ride becomes a page that anyone can
-open, turn and play, and a GIF.
+The benchmark bicycle of Meijaard et al. (2007) rides without a rider for ten seconds, in the middle of its stable speed
+range. It starts with a roll rate, as after a sideways push. The simulation is saved as an interactive HTML page and as
+a GIF.
 
     variable   meaning                                                   unit
     speed      in the middle between the weave and the capsize speed     m/s
@@ -10,9 +10,9 @@ open, turn and play, and a GIF.
     ride       roll, steer, yaw, place, ... over time                    rad, m
 
 Run:      python examples/animate_bicycle.py [--out FOLDER]
-Appears:  a few lines on the ride, the time to build the page, and the sizes of ride.html and ride.gif; and
-          eigenvalues.png, which says where the bicycle rights itself. In the page: drag to turn, wheel to zoom, space
-          to stop; "?" lists the keys.
+Appears:  a summary of the simulation, the time to build the page, and the sizes of ride.html and ride.gif; and
+          eigenvalues.png, which shows the stable speed range. In the page, drag to rotate, use the mouse wheel to
+          zoom, and press space to pause; "?" lists the keys.
 Takes:    about half a minute, most of it compilation.
 """
 

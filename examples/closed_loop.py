@@ -1,7 +1,7 @@
-"""What does a closed loop carry, and does it stay closed for a minute?
+"""Which forces act in a closed loop, and does it remain closed for a minute?
 
-A crank-rocker: four bars in a loop, one of them the ground. A weight hangs on the coupler. The loop is opened at the
-rocker's pin, described as a chain, and closed again by two configuration constraints; nothing else is said of it.
+The mechanism is a crank-rocker: four bars in a loop, one of which is the ground. A weight hangs on the coupler. The
+loop is opened at the pin of the rocker, described as a chain, and closed by two configuration constraints.
 
     variable                    meaning                                            unit
     crank, coupler, rocker      angle of each bar from the one before it           rad
@@ -11,7 +11,7 @@ rocker's pin, described as a chain, and closed again by two configuration constr
     torque                      on the crank                                       N m
 
 Run:      python examples/closed_loop.py [--out FOLDER]
-Appears:  which speeds are best made dependent; the audit of one minute with and without projection; and
+Appears:  the best choice of dependent speeds; the audit of one minute with and without projection; and
           closed_loop.png: the coupler's path, the forces in both ground pins, the gap at the pin over a minute.
 Takes:    half a minute.
 """

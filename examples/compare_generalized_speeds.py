@@ -1,8 +1,8 @@
-"""Does it matter which generalized speeds one chooses?
+"""What is the effect of the choice of generalized speeds?
 
-The same spinning top on a ball joint, twice: with the angular velocities along its own axes as speeds and Euler
-parameters as coordinates (Exercise 5.6, `jaxkane.catalog.SpinningTop`), and with 3-1-3 angles and their rates. The
-motion is the same; the equations, their cost and the places where they fail are not. Examples 3 and 4 of the book, one
+A spinning top on a ball joint is described twice: with body-fixed angular velocities as speeds and Euler parameters as
+coordinates (Exercise 5.6, `jaxkane.catalog.SpinningTop`), and with 3-1-3 angles and their rates. The motion is the
+same, but the equations, their cost and their singularities differ. Examples 3 and 4 of the book, which describe one
 mechanism with two sets of speeds, are compared first.
 
     variable                     meaning                                             unit

@@ -1,7 +1,7 @@
-"""How is a mechanism of one's own described, and what must its bearing carry?
+"""How do you describe a new mechanism, and which forces act in its bearing?
 
-A rotary pendulum (Furuta's): a motor turns a level arm, at whose end a rod swings in the plane across the arm. The
-description is the class `RotaryPendulum`, some thirty lines; all else follows from it.
+The mechanism is a rotary pendulum (Furuta pendulum): a motor turns a horizontal arm. At its end, a rod swings in the
+plane normal to the arm. The class `RotaryPendulum` has about thirty lines.
 
     variable             meaning                                             unit
     arm, rod             angle of the arm about the vertical; of the rod     rad

@@ -1,12 +1,12 @@
-"""Which small changes of geometry and mass let a bicycle right itself over the widest range of speeds?
+"""Which small changes of geometry and mass maximize the stable speed range of a bicycle?
 
-The benchmark bicycle of Meijaard et al. (2007) is stable by itself from its weave speed to its capsize speed, 4.29 to
-6.02 m/s. `critical_speeds` gives both from the nonlinear model, with their gradients. Small steps along the gradient,
-kept within bounds and halved where they do not help, make
+The benchmark bicycle of Meijaard et al. (2007) is stable from its weave speed to its capsize speed, 4.29 to 6.02 m/s.
+`critical_speeds` computes both from the nonlinear model, with their gradients. Projected gradient ascent within bounds
+maximizes
 
     capsize speed - weave speed
 
-as large as it goes. The rider is not considered.
+Steps that do not increase it are halved. A rider is not considered.
 
     variable    meaning                                             unit      bounds
     w           wheelbase                                           m         0.95 to 1.10

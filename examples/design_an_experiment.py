@@ -1,16 +1,16 @@
-"""Which ride would tell a bicycle's parameters apart?
+"""Which experiment distinguishes two parameters of a bicycle?
 
-The roll inertia of the rear frame with its rider and the height of their mass centre are hard to tell apart: both slow
-the roll. Before anyone rides, the benchmark bicycle shows at which speed and with which sensors a ride of two
-seconds would tell the two, for a torque at the handlebar that is made of five sines. Then the sines' amplitudes and
-phases are moved by gradient descent until the ride tells most (D-optimal: the smallest determinant of the covariance),
-for the same root mean square of the torque and with limits on roll rate and steer.
+The roll inertia of the rear frame with its rider and the height of their mass centre are difficult to distinguish,
+because both slow down the roll. The example first computes the standard errors for several speeds and sensors. The
+experiment takes two seconds, and the torque at the handlebar is a sum of five sines. Gradient descent then optimizes
+the amplitudes and phases of the sines (D-optimality: the smallest determinant of the covariance), for the same root
+mean square of the torque and with limits on roll rate and steer.
 
     variable        meaning                                                        unit
     IBxx, zB, IBzz  roll and yaw inertia of the rear frame, height (down)          kg m^2, m, kg m^2
-    steer_torque    the input that is designed, root mean square 1                 N m
-    roll_rate, steer, steer_rate, yaw_rate      what may be measured               rad, rad/s
-    unknown too     the ride's start, an offset of each sensor                     rad, rad/s
+    steer_torque    the designed input, with a root mean square of 1               N m
+    roll_rate, steer, steer_rate, yaw_rate      possible measurements              rad, rad/s
+    also unknown    the initial state, an offset of each sensor                    rad, rad/s
 
 Run:      python examples/design_an_experiment.py [--out FOLDER]
 Appears:  standard errors by speed and sensors, then before and after the design, and design_an_experiment.png.
@@ -26,7 +26,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.fit import Problem, Simulation, Trial, design, identifiability
+from jaxkane.fit import Offset, Problem, Simulation, Trial, design, identifiability
 
 jax.config.update("jax_enable_x64", True)
 
@@ -42,7 +42,8 @@ SENSORS = {
     "roll rate, steer": ("roll_rate", "steer"),
     "all, and yaw rate": tuple(SIGMA),
 }
-OPTIONS = {"unknown": ("roll", "steer", "roll_rate", "steer_rate"), "sensor_bias": tuple(SIGMA)}
+UNKNOWN = ("roll", "steer", "roll_rate", "steer_rate")
+OFFSETS = {channel: Offset(channel, each="trial") for channel in SIGMA}
 
 
 def torque(coefficients, t):
@@ -57,6 +58,7 @@ def errors_by_speed_and_sensors(bicycle, coefficients):
     """Standard error of each parameter, as a part of its value: (speeds, sensors, names)."""
     deviations = np.zeros((len(SPEEDS), len(SENSORS), len(NAMES)))
     samples = {name: np.asarray(x) for name, x in torque(coefficients, jnp.asarray(TIMES)).items()}
+    free, options = (*NAMES, *OFFSETS.values()), {"unknown": UNKNOWN, "simulation": Simulation(step=0.02)}
     for i, speed in enumerate(SPEEDS):
         for j, sensors in enumerate(SENSORS.values()):
             # A sensor that is not there is one that says nothing; so every case runs the same program.
@@ -64,10 +66,10 @@ def errors_by_speed_and_sensors(bicycle, coefficients):
             rest = {c: np.zeros(TIMES.shape) for c in SIGMA}
             wheel = {"rear_wheel_rate": -speed / float(bicycle.rR)}
             plan = Trial(TIMES, rest, samples, sigma=sigma, initial=wheel)
-            problem = Problem.of(bicycle, plan, NAMES, simulation=Simulation(step=0.02), **OPTIONS)
+            problem = Problem.of(bicycle, plan, free, **options)
             ride = problem.trajectories(problem.start)[0]
             plan = Trial(TIMES, {c: np.asarray(ride[c]) for c in SIGMA}, samples, sigma=sigma, initial=wheel)
-            seen = identifiability(Problem.of(bicycle, plan, NAMES, simulation=Simulation(step=0.02), **OPTIONS))
+            seen = identifiability(Problem.of(bicycle, plan, free, **options))
             C = np.linalg.pinv(seen.information)
             deviations[i, j] = np.sqrt(C.diagonal())
     return deviations
@@ -92,12 +94,11 @@ def main():
         TIMES,
         torque,
         start,
-        NAMES,
+        (*NAMES, OFFSETS["roll_rate"], OFFSETS["steer"]),
         sigma={c: SIGMA[c] for c in ("roll_rate", "steer")},
         initial={"rear_wheel_rate": -speed / float(bicycle.rR)},
         limits={"roll_rate": 1.5, "steer": 0.6},
-        unknown=OPTIONS["unknown"],
-        sensor_bias=("roll_rate", "steer"),
+        unknown=UNKNOWN,
         steps=30,
         progress=True,
     )

@@ -1,9 +1,9 @@
-"""What do the systems of the catalogue look like, and how do they move when left to themselves?
+"""What do the systems of the catalogue look like, and how do they move without inputs?
 
 Every entry of `jaxkane.catalog.CATALOG` is simulated from its own state, without inputs, and sketched as a stick
-figure. The sketch is animated, and drawn as a stroboscopic photograph: the figure at a few instants, the last one
-brightest, over the traces of mass centres and of a few ends. Planar systems are seen from the front, others obliquely
-from above.
+figure. The sketch is animated. It is also drawn as a stroboscopic photograph: the figure at a few instants, the last
+one brightest, and the traces of mass centres and of a few ends. Planar systems are seen from the front, others
+obliquely from above.
 
     variable            meaning                                                               unit
     seconds             how long the shutter is open, for each system its own                 s

@@ -1,21 +1,21 @@
-"""How far does a bicycle lean, when only gyroscopes and the steering angle are measured?
+"""What is the roll angle of a bicycle if only gyroscopes and the steering angle are measured?
 
-A rider on a treadmill is pulled sideways five times (J. K. Moore, UC Davis, 2012). A Kalman filter follows the ride,
-one sample after the other: the Whipple bicycle, disturbed by torques that nobody measures, with two gyroscopes whose
-offsets wander. The roll angle was measured too; the filter never sees it. The filter is then written as C, compiled by
-the compiler of this machine, and runs over the same samples.
+A rider on a treadmill is pulled sideways five times (J. K. Moore, UC Davis, 2012). A Kalman filter estimates the motion
+sample by sample. Its model is the Whipple bicycle with unmeasured torques and two gyroscopes whose offsets drift. The
+roll angle was measured too, but the filter does not use it. The filter is then exported to C, compiled, and run with
+the same samples.
 
     variable                 meaning                                                       unit
-    roll, steer              angles; roll is what is asked for                             rad
-    gyro_roll, gyro_steer    what the gyroscopes read: rates and an offset                 rad/s
-    roll_offset, steer_offset  the offsets, estimated too                                  rad/s
+    roll, steer              angles; roll is estimated                                     rad
+    gyro_roll, gyro_steer    readings of the gyroscopes: rates and an offset               rad/s
+    roll_offset, steer_offset  the offsets, also estimated                                 rad/s
     rear_wheel_rate          from the treadmill's speed                                    rad/s
 
 Run:      python examples/estimate_roll.py [--out FOLDER]
-          The ride is shipped with the library (`jaxkane.data.davis_rider`).
+          The data are included in the library (`jaxkane.data.davis_rider`).
 Appears:  estimate_roll.png: the roll angle, measured and estimated, and the offsets; roll_filter.h and its test, the
-          filter in C; on the screen the errors of the filter and of two ways without a model, and the time of a step.
-Takes:    some ten seconds, most of them compilation.
+          filter in C; printed are the errors of the filter and of two methods without a model, and the time of a step.
+Takes:    about ten seconds, most of it compilation.
 """
 
 import argparse

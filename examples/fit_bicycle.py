@@ -1,8 +1,8 @@
-"""Which bicycle was it? Parameters of a nonlinear bicycle from noisy rides, by gradient descent.
+"""Which parameters does a nonlinear bicycle have? Estimation from noisy data by gradient descent.
 
-Three rides of the benchmark bicycle are simulated at 4.4, 5.2 and 6 m/s. Known torques push steer and roll; roll, steer
-and their rates are measured with noise, 100 times a second. Four parameters start 20 % off and are found again. So
-that the initial guess does not fall over, the rides are cut into windows of 2.5 s, each with its own unknown start.
+The benchmark bicycle is simulated at 4.4, 5.2 and 6 m/s. Known torques excite steer and roll. Roll, steer and their
+rates are measured with noise at 100 Hz. The initial guesses of four parameters are wrong by 20 %. With these guesses
+the bicycle would fall over, so the trials are cut into windows of 2.5 s with unknown initial states.
 
     variable    meaning                                                              unit
     IBxx        roll inertia of the rear frame with its rider                        kg m^2
@@ -13,11 +13,11 @@ that the initial guess does not fall over, the rides are cut into windows of 2.5
     steer_torque, roll_torque             known                                      N m
 
 Run:      python examples/fit_bicycle.py [--out FOLDER]
-Appears:  a table (start, estimate, standard error, truth) and fit_bicycle.png: measurements and fits, the way down, and
-          how far every estimate is from the truth, with its uncertainty.
+Appears:  a table (initial guess, estimate, standard error, true value) and fit_bicycle.png: measurements and fits, the
+          cost of each step, and the error of each estimate with its uncertainty.
 Takes:    under a minute, half of it compilation.
 
-Measured rides: `identify_measured_bicycle.py`.
+For measured data, see `identify_measured_bicycle.py`.
 """
 
 import argparse

@@ -1,21 +1,22 @@
-"""What do measured rides tell about a bicycle, and what can they not tell?
+"""Which parameters of a bicycle do measured trials determine?
 
-A riderless steer-by-wire bicycle of TU Delft is pushed on a treadmill and left to its controller: 31 rides of a second
-at 2 to 5 m/s. The nonlinear Whipple bicycle is fitted four times to those at 2 to 4 m/s: its steer damping alone; then
-the torque's gain, the inertia of the fork and the trail with it; then the rear frame's roll inertia too; and at last
-the fork's whole inertia as a body that can be. Each fit then predicts the rides at 5 m/s, which it has not seen. The
-sum of squares falls with each number that is freed; whether the prediction gets better is another question.
+A riderless steer-by-wire bicycle of TU Delft with a controller is pushed on a treadmill: 31 trials of one second at 2
+to 5 m/s. The nonlinear Whipple bicycle is fitted four times to the trials at 2 to 4 m/s. The free parameters are the
+steer damping alone; additionally the gain of the torque, the inertia of the fork and the trail; additionally the roll
+inertia of the rear frame; and finally the whole inertia of the fork, kept physically consistent. Each fit predicts the
+held-out trials at 5 m/s. The sum of squares decreases with each additional parameter, but the prediction need not
+improve.
 
     variable         meaning                                                          unit
     steer_damping    viscous torque between fork and frame                            N m s/rad
-    gain             of the steer motor's torque: what acts over what was commanded   1
+    gain             of the torque of the steer motor: actual over commanded torque   1
     IHzz, c, IBxx    fork's inertia about its axis, trail, rear frame's roll inertia  kg m^2, m, kg m^2
-    unknown too      each ride's start, an offset of its roll torque and steer torque rad, rad/s, N m
+    also unknown     initial states, offsets of roll torque and steer torque          rad, rad/s, N m
 
 Run:      python examples/identify_measured_bicycle.py [--out FOLDER]
-          The rides are shipped with the library (`jaxkane.data.steer_by_wire`).
-Appears:  a table for each fit with what is suspicious about it; the fits beside each other, with the rides held out;
-          and identify_measured_bicycle.html: the full report of the first, with trials left out.
+          The data are included in the library (`jaxkane.data.steer_by_wire`).
+Appears:  a table and warnings for each fit; a comparison of the fits, with the held-out trials; and
+          identify_measured_bicycle.html: the full report of the first fit, with cross-validation.
 Takes:    about a minute, half of it compilation.
 """
 
@@ -27,6 +28,7 @@ from jaxkane.catalog import WhippleBicycle
 from jaxkane.fit import (
     Gain,
     LeastSquares,
+    Offset,
     bicycle_rides,
     compare,
     cross_validate,
@@ -52,14 +54,14 @@ FREE = {
 def check(comparison):
     """The errors and estimates that these rides give. No test repeats these fits."""
     fits = first, four, five, _ = list(comparison.fits.values())
-    assert all(fit.status == "converged" for fit in fits)
+    assert all(fit.status in ("converged", "bound") for fit in fits)
     assert first.cost < 3000 < 15000 < first.history[0]
     assert abs(first.estimates["steer_damping"] - 0.535) < 0.01
-    assert any("not noise" in note for note in first.notes)
+    assert any("not white noise" in note for note in first.notes)
     # What no fork can be is said, and what no such bicycle has.
-    assert any("Not a possible body" in note and "fork" in note for note in four.notes)
-    assert any(note.startswith("c went to") and "implausible" in note for note in four.notes)
-    assert any("Not a possible body" in note and "rear frame" in note for note in five.notes)
+    assert any("not physically possible" in note and "fork" in note for note in four.notes)
+    assert any(note.startswith("c is ") and "compensate" in note for note in four.notes)
+    assert any("not physically possible" in note and "rear frame" in note for note in five.notes)
     # All fit better than the damping alone; two predict worse.
     assert all(fit.cost < first.cost for fit in fits[1:])
     damping, *richer = (fit.cost for fit in comparison.held_out.values())
@@ -76,10 +78,11 @@ def main():
     rides = [ride for ride in recording.trials if ride.initial["speed"][0] != HELD_OUT]
     unseen = [ride for ride in recording.trials if ride.initial["speed"][0] == HELD_OUT]
     # The steering torque is a command, kept until the next.
-    options = {"input_bias": ("roll_torque", "steer_torque"), "zero_order_hold": ("steer_torque",)}
+    options = {"optimizer": LeastSquares(), "zero_order_hold": ("steer_torque",)}
+    offsets = [Offset(name, each="trial") for name in ("roll_torque", "steer_torque")]
     fits = {}
     for what, free in FREE.items():
-        fits[what] = fit_bicycle(rides, bicycle, free, optimizer=LeastSquares(), **options)
+        fits[what] = fit_bicycle(rides, bicycle, (*free, *offsets), **options)
         print(f"\n{what[0].upper()}{what[1:]}\n{fits[what]}")
     comparison = compare(fits, held_out=bicycle_rides(unseen, bicycle))
     print(f"\n{comparison}")

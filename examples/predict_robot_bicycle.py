@@ -1,20 +1,20 @@
-"""What will a bicycle do next? A model with process noise, fitted to three rides and tried on a fourth.
+"""How well does a model with process noise predict a bicycle? It is fitted to three trials and tested with a fourth.
 
-A riderless bicycle balances by a motor on its steering axis (D. L. Peterson, UC Davis, 2013). Seals, the headset and
-the floor disturb it, and no model says how. A fit without process noise takes that for an error of the sensors. Here
-white noise disturbs roll and steer, and a Kalman filter predicts each sample from those before it. The likelihood of
-these predictions estimates the damping, how strong the noise is, and how well the sensors measure. The fourth ride is
-not fitted. All samples of the rides are used, at 100 Hz.
+A riderless bicycle balances with a motor on its steering axis (D. L. Peterson, UC Davis, 2013). Seals, the headset and
+the floor disturb it in ways that are not modelled. A fit without process noise would treat these disturbances as sensor
+errors. In this example, white noise acts on roll and steer, and a Kalman filter predicts each sample from the previous
+ones. The damping, the intensity of the noise and the errors of the sensors maximize the likelihood of these
+predictions. The fourth trial is held out. All samples are used, at 100 Hz.
 
     variable             meaning                                        unit
     steer, roll_rate     measured: an encoder and a gyroscope           rad, rad/s
-    roll                 never measured                                 rad
+    roll                 not measured                                   rad
     steer_torque         command to the motor                           N m
 
 Run:      python examples/predict_robot_bicycle.py [--out FOLDER]
-          The rides are shipped with the library (`jaxkane.data.robot_bicycle`).
-Appears:  predict_robot_bicycle.png: steer predicted 0.1 s ahead, its errors, and the roll angle with its band; on the
-          screen the fit, whether the innovations are white, and the errors of predictions beside those of two simple
+          The data are included in the library (`jaxkane.data.robot_bicycle`).
+Appears:  predict_robot_bicycle.png: steer predicted 0.1 s ahead, its errors, and the roll angle with its band; printed
+          are the fit, whether the innovations are white, and the prediction errors of the model and of two simple
           rules.
 Takes:    a minute.
 """
@@ -27,13 +27,20 @@ import numpy as np
 
 import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.fit import LeastSquares, NoiseScale, SpectralDensity, Trial, bicycle_rides, fit_bicycle, smoothed, validate
+from jaxkane.fit import LeastSquares, NoiseScale, Offset, SpectralDensity, Trial, bicycle_rides, fit_bicycle, validate
 
 jk.configure()
 
 SIGMA = {"steer": 0.0003, "roll_rate": 0.003}  # [rad, rad/s]: at rest; of steer a guess, since its factor is estimated
 START = {"roll": 0.1, "steer": 0.1, "roll_rate": 0.3, "steer_rate": 1.0}  # standard deviations
-FREE = ("steer_damping", SpectralDensity("roll_rate"), SpectralDensity("steer_rate"), NoiseScale("steer"))
+FREE = (
+    "steer_damping",
+    SpectralDensity("roll_rate"),
+    SpectralDensity("steer_rate"),
+    NoiseScale("steer"),
+    Offset("steer", each="trial", prior=(0.0, 0.02)),
+    Offset("steer_torque", each="trial", prior=(0.0, 0.5)),
+)
 
 
 def at_100_hz(run, every=1):
@@ -89,8 +96,6 @@ def main(folder: Path) -> None:
         FREE,
         noise={"roll_rate": 0.01, "steer_rate": 0.1},
         unknown=START,
-        sensor_bias={"steer": 0.02},
-        input_bias={"steer_torque": 0.5},
         zero_order_hold=("steer_torque",),
         optimizer=LeastSquares(rtol=1e-6),
     )
@@ -109,7 +114,7 @@ def main(folder: Path) -> None:
         for name, numbers in errors_of_predictions(prediction, unseen, every).items():
             print(f"{ahead:<8}{name:<12}" + "".join(f"{x:10.5f}" for x in numbers))
             assert numbers[0] < min(numbers[1:]) or name == "roll_rate"
-    drawn(folder / "predict_robot_bicycle.png", sparse, unseen, next(iter(smoothed(held_out).values())))
+    drawn(folder / "predict_robot_bicycle.png", sparse, unseen, next(iter(held_out.smoothed().values())))
     low, high = result.intervals()["steer_damping"]
     print("What the gyroscope reads is mostly vibration, which nothing predicts.")
     print(f"\nThe damping, with all that the noise stands for: {low:.2f} to {high:.2f} N m s/rad.")

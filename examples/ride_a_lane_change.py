@@ -1,23 +1,24 @@
-"""How does a rider change lanes on a bicycle that would fall over if left alone?
+"""How does a rider change lanes on an unstable bicycle?
 
-The benchmark bicycle of Meijaard et al. (2007) rides at 3 m/s, below the speeds at which it rights itself, and changes
-to the lane on its left. Two riders steer it, each by the torque on the handlebar alone:
+The benchmark bicycle of Meijaard et al. (2007) rides at 3 m/s, below its stable speed range, and changes to the left
+lane. Two controllers steer it by a torque on the handlebar:
 
-- the sequential-loop rider of Hess, Moore and Hubbard (2012), with the published gains and its arms' lag, who reads the
-  path where the front wheel will be a little later;
-- a linear-quadratic regulator scheduled over speed, which is told how far to lean by a path follower that looks ahead.
+- the sequential-loop rider of Hess, Moore and Hubbard (2012), with the published gains and neuromuscular lag, which
+    uses
+  the path ahead of the front wheel;
+- a linear-quadratic regulator scheduled over speed, with a path follower that commands the roll angle.
 
-Both have to steer to the right before they can turn left: the bicycle must lean into its turn first.
+Both must steer to the right before they can turn left, because the bicycle must first lean into the turn.
 
     variable    meaning                                                              unit
     path        y(x) from lane to lane, positive to the right                        m
-    preview     how far ahead each looks                                             s
+    preview     preview time of each controller                                      s
     roll, steer, x, y, yaw                                                           rad, m
     applied_steer_torque    on the fork, by the rider                                N m
 
 Run:      python examples/ride_a_lane_change.py [--out FOLDER]
-Appears:  how far each is from the path; ride_a_lane_change.png: the road from above, and steer, roll and torque on
-          the way; ride_a_lane_change.html: the regulator's ride as a page that anyone can turn and play.
+Appears:  the deviations from the path; ride_a_lane_change.png: the road from above, and steer, roll and torque;
+          ride_a_lane_change.html: an interactive animation with the regulator.
 Takes:    under a minute, nearly all of it compilation.
 """
 

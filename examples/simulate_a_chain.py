@@ -1,9 +1,9 @@
-"""A chain hangs folded, by both ends; one end is let go. Does that end fall faster than a stone?
+"""A chain hangs folded from both ends, and one end is released. Does this end fall faster than a stone?
 
-A plane chain of rods, whose number is a field of the description: `Chain(links=21)`. It is static, since the
-description counts with it; the names of coordinates and speeds are properties that follow from it. The more links, the
-nearer a flexible chain, whose falling end has at the depth x the speed (Calkin and March, American Journal of Physics
-57, 154, 1989)
+The number of links of a planar chain of rods is a field: `Chain(links=21)`. The field is static, because it is used in
+`range`. The names of coordinates and speeds are properties that depend on it. With many links, the chain approximates a
+flexible chain, whose falling end has the following speed at the depth x (Calkin and March, American Journal of Physics
+57, 154, 1989):
 
     v^2 = 2 g x (1 - x / 2 L) / (1 - x / L)
 

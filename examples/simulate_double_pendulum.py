@@ -1,4 +1,4 @@
-"""How does a double pendulum move when it is let go from above, and how far can the simulation be trusted?
+"""How does a double pendulum move if it is released from above, and how accurate is the simulation?
 
 Two equal links hang from a fixed pin and from each other, in a vertical plane (`jaxkane.catalog.DoublePendulum`).
 
@@ -9,9 +9,9 @@ Two equal links hang from a fixed pin and from each other, in a vertical plane (
     gravity                                                               m/s^2
 
 Run:      python examples/simulate_double_pendulum.py [--out FOLDER]
-Appears:  a line on the steps taken and on the energy, which no friction and no torque may change, and
+Appears:  the number of steps and the error of the energy, which is constant without friction and torques, and
           simulate_double_pendulum.png: the paths of both tips as a long exposure, the angles, the energy error
-          (its spikes are the interpolation between the solver's steps, its drift is the steps themselves).
+          (its spikes are due to the interpolation between steps, its drift is due to the steps).
 Takes:    a few seconds.
 """
 

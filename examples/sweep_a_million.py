@@ -1,9 +1,9 @@
-"""How far does a bicycle lean in the second after a push? A million of them, or as many as are asked for.
+"""What is the largest roll angle of a bicycle in the second after a push? A sweep of up to a million bicycles.
 
-Riders, frames and speeds differ at random; each bicycle (`jaxkane.catalog.WhippleBicycle`, nonlinear) rolls straight
-ahead, gets a sideways push and rides without hands. Of each ride a few numbers are kept, not the motion, so the memory
-hardly grows with the number of rides. With `--folder` every finished chunk is kept as a file: stop it, or kill it,
-call it again with the same arguments, and it goes on. All cores can work at it: `--devices`.
+The parameters of riders and frames and the speeds are random. Each bicycle (`jaxkane.catalog.WhippleBicycle`,
+nonlinear) rolls straight ahead, is pushed sideways and rides without a rider. Only a few numbers of each simulation are
+kept, so the memory hardly depends on the number of members. With `--folder`, every finished chunk is saved. An
+interrupted sweep can be resumed by the same command. `--devices` selects the number of cores.
 
     variable     meaning                                              range             unit
     speed        forward speed at the start                           2 to 8            m/s
@@ -11,11 +11,11 @@ call it again with the same arguments, and it goes on. All cores can work at it:
     mB           mass of frame and rider                              50 to 110         kg
     lam          tilt of the steer axis                               0.2 to 0.5        rad
     largest      largest roll in the first second                                       rad (pictured in degrees)
-    gained       roll at the end over the largest: below 1 it rights itself             1
+    gained       roll at the end over the largest: below 1 it stabilizes                1
 
 Run:      python examples/sweep_a_million.py [--members N] [--folder FOLDER] [--devices N] [--out FOLDER]
-Appears:  rides per second, the memory of the process, how the rides ended; and sweep_a_million.png: the largest roll
-          over the speed, coloured by the number of bicycles, and the share that is on its way up again.
+Appears:  simulations per second, the memory of the process, the statuses; and sweep_a_million.png: the largest roll
+          over the speed, coloured by the number of bicycles, and the share that is returning to upright.
 Takes:    ten to thirty seconds for the 20 000 of the default, most of it compilation; two or three minutes for a
           million.
 """

@@ -1,8 +1,9 @@
-"""At which speeds does a riderless bicycle right itself after a push?
+"""At which speeds is a riderless bicycle stable after a push?
 
 The benchmark bicycle of Meijaard et al. (2007), nonlinear (`jaxkane.catalog.WhippleBicycle`), rolls straight ahead and
-upright at 200 speeds and gets the same sideways push: a roll rate. Linear theory says that it rights itself between the
-weave speed (4.292 m/s: below, it swings ever wider) and the capsize speed (6.024 m/s: above, it slowly leans over).
+upright at 200 speeds. The same sideways push, a roll rate, is applied at each speed. In linear theory the bicycle is
+stable between the weave speed (4.292 m/s; below, oscillations grow) and the capsize speed (6.024 m/s; above, it slowly
+falls over).
 
     variable    meaning                                                              unit
     speed       forward speed at the start, 1 to 10                                  m/s
@@ -10,9 +11,9 @@ weave speed (4.292 m/s: below, it swings ever wider) and the capsize speed (6.02
     roll_rate   its rate, 0.5 at the start: the push                                 rad/s
 
 Run:      python examples/sweep_bicycle_speed.py [--out FOLDER]
-Appears:  rides per second; a table of how the rides ended ("singular speeds": the fork has turned by 90 degrees, where
-          rolling no longer determines yaw, pitch and the front wheel's turning); and sweep_bicycle_speed.png: roll over
-          time, coloured by speed, and how far each bicycle rolls in the last second. The bars in the colour scale and
+Appears:  simulations per second; a table of statuses ("singular speeds": the fork has turned by 90 degrees, where the
+          rolling constraints no longer determine the dependent speeds); and sweep_bicycle_speed.png: roll over time,
+          coloured by speed, and the roll angle of each bicycle in the last second. The bars in the colour scale and
           the green band are the speeds of linear theory.
 Takes:    under half a minute, most of it compilation.
 """

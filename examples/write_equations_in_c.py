@@ -1,18 +1,17 @@
-"""Do equations that are written out in C move as the library's do, and what do they look like?
+"""Do exported C equations give the same motion as the library, and what do they look like?
 
-A double pendulum (`jaxkane.catalog.DoublePendulum`) is let go from above. Its equations are written as C99 by
-`jaxkane.export.c`, compiled by the compiler of this machine together with the Runge-Kutta steps below, and the ride is
-laid beside the one of `jaxkane.simulate`.
+A double pendulum (`jaxkane.catalog.DoublePendulum`) is released from above. `jaxkane.export.c` exports its equations as
+C99. They are compiled together with a Runge-Kutta method, and the result is compared with `jaxkane.simulate`.
 
     variable                meaning                                       unit
     theta1, theta2          angle of each link from the downward vertical rad
     theta1_dot, theta2_dot  their rates                                   rad/s
 
 Run:      python examples/write_equations_in_c.py [--out FOLDER]
-Appears:  in the folder double_pendulum.h, .c and _test.c, as they can be taken elsewhere, and ride.c; on the screen
-          what the test program says of them, the largest difference of the two rides, and the time of a step in C.
-          Without a C compiler the files alone.
-Takes:    some seconds.
+Appears:  the files double_pendulum.h, .c and _test.c, which can be used elsewhere, and ride.c; printed are the output
+          of the test program, the largest difference of the two simulations, and the time of a step in C. Without
+          a C compiler, only the files are written.
+Takes:    a few seconds.
 """
 
 import argparse

@@ -181,8 +181,13 @@ def pytest_collection_modifyitems(items):
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     native, optimized = Compilation.of(item)
-    if _kernels_of(item) == "native" and native_kernels.why_not():
-        pytest.skip(f"no native kernels: {native_kernels.why_not()}")
+    if _kernels_of(item) == "native":
+        if native_kernels.why_not():
+            pytest.skip(f"no native kernels: {native_kernels.why_not()}")
+        if jax.default_backend() != "cpu":
+            pytest.skip(f"native kernels run on a CPU only, and JAX uses the {jax.default_backend()}")
+    if item.get_closest_marker("many_steps") and jax.default_backend() != "cpu":
+        pytest.skip(f"many steps in sequence take minutes on the {jax.default_backend()}")
     if native != native_kernels.is_wanted():
         native_kernels.use(native)
     if optimized != _is_optimized:
@@ -203,3 +208,10 @@ def native():
 @pytest.fixture
 def by_xla():
     """For tests without native kernels."""
+
+
+@pytest.fixture
+def on_cpu():
+    """For tests of programs that are compiled for a CPU."""
+    if jax.default_backend() != "cpu":
+        pytest.skip(f"the program is compiled for a CPU, and JAX uses the {jax.default_backend()}")

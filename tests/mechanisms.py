@@ -53,6 +53,51 @@ class OnACircle(jk.System):
         return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
 
 
+class Crank(jk.System):
+    """A crank and the slider that it drives, whose place `x` is in units of `unit` metres."""
+
+    radius: Scalar = parameter(1.0)  # [m]
+    unit: Scalar = parameter(1.0)  # [m]
+    coordinates, speeds = ("angle", "x"), ("rate",)
+
+    def place(self, q):
+        return q["x"] * self.unit / self.radius
+
+    def q_dot(self, t, q, u):
+        s, c = jnp.sin(q["angle"]), jnp.cos(q["angle"])
+        return u["rate"], -(s + s * c / (self.place(q) - c)) * u["rate"] * self.radius / self.unit
+
+    def configuration_constraints(self, t, q):
+        s, c = jnp.sin(q["angle"]), jnp.cos(q["angle"])
+        return [((self.place(q) - c) ** 2 + s**2 - 9.0) * (self.radius / self.unit) ** 2]
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(3, q["angle"], u["rate"])
+        return jk.Motion([jk.Body(1.0, 0.0, O.fixed(self.radius * B.x, B), N, name="pin")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * self.radius * motion.N.y)
+
+    def outputs(self, t, q, u, motion, now):
+        return {"ratio": self.place(q)}
+
+
+class CrankAlone(Crank):
+    """By its angle alone."""
+
+    coordinates = ("angle",)
+
+    def place(self, q):
+        return jnp.cos(q["angle"]) + jnp.sqrt(9.0 - jnp.sin(q["angle"]) ** 2)
+
+    def q_dot(self, t, q, u):
+        return (u["rate"],)
+
+    def configuration_constraints(self, t, q):
+        return ()
+
+
 class Slider(jk.System):
     """A rod hinged to a slider: right; the wrong ones differ from it in a line."""
 
@@ -188,3 +233,57 @@ def case(name):
     else:
         system, q, u = Bob(), (0.6, -0.8), (0.5,)
     return system, 0.7, np.array(q), np.array(u), np.linspace(-0.4, 0.9, len(system.inputs))
+
+
+class RimlessWheel(jk.System):
+    """Spokes 2 half apart on a slope: the wheel turns about one foot, then about the next."""
+
+    half: Scalar = parameter(0.4, unit="rad")
+    slope: Scalar = parameter(0.08, unit="rad")
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        spoke = N.rotate(3, -q["angle"], -u["rate"])
+        return jk.Motion([jk.Body(1.0, 0.0, O.fixed(1.0 * spoke.y))])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def events(self, t, q, u):
+        next_foot = {"angle": q["angle"] - 2.0 * self.half, "rate": u["rate"] * jnp.cos(2.0 * self.half)}
+        return {"step": jk.falling(self.slope + self.half - q["angle"], then=next_foot)}
+
+
+class CompassGait(jk.System):
+    """Two legs; angles from the vertical, positive downhill. The stance foot is O."""
+
+    hip: Scalar = parameter(10.0, unit="kg")
+    leg: Scalar = parameter(5.0, unit="kg")
+    slope: Scalar = parameter(np.deg2rad(3.0), unit="rad")
+    coordinates, speeds = ("stance", "swing"), ("stance_rate", "swing_rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, -q["stance"], -u["stance_rate"], "A")
+        B = N.rotate(3, -q["swing"], -u["swing_rate"], "B")
+        foot = O.fixed(0.0 * A.y)
+        hip = foot.fixed(1.0 * A.y)
+        masses = (self.leg, foot.fixed(0.5 * A.y)), (self.hip, hip), (self.leg, hip.fixed(-0.5 * B.y))
+        bodies = [jk.Body(m, 0.0, P, name=n) for (m, P), n in zip(masses, ("stance", "hip", "swing"), strict=True)]
+        return jk.Motion(bodies, points={"foot": foot, "toe": hip.fixed(-1.0 * B.y)}, frames={"N": N})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def exchange(self, t, q, u):
+        new = {"stance": q["swing"], "swing": q["stance"]}
+        return {**new, "stance_rate": u["swing_rate"], "swing_rate": u["stance_rate"]}
+
+    def events(self, t, q, u):
+        N, _ = jk.inertial()
+        toe = self.motion(t, q, u)["toe"].velocity
+        lands = jk.Impact(toe.dot(N.x), toe.dot(N.y), release=("foot",))
+        height = 2.0 * self.slope - q["stance"] - q["swing"]
+        ahead = q["stance"] - q["swing"]
+        return {"heel_strike": jk.falling(height, when=ahead, then=(lands, self.exchange))}

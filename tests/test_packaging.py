@@ -9,13 +9,13 @@ from pathlib import Path
 
 import jax
 import pytest
+import yaml
 
 import jaxkane as jk
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 PYTHONS = re.findall(r"Python :: (3\.\d+)", " ".join(PROJECT["classifiers"]))
-yaml = pytest.importorskip("yaml")
 
 
 def test_there_is_one_version():
@@ -111,3 +111,11 @@ def test_a_self_test_that_fails_says_so(monkeypatch, capsys):
     assert "ZeroDivisionError: division by zero" in lines[-2]
     monkeypatch.setattr(program, "CHECKS", {})
     assert program.main() == 0
+
+
+def test_the_documentation_is_built_with_what_its_extra_installs():
+    """Signatures are formatted by ruff, and notebooks need their kernel and the packages that they import."""
+    extra = " ".join(PROJECT["optional-dependencies"]["docs"])
+    for package in ("ruff", "mkdocs>", "mkdocs-material", "mkdocstrings[python]", "nbconvert", "latex2mathml"):
+        assert package in extra
+    assert "jaxkane[notebooks,control,symbolic,casadi]" in extra

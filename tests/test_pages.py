@@ -1,6 +1,9 @@
 """The documentation's pages can be typed in as they stand, one after the other, and lead somewhere."""
 
+import importlib.util
+import logging
 import re
+import types
 from pathlib import Path
 
 import matplotlib
@@ -17,7 +20,7 @@ from jaxkane.bicycles import PathFollower
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
-WITHOUT_CODE = ("bicycles_fit", "glossary")
+WITHOUT_CODE = ("architecture", "bicycles_fit", "glossary")
 AFTER_FIT = ("multiple_shooting", "process_noise", "uncertainty", "model_extensions")  # their code goes on from fit.md
 RUN = [page for page in PAGES if page.stem not in ("constraints", *WITHOUT_CODE)]  # constraints: test_documentation.py
 
@@ -106,6 +109,69 @@ def test_links_and_pictures_are_there():
                 assert (DOCS / target).exists(), f"{page.name}: {target}"
 
 
+def headings_of(page):
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    return re.findall(r"^#+ (.*)", text, re.MULTILINE)
+
+
+def test_links_of_the_readme_lead_to_headings():
+    """`mkdocs build --strict` checks the links of the pages, but not those of the README."""
+    links = re.findall(r"\]\(([^)#:]+)(?:#([^)]+))?\)", (DOCS.parent / "README.md").read_text(encoding="utf-8"))
+    for path, anchor in links:
+        page = DOCS.parent / path
+        assert page.exists() or path.startswith("../"), path
+        if page.suffix == ".md":
+            anchors = {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings_of(page)}
+            assert not anchor or anchor in anchors, f"README: {path}#{anchor}"
+
+
+SEARCHED = (
+    *("initial conditions", "recompilation", "observability", "baumgarte", "how to cite", "springs and dampers"),
+    *("contact and reaction forces", "quaternions", "closed loops", "gpu", "kalman filter", "import"),
+)
+
+
+@pytest.mark.parametrize("words", SEARCHED)
+def test_words_that_readers_search_for_are_headings(words):
+    navigation = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
+    headings = [heading.lower() for page in PAGES for heading in headings_of(page)]
+    assert any(words in heading for heading in (*headings, navigation.lower()))
+
+
+@pytest.fixture(scope="module")
+def hooks():
+    for package in ("mkdocs", "nbconvert", "latex2mathml"):
+        pytest.importorskip(package)
+    spec = importlib.util.spec_from_file_location("hooks", DOCS / "hooks.py")
+    hooks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    return hooks
+
+
+def test_the_reference_is_in_the_order_of_use(hooks):
+    modules = hooks.modules()
+    assert modules.index("joints") < modules.index("sweep") < modules.index("stability") < modules.index("fit")
+    assert modules.index("fit") < modules.index("estimate") < modules.index("export")
+    assert "state_estimation.md" in hooks.reference("estimate")
+    page = hooks.reference("fit")
+    assert page.index("jaxkane.fit.fit\n") < page.index("jaxkane.fit.Trial\n") < page.index("jaxkane.fit.bootstrap\n")
+    page = hooks.reference("")
+    assert page.index("jaxkane.System\n") < page.index("jaxkane.simulate\n") < page.index("jaxkane.mass_matrix\n")
+    packages = [module for module in modules if (hooks.PACKAGE / module).is_dir()]
+    unknown = set(hooks.FIRST) - {name for module in packages for name in hooks.public_names(module)}
+    assert not unknown
+
+
+def test_a_link_that_leads_nowhere_is_found(hooks, tmp_path, caplog):
+    (tmp_path / "a.html").write_text('<h1 id="there">A</h1><a href="#there"></a><a href="b.html#missing"></a>')
+    (tmp_path / "b.html").write_text('<a href="a.html#there"></a><img src="c.png">')
+    with caplog.at_level(logging.WARNING):
+        hooks.on_post_build(types.SimpleNamespace(site_dir=tmp_path))
+    assert {f"{page}: {target}" for page, target in (record.args for record in caplog.records)} == {
+        "a.html: b.html#missing", "b.html: c.png"
+    }  # fmt: skip
+
+
 def test_every_picture_of_the_gallery_is_of_an_entry():
     """The site's gallery is made from the catalogue; a picture is wanted of each, and of nothing else."""
     assert {path.stem for path in (DOCS / "catalogue").glob("*.png")} == set(jk.catalog.CATALOG)
@@ -113,6 +179,6 @@ def test_every_picture_of_the_gallery_is_of_an_entry():
 
 def test_code_is_not_wider_than_its_box():
     for page in PAGES:
-        for block in blocks_of(page):
+        for block in re.findall(r"```(?:python|py)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
             wide = [line for line in block.splitlines() if len(line) > 80]
             assert not wide, f"{page.name}: {wide[0]}"

@@ -1,4 +1,4 @@
-"""What is installed, and whether it works: `python -m jaxkane` prints the text that a report of a fault needs."""
+"""`python -m jaxkane` prints the environment and a self-test. Paste its output into a bug report."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def swing(length: jax.typing.ArrayLike = 1.0) -> jk.Trajectory:
 
 
 def energy_is_kept() -> tuple[float, float]:
-    """Of the double pendulum, by hand; relative to the potential energy at the start."""
+    """Conservation of the double pendulum's energy. **Returns:** the relative error and its tolerance."""
     ride = swing()
     a, b, a_dot, b_dot = (np.asarray(ride[name]) for name in ("theta1", "theta2", "theta1_dot", "theta2_dot"))
     kinetic = 2 / 3 * a_dot**2 + b_dot**2 / 6 + 0.5 * a_dot * b_dot * np.cos(a - b)
@@ -44,7 +44,7 @@ def energy_is_kept() -> tuple[float, float]:
 
 
 def derivatives_are_slopes() -> tuple[float, float]:
-    """Of the last angle by the length, against central differences."""
+    """The derivative of the last angle by the length, compared with central differences."""
     angle = jax.jit(lambda length: swing(length)["theta1"][-1])
     slope, d = float(jax.jit(jax.jacfwd(angle))(1.0)), 1e-4
     return abs(slope - float(angle(1.0 + d) - angle(1.0 - d)) / (2 * d)) / abs(slope), 1e-4
@@ -59,23 +59,23 @@ def eigenvalues_are_the_published_ones() -> tuple[float, float]:
 
 
 CHECKS: dict[str, Callable[[], tuple[float, float]]] = {
-    "a double pendulum keeps its energy": energy_is_kept,
-    "derivatives of a motion are its slopes": derivatives_are_slopes,
-    "eigenvalues of the benchmark bicycle are the published ones": eigenvalues_are_the_published_ones,
+    "the energy of a double pendulum is constant": energy_is_kept,
+    "derivatives of a trajectory agree with central differences": derivatives_are_slopes,
+    "eigenvalues of the benchmark bicycle agree with the published ones": eigenvalues_are_the_published_ones,
 }
 
 
 def main() -> int:
-    """Print the environment and the self-test. **Returns:** 0 where all checks hold, else 1."""
+    """Print the environment and the self-test. **Returns:** 0 if all checks pass, else 1."""
     print(f"Python {platform.python_version()}, {platform.platform()}, {os.cpu_count()} cores")
     print(", ".join(f"{package} {version_of(package)}" for package in PACKAGES))
     environment = sorted(f"{name}={value}" for name, value in os.environ.items() if name.startswith(SETTINGS))
     settings = jk.configure(verbose=False)
     why_not = native.why_not()
     print(f"native kernels: {'yes' if settings.native else f'no, {why_not}' if why_not else 'switched off'}")
-    print(f"compiled programs: {f'kept in {settings.cache}' if settings.cache else 'not kept'}")
+    print(f"compiled programs: {f'saved in {settings.cache}' if settings.cache else 'not saved'}")
     print(f"devices: {', '.join(f'{each} ({each.device_kind})' for each in jax.devices())}")
-    print("environment:", ", ".join(environment) or "nothing of JAX, XLA or jaxkane is set")
+    print("environment:", ", ".join(environment) or "no variable of JAX, XLA or jaxkane is set")
     failed = 0
     for what, check in CHECKS.items():
         started = time.perf_counter()

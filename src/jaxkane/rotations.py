@@ -1,7 +1,7 @@
-"""Orientation of a rigid body: body-fixed sequences and Euler parameters. Knows angles; knows no frame and no body.
+"""Orientation of a rigid body: body-fixed sequences and Euler parameters. Does not depend on frames or bodies.
 
-`[R]` is the textbook's transformation matrix: it takes components in the parent frame to components in the rotated
-frame. Every function works on single numbers, and keeps the exact zeros and ones of its entries.
+`[R]` is the transformation matrix of the textbook: it maps components in the parent frame to components in the rotated
+frame. Every function operates on scalars and preserves exact zeros and ones.
 Source: Kamman, Volume II, Unit 5, Examples 2, 6, 7 and Exercises 5.6, 5.8.
 """
 
@@ -22,7 +22,7 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def axes_of(sequence: str) -> tuple[int, ...]:
-    """The axes (0, 1, 2) of a body-fixed sequence written "3-1-2" or "312"."""
+    """The axes (0, 1 or 2) of a body-fixed sequence such as "3-1-2" or "312"."""
     digits = str(sequence).replace("-", "")
     if not digits or any(d not in "123" for d in digits):
         raise ValueError(f'A body-fixed sequence is written with the axes 1, 2, 3, such as "3-1-2"; got {sequence!r}.')
@@ -48,7 +48,7 @@ def _frozen(rows) -> Matrix:
 
 
 def transpose(matrix: Matrix) -> Matrix:
-    """The transpose: for a rotation matrix, its inverse."""
+    """The transpose, which is the inverse of a rotation matrix."""
     return _frozen(zip(*matrix, strict=True))
 
 
@@ -61,7 +61,10 @@ def matmul(a: Matrix, b: Matrix) -> Matrix:
 def sequence_matrix(sequence: str, angles: Sequence[Component]) -> Matrix:
     """[R] of a body-fixed sequence of rotations, from parent components to rotated components.
 
-    **Arguments:** `sequence`, such as "3-1-2"; `angles` [rad], one for each axis.
+    **Arguments:**
+
+    - `sequence`: the axes in their order, such as "3-1-2".
+    - `angles`: one for each axis [rad].
     """
     rotation, axes = IDENTITY, axes_of(sequence)
     for axis, angle in zip(axes, several(angles, len(axes), f"{sequence!r} takes {len(axes)} angles"), strict=True):
@@ -70,7 +73,7 @@ def sequence_matrix(sequence: str, angles: Sequence[Component]) -> Matrix:
 
 
 def _rate_directions(sequence: str, angles: Sequence[Component]) -> list[Triple]:
-    # The column of each angle's rate in the rotated frame's components of the angular velocity.
+    # For each angle, the derivative of the angular velocity by its rate, in components of the rotated frame.
     rest = IDENTITY
     columns: list[Triple] = []
     axes = axes_of(sequence)
@@ -82,9 +85,13 @@ def _rate_directions(sequence: str, angles: Sequence[Component]) -> list[Triple]
 
 
 def angular_velocity(sequence: str, angles: Sequence[Component], rates: Sequence[Component]) -> Triple:
-    """Components, in the rotated frame, of its angular velocity relative to the parent [rad/s].
+    """Angular velocity of the rotated frame relative to its parent [rad/s], with components in the rotated frame.
 
-    **Arguments:** `sequence`, such as "3-1-3"; `angles` [rad] and their `rates` [rad/s], three each.
+    **Arguments:**
+
+    - `sequence`: the axes in their order, such as "3-1-3".
+    - `angles`: one for each axis [rad].
+    - `rates`: time derivatives of the angles [rad/s].
     """
     columns = _rate_directions(sequence, angles)
     rates = several(rates, len(columns), f"{sequence!r} takes {len(columns)} rates")
@@ -94,10 +101,14 @@ def angular_velocity(sequence: str, angles: Sequence[Component], rates: Sequence
 def angle_rates(sequence: str, angles: Sequence[Component], omega: Sequence[Component]) -> Triple:
     """Rates of the three angles of a body-fixed sequence [rad/s], from body-fixed components of angular velocity.
 
-    The inverse of `angular_velocity`. It does not exist where the sequence locks: a sine (3-1-3) or a cosine
-    (3-2-1, 3-1-2, 1-2-3) of the second angle is zero there, and the rates become infinite.
+    This is the inverse of `angular_velocity`. In gimbal lock it does not exist: the sine (3-1-3) or the cosine
+    (3-2-1, 3-1-2, 1-2-3) of the second angle is zero, and the rates become infinite.
 
-    **Arguments:** `sequence` of three axes; `angles` [rad], `omega` [rad/s], three each.
+    **Arguments:**
+
+    - `sequence`: three axes in their order, such as "3-1-3".
+    - `angles`: three angles [rad].
+    - `omega`: three components of the angular velocity in the rotated frame [rad/s].
     """
     a, b, c = several(_rate_directions(sequence, angles), 3, "angle_rates takes a sequence of three axes")
     omega = several(omega, 3, "An angular velocity has three components")
@@ -111,9 +122,9 @@ def _divide(a: Component, b: Component) -> Component:
 
 
 def euler_parameters_matrix(parameters: Sequence[Component]) -> Matrix:
-    """[R] of Euler parameters (e1, e2, e3, e4) of unit norm, e4 the scalar.
+    """[R] of Euler parameters (e1, e2, e3, e4) of unit norm.
 
-    Scalar last, as in the textbook (Example 2); jaxlie and MuJoCo put it first.
+    The scalar e4 is last, as in the textbook (Example 2). In jaxlie and MuJoCo, the scalar is first.
     """
     e1, e2, e3, e4 = several(parameters, 4, _FOUR)
     return (
@@ -124,9 +135,9 @@ def euler_parameters_matrix(parameters: Sequence[Component]) -> Matrix:
 
 
 def normalized(parameters: Sequence[Component]) -> tuple[Component, ...]:
-    """Euler parameters brought to unit norm; exact ones stay exact.
+    """Euler parameters divided by their norm. Exact numbers remain exact.
 
-    **Raises:** `ValueError` where all are exactly zero.
+    **Raises:** `ValueError` if all are exactly zero.
     """
     parameters = several(parameters, 4, _FOUR)
     square = dot(parameters, parameters)
@@ -134,7 +145,10 @@ def normalized(parameters: Sequence[Component]) -> tuple[Component, ...]:
         norm = jnp.sqrt(square)
         return tuple(_divide(e, norm) for e in parameters)
     if square == 0.0:
-        raise ValueError("Euler parameters that are all zero are no rotation; (0.0, 0.0, 0.0, 1.0) is none at all.")
+        raise ValueError(
+            "The Euler parameters are all zero, which does not describe an orientation. For the reference orientation, "
+            "pass (0.0, 0.0, 0.0, 1.0)."
+        )
     return tuple(parameters) if abs(square - 1.0) < 1e-15 else tuple(e / math.sqrt(square) for e in parameters)
 
 
@@ -150,21 +164,23 @@ def euler_parameter_rates(parameters: Sequence[Component], omega: Sequence[Compo
 
 
 def euler_parameter_norm(parameters: Sequence[Component]) -> Component:
-    """e1^2 + e2^2 + e3^2 + e4^2 - 1: zero, the configuration constraint of Euler parameters."""
+    """e1^2 + e2^2 + e3^2 + e4^2 - 1: the residual of the configuration constraint of Euler parameters."""
     e = several(parameters, 4, _FOUR)
     return sub(dot(e, e), 1.0)
 
 
 def of_rotation_vector(vector: Sequence[Component]) -> tuple[Component, Component, Component, Component]:
-    """Euler parameters (scalar last) of a rotation vector [rad]: (r sin(a / 2) / a, cos(a / 2)), a = |r|; smooth at
-    zero."""
+    """Euler parameters (scalar last) of a rotation vector r [rad]: (r sin(a / 2) / a, cos(a / 2)), a = |r|.
+
+    The function is smooth at zero.
+    """
     vector = several(vector, 3, "A rotation vector has three components")
     square = dot(vector, vector)
     if is_exact(square):
         angle = math.sqrt(square)
         ratio, scalar = (math.sin(0.5 * angle) / angle if angle else 0.5), math.cos(0.5 * angle)
     else:
-        # Where the series is exact to rounding, and the square root of zero, which has no derivative, is not taken.
+        # Below 1e-4, the series is exact within rounding. It avoids the square root of zero, which has no derivative.
         small = square < 1e-4
         angle = jnp.sqrt(jnp.where(small, 1.0, square))
         series = 0.5 - square / 48 + square**2 / 3840 - square**3 / 645120

@@ -1,4 +1,4 @@
-"""Sensors: gyroscopes, accelerometers, encoders, markers, cameras, load cells; and their filters.
+"""Sensors (gyroscopes, accelerometers, encoders, markers, cameras, load cells) and filters.
 
 For `System.outputs`, and the filters for `System.state_rates`:
 
@@ -8,8 +8,8 @@ For `System.outputs`, and the filters for `System.state_rates`:
 
     ride["imu.ay"], Trial(t, {"imu.gz": rate}, sigma=0.01)
 
-A sensor's place, mounting, gain, offset and lag are parameters of the system like any other, which a fit can free.
-Noise is the trial's `sigma`. Values are those of the ideal instrument; nothing is rounded unless a resolution is given.
+The position, mounting, gain, offset and lag of a sensor are parameters that a fit can estimate. The outputs do not
+contain noise; the noise of a measurement is `sigma` of a trial. Outputs are not rounded unless a resolution is given.
 """
 
 from __future__ import annotations
@@ -28,30 +28,36 @@ Named = dict[str, Component]
 
 
 def gyroscope(frame: Frame) -> Named:
-    """Angular velocity [rad/s] of a frame, along its own axes: "x", "y", "z".
+    """Angular velocity [rad/s] of a frame, with components "x", "y", "z" in this frame.
 
-    **Arguments:** `frame`: the instrument's, such as `body_frame.rotate_fixed(self.mounting)`.
+    **Arguments:**
+
+    - `frame`: the frame of the instrument, such as `body_frame.rotate_fixed(self.mounting)`.
     """
     return _along(_checked(frame).angular_velocity, frame)
 
 
 def accelerometer(now: Any, point: Point | Body, frame: Frame, gravity: Vector) -> Named:
-    """Specific force [m/s^2] at a point, along the axes of a frame: "x", "y", "z".
+    """Specific force [m/s^2] at a point, with components "x", "y", "z" in a frame.
 
         f = a - g
 
-    At rest it is g upwards, in free fall zero.
+    It is g upwards at rest and zero in free fall.
 
-    **Arguments:** `now`, as `outputs` receives it; `point`: where the instrument sits, a Point that is fixed in the
-    body that carries it; `frame`: the instrument's; `gravity` [m/s^2]: the Vector that `weight` is given.
+    **Arguments:**
+
+    - `now`: the argument of `outputs`.
+    - `point`: the position of the instrument, a Point that is fixed in its body.
+    - `frame`: the frame of the instrument.
+    - `gravity`: gravitational acceleration [m/s^2], the Vector that is passed to `weight`.
     """
     return _along(now.acceleration(point_of(point)) - gravity, frame)
 
 
 def imu(now: Any, point: Point | Body, frame: Frame, gravity: Vector) -> Named:
-    """An accelerometer and a gyroscope in one box: "ax", "ay", "az" [m/s^2], "gx", "gy", "gz" [rad/s].
+    """An accelerometer and a gyroscope: "ax", "ay", "az" [m/s^2] and "gx", "gy", "gz" [rad/s].
 
-    Arguments as `accelerometer`.
+    **Arguments:** as `accelerometer`.
     """
     f, w = accelerometer(now, point, frame, gravity), gyroscope(frame)
     return {**{f"a{k}": x for k, x in f.items()}, **{f"g{k}": x for k, x in w.items()}}
@@ -60,13 +66,17 @@ def imu(now: Any, point: Point | Body, frame: Frame, gravity: Vector) -> Named:
 def encoder(
     angle: Component, *, zero: Component = 0.0, ratio: Component = 1.0, resolution: Component | None = None
 ) -> Component:
-    """An angle, or the way of a wheel, as an encoder counts it.
+    """The reading of an encoder for an angle or the distance travelled by a wheel.
 
-        reading = ratio * (angle - zero),  rounded to whole multiples of `resolution`
+        reading = ratio * (angle - zero),  rounded to multiples of `resolution`
 
-    **Arguments:** `angle` [rad]; `zero`: where it reads zero; `ratio`: of a gear between, or a wheel's radius [m/rad],
-    or its sign; `resolution`, in the unit of the reading, positive: None for an ideal one. Derivatives pass through
-    the rounding as if there were none. In a fit leave it out, and take resolution / sqrt(12) as `sigma`.
+    **Arguments:**
+
+    - `angle`: [rad].
+    - `zero`: the angle at which the reading is zero [rad].
+    - `ratio`: gear ratio with its sign, or radius of a wheel [m/rad].
+    - `resolution`: in the unit of the reading, positive. None is an ideal encoder. The derivative ignores the rounding.
+        In a fit, omit it and use resolution / sqrt(12) as `sigma`.
     """
     reading = ratio * (angle - zero)
     if resolution is None:
@@ -76,9 +86,13 @@ def encoder(
 
 
 def marker(point: Point | Body, origin: Point, frame: Frame) -> Named:
-    """Where a point is, as a tracking system reports it: "x", "y", "z" [m].
+    """The position of a point relative to a tracking system: "x", "y", "z" [m].
 
-    **Arguments:** `origin`, `frame`: of the tracking system, from which and along whose axes the place is measured.
+    **Arguments:**
+
+    - `point`: the marker.
+    - `origin`: the origin of the tracking system.
+    - `frame`: the frame of the tracking system.
     """
     return _along(point_of(point).position_from(origin), frame)
 
@@ -91,12 +105,20 @@ def camera(
     focal_length: Component,
     image_center: Sequence[Component] = (0.0, 0.0),
 ) -> Named:
-    """Where a point is in the picture of a pinhole camera: "u", "v", in the unit of the focal length (pixels).
+    """The position of a point in the image of a pinhole camera: "u", "v", in the unit of the focal length (pixels).
 
         u = u0 + focal_length * x / z,   v = v0 + focal_length * y / z
 
-    **Arguments:** `center`: the camera's projection centre; `frame`: the camera's, z along the optical axis away from
-    it, x to the right and y downwards in the picture. What is behind the camera is NaN.
+    Points behind the camera are NaN.
+
+    **Arguments:**
+
+    - `point`: the observed point.
+    - `center`: the projection centre of the camera.
+    - `frame`: the frame of the camera: z along the optical axis away from the camera, x to the right and y downwards in
+        the image.
+    - `focal_length`: in pixels.
+    - `principal_point`: (u0, v0) in pixels.
     """
     x, y, z = point_of(point).position_from(center).components_in(frame)
     is_seen = jnp.asarray(z) > 0
@@ -107,17 +129,24 @@ def camera(
 
 
 def load_cell(now: Any, name: str, frame: Frame) -> Named:
-    """The force [N] that a constraint carries at a named point, or the moment [N m] at a named frame: "x", "y", "z".
+    """The constraint force [N] at a named point, or the constraint moment [N m] at a named frame: "x", "y", "z".
 
-    **Arguments:** `now`, as `outputs` receives it; `name`: in `Motion(points=..., frames=...)`, see `constraint_forces`
-    for what it acts on; `frame`: along whose axes the instrument measures. Forces from `loads` are not in it.
+    Forces of `loads` are not included.
 
-    **Raises:** `KeyError` for a name that is none of these; `TypeError` for that of an auxiliary speed, along which
-    the force is a number: `now.force(name)`.
+    **Arguments:**
+
+    - `now`: the argument of `outputs`.
+    - `name`: a name of `Motion(points=..., frames=...)`. `constraint_forces` explains on which part the force acts.
+    - `frame`: the frame of the components.
+
+    **Raises:** `KeyError` for an unknown name. `TypeError` for the name of an auxiliary speed, whose force is the
+    number `now.force(name)`.
     """
     force = now.force(name)
     if not isinstance(force, Vector):
-        raise TypeError(f"load_cell: {name!r} is an auxiliary speed, its force a number: take now.force({name!r}).")
+        raise TypeError(
+            f"load_cell: {name!r} is an auxiliary speed. Its force is a number, not a Vector. Use now.force({name!r})."
+        )
     return _along(force, frame)
 
 
@@ -125,13 +154,17 @@ def load_cell(now: Any, name: str, frame: Frame) -> Named:
 
 
 def low_pass(signal: Component, x: Any, time_constant: Component) -> tuple[tuple[Component], Component]:
-    """A filter of the first order: a sensor, a motor or an actuator that lags behind.
+    """A first-order low-pass filter, for the lag of a sensor or an actuator.
 
         time_constant * x_dot = signal - x,   output x
 
-    **Arguments:** `x`: its state, or a sequence that holds it; `time_constant` [s], positive.
+    **Arguments:**
 
-    **Returns:** the rates of its states, for `state_rates`, and its output, for `outputs` or `loads`.
+    - `signal`: the input of the filter.
+    - `x`: the state of the filter, or a sequence that contains it.
+    - `time_constant`: [s], positive.
+
+    **Returns:** the rates of the states for `state_rates`, and the output for `outputs` or `loads`.
     """
     (x,) = _states(x, (1,), "low_pass")
     positive(time_constant, "low_pass: the time constant")
@@ -141,12 +174,18 @@ def low_pass(signal: Component, x: Any, time_constant: Component) -> tuple[tuple
 def low_pass_second_order(
     signal: Component, x: Sequence[Component], frequency: Component, damping: Component = 0.5**0.5
 ) -> tuple[tuple[Component, Component], Component]:
-    """A filter of the second order; with the damping ratio 1/sqrt(2) that of Butterworth.
+    """A second-order low-pass filter. The damping ratio 1/sqrt(2) gives a Butterworth filter.
 
         x1_dot = x2,   x2_dot = w^2 (signal - x1) - 2 damping w x2,   w = 2 pi frequency,   output x1
 
-    **Arguments:** `x`: its two states; `frequency` [Hz], where it takes away half of the power. **Returns:** as
-    `low_pass`.
+    **Arguments:**
+
+    - `signal`: the input of the filter.
+    - `x`: the two states of the filter.
+    - `frequency`: the cut-off frequency [Hz]; with the damping ratio 1/sqrt(2), half of the power passes.
+    - `damping`: the damping ratio.
+
+    **Returns:** as `low_pass`.
     """
     x1, x2 = _states(x, (2,), "low_pass_second_order")
     w = 2.0 * jnp.pi * positive(frequency, "low_pass_second_order: the frequency")
@@ -154,15 +193,21 @@ def low_pass_second_order(
 
 
 def delayed(signal: Component, x: Any, delay: Component) -> tuple[tuple[Component, ...], Component]:
-    """A dead time by Pade's approximation with one state or two: right for signals much slower than the delay.
+    """A delay, by Pade's approximation with one or two states. It is accurate for signals much slower than the delay.
 
         exp(-d s) = (1 - d s / 2) / (1 + d s / 2)                                   one state
         exp(-d s) = (1 - d s / 2 + d^2 s^2 / 12) / (1 + d s / 2 + d^2 s^2 / 12)     two
 
-    The error of the phase is (w d)^3 / 12 or (w d)^5 / 720 at the frequency w [rad/s]. A step comes with a wrong jump
-    at first, since the signal passes through.
+    The error of the phase is (w d)^3 / 12 or (w d)^5 / 720 at the frequency w [rad/s]. The response to a step has a
+    wrong initial jump, because the approximation has a direct feedthrough.
 
-    **Arguments:** `x`: its state or states; `delay` [s], positive. **Returns:** as `low_pass`.
+    **Arguments:**
+
+    - `signal`: the input.
+    - `x`: the state or the two states.
+    - `delay`: [s], positive.
+
+    **Returns:** as `low_pass`.
     """
     x = _states(x, (1, 2), "delayed")
     positive(delay, "delayed: the delay")
@@ -175,7 +220,9 @@ def delayed(signal: Component, x: Any, delay: Component) -> tuple[tuple[Componen
 def _states(x: Any, sizes: tuple[int, ...], name: str) -> tuple[Component, ...]:
     states = tuple(x) if not hasattr(x, "shape") and hasattr(x, "__iter__") else (x,)
     if len(states) not in sizes:
-        raise ValueError(f"sensors.{name} has {' or '.join(map(str, sizes))} states, got {len(states)}.")
+        raise ValueError(
+            f"sensors.{name}: the number of states must be {' or '.join(map(str, sizes))}, got {len(states)}."
+        )
     return states
 
 
@@ -185,5 +232,5 @@ def _along(vector: Vector, frame: Frame) -> Named:
 
 def _checked(frame: Frame) -> Frame:
     if not isinstance(frame, Frame):
-        raise TypeError(f"A sensor measures along the axes of a Frame, got {frame!r}.")
+        raise TypeError(f"The frame of a sensor must be a Frame, got {frame!r}.")
     return frame

@@ -169,13 +169,13 @@ def test_from_file_reads_values_and_deviations(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (text(wheelbase=1.0), r"line 27: wheelbase is no parameter"),
+        (text(wheelbase=1.0), r"line 27: wheelbase is not a parameter"),
         (text() + "mB = 80+/-1\n", r"line 27: mB was given before, on line 11"),
         (text(mB="heavy"), r"line 11: 'mB = heavy\+/-0.01' is not of the form"),
         (text(mB="nan"), r"line 11"),
         (text() + "what is this\n", r"line 27: 'what is this' is not"),
         (text(mB=None, w=None), r"missing: w, mB"),
-        (text(IRzz=0.5), r"IRzz = 0.5, but the model has IRzz = IRxx"),
+        (text(IRzz=0.5), r"IRzz = 0.5, but the model requires IRzz = IRxx"),
         (text(mB=-85.0), r"WhippleBicycle.mB = -85.0 must be positive"),
     ],
 )

@@ -462,5 +462,5 @@ def test_tyres_and_roads_that_cannot_be_are_refused():
         MagicFormula89(jnp.ones(14), largest_load=0.0)
     with pytest.raises(ValueError, match="one number"):
         Road(lambda x, y: jnp.array([x, y])).at(0.0, 0.0)
-    with pytest.raises(TypeError, match="`road` is a Ground"):
+    with pytest.raises(TypeError, match="`road` must be a Ground"):
         Bicycle.benchmark().with_parts(road=0.1)

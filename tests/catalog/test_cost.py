@@ -8,7 +8,7 @@ from test_laws import QUICK, SLOW
 import jaxkane as jk
 from jaxkane._kane.kanes_method import _motion_rates
 from jaxkane._scalarjit.backends.native import Scalars
-from jaxkane._scalarjit.function import Program
+from jaxkane._scalarjit.program import Program
 from jaxkane.catalog import CATALOG
 
 

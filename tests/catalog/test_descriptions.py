@@ -3,6 +3,7 @@
 import ast
 import pathlib
 
+import numpy as np
 import pytest
 
 from jaxkane import catalog
@@ -43,3 +44,16 @@ def test_an_entry_is_registered_in_the_books_order(monkeypatch):
 @pytest.mark.parametrize("name", catalog.CATALOG)
 def test_every_system_says_where_it_stands_in_the_book(name):
     assert catalog.CATALOG[name].book in getattr(catalog, name).__doc__
+
+
+def test_the_links_of_the_spatial_double_pendulum_are_uniform_rods():
+    """Transverse moments m l^2 / 12, and a small moment about each rod; the first rod is longer and heavier."""
+    system = catalog.SpatialDoublePendulum()
+    links = ("mass1", "length1", "I11_1", "I22_1", "I33_1"), ("mass2", "length2", "I11_2", "I22_2", "I33_2")
+    numbers = [[float(getattr(system, name)) for name in link] for link in links]
+    assert [m for m, *_ in numbers] == [1.2, 0.8]
+    assert [length for _, length, *_ in numbers] == [1.0, 0.75]
+    for m, length, across, along, other in numbers:
+        np.testing.assert_allclose([across, other], m * length**2 / 12, rtol=1e-14)
+        assert 0.01 * across < along < 0.03 * across
+    assert float(system.gravity) == 9.81

@@ -173,7 +173,7 @@ def test_joints_that_follow_others():
     hinge += '<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/>{2}</joint>'
     mimic = '<mimic joint="ja" multiplier="-3" offset="0.1"/>'
     text = f'<robot name="r"><link name="base"/>{hinge.format("a", 0.2, "")}{hinge.format("b", 0.3, mimic)}</robot>'
-    with pytest.warns(UserWarning, match="left out.*limits of joints"):
+    with pytest.warns(UserWarning, match="omitted.*limits of joints"):
         system = jk.convert.from_urdf(text)
     assert (system.speeds, system.dependent_speeds) == (("ja_rate",), ("jb_rate",))
     np.testing.assert_allclose(jk.mass_matrix(system, 0.0, [0.2, 0.1 - 0.6], [0.0]), [[0.2 + 9 * 0.3]], rtol=1e-12)
@@ -197,15 +197,22 @@ def test_what_is_left_out_is_said():
         '<option density="1.2"/><actuator><muscle name="m" joint="j"/><motor name="T" joint="j" ctrlrange="-1 1"/>'
         '</actuator><tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>',
     )
-    with pytest.warns(UserWarning, match="left out") as told:
+    with pytest.warns(UserWarning, match="omitted") as told:
         system = jk.convert.from_mjcf(text)
     words = str(told[0].message)
-    for what in ("contacts", "limits of joints", "friction of joints", "tendons", "'m', which has a state", "medium"):
+    for what in (
+        "contacts",
+        "limits of joints",
+        "friction of joints",
+        "tendons",
+        "'m', which has its own state",
+        "medium",
+    ):
         assert what in words
         assert any(what in each for each in system.left_out)
     assert "limits of controls" in words
     assert system.inputs == ("T",)
-    with pytest.raises(ValueError, match=r"no counterpart: .*contacts"):
+    with pytest.raises(ValueError, match=r"not supported: .*contacts"):
         jk.convert.from_mjcf(text, strict=True)
 
 
@@ -253,7 +260,7 @@ def test_a_name_of_the_file_is_not_given_to_what_has_none():
 def test_friction_of_zero_is_none():
     smooth = ELBOW.replace('damping="0.02"', 'damping="0.02" friction="0"')
     assert jk.convert.from_urdf(smooth, strict=True).left_out == ()
-    with pytest.raises(ValueError, match="no counterpart: friction of joints"):
+    with pytest.raises(ValueError, match="not supported: friction of joints"):
         jk.convert.from_urdf(smooth.replace('friction="0"', 'friction="0.1"'), strict=True)
 
 
@@ -288,10 +295,10 @@ def test_degrees_are_those_of_the_file():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("<mujoco><worldbody>", "MuJoCo does not read the text"),
-        (mjcf('<body name="a"><joint/></body>'), "does not read.*mass"),
+        ("<mujoco><worldbody>", "MuJoCo cannot read the text"),
+        (mjcf('<body name="a"><joint/></body>'), "cannot read.*mass"),
         (mjcf('<geom size=".1"/>'), "no joint"),
-        (mjcf('<body><joint/><geom type="mesh" mesh="m"/></body>'), "does not read.*mesh"),
+        (mjcf('<body><joint/><geom type="mesh" mesh="m"/></body>'), "cannot read.*mesh"),
     ],
 )
 def test_a_file_that_is_no_mechanism(text, words):
@@ -319,15 +326,15 @@ def test_what_a_file_switches_off_is_off():
 
 @needs_mujoco
 def test_a_file_that_is_not_there():
-    with pytest.raises(FileNotFoundError, match=r"no file 'nowhere.xml'"):
+    with pytest.raises(FileNotFoundError, match=r"'nowhere.xml' does not exist"):
         jk.convert.from_mjcf("nowhere.xml")
 
 
 @needs_mujoco
 def test_a_urdf_that_is_none():
-    with pytest.raises(ValueError, match="no URDF"):
+    with pytest.raises(ValueError, match="not a URDF"):
         jk.convert.from_urdf("<robot><link>")
-    with pytest.raises(ValueError, match=r"no URDF.*<mujoco>"):
+    with pytest.raises(ValueError, match=r"not a URDF.*<mujoco>"):
         jk.convert.from_urdf(mjcf(""))
     with pytest.raises(ValueError, match=r"one root link.*a, b"):
         jk.convert.from_urdf('<robot name="r"><link name="a"/><link name="b"/></robot>')

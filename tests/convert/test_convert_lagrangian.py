@@ -161,9 +161,9 @@ def test_what_a_lagrangian_does_not_say_is_named():
     bring = lambda L, origin=None, **more: jk.convert.from_sympy(  # noqa: E731
         me.LagrangesMethod(L, [x], **more), {"m": 1.0}, origin=origin
     )
-    with pytest.raises(ValueError, match="no quadratic function of the rates"):
+    with pytest.raises(ValueError, match="not a quadratic function of the rates"):
         bring(m * x.diff() ** 4)
-    with pytest.raises(ValueError, match="positions from O cannot be had"):
+    with pytest.raises(ValueError, match="positions from O are not available"):
         bring(kinetic, origin=me.Point("O"))
     loads = [(P, F * N.x)]
     with pytest.raises(ValueError, match=r"frame=N"):
@@ -171,13 +171,13 @@ def test_what_a_lagrangian_does_not_say_is_named():
     with pytest.raises(ValueError, match="P, at which a load acts, has no velocity"):
         bring(kinetic, forcelist=loads, frame=N)
     P.set_vel(N, me.dynamicsymbols("u") * N.x)
-    with pytest.raises(ValueError, match=r"holds u\(t\), which is neither"):
+    with pytest.raises(ValueError, match=r"contains u\(t\), which is neither"):
         bring(kinetic, forcelist=loads, frame=N)
     with pytest.raises(TypeError, match="at a Point or on a ReferenceFrame"):
         bring(kinetic, forcelist=[(me.Particle("p", P, m), F * N.x)], frame=N)
-    with pytest.raises(ValueError, match=r"Derivative\(f\(t\), t\) follows from no kinematic"):
+    with pytest.raises(ValueError, match=r"no kinematic equation of the model determines Derivative\(f\(t\), t\)"):
         bring(kinetic * (2 + sm.sin(f)))
-    with pytest.raises(ValueError, match=r"the Lagrangian holds Derivative\(x\(t\), \(t, 2\)\)"):
+    with pytest.raises(ValueError, match=r"the Lagrangian contains Derivative\(x\(t\), \(t, 2\)\)"):
         bring(kinetic + x * x.diff(T, 2))
     with pytest.raises(ValueError, match="inertial frame of the bodies"):
         bring(kinetic, bodies=[me.Particle("p", P, m)])

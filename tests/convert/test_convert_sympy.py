@@ -246,7 +246,7 @@ def test_what_a_model_does_not_say_is_named(me):
     N, P = me.ReferenceFrame("N"), me.Point("P")
     bob = me.Particle("bob", P, m)
     make = lambda **more: me.KanesMethod(N, [q], [u], [q.diff() - u], **more)  # noqa: E731
-    with pytest.raises(ValueError, match="knows no bodies"):
+    with pytest.raises(ValueError, match="has no bodies"):
         jk.convert.from_sympy(make(), {})
     with pytest.raises(ValueError, match="P has no velocity"):
         jk.convert.from_sympy(make(bodies=[bob]), {m: 1.0})
@@ -254,13 +254,13 @@ def test_what_a_model_does_not_say_is_named(me):
     with pytest.raises(ValueError, match=r"f\(t\) in the motion"):
         jk.convert.from_sympy(make(bodies=[bob]), {m: 1.0})
     P.set_vel(N, (u + f.diff()) * N.x)
-    with pytest.raises(ValueError, match=r"Derivative\(f\(t\), t\) follows from no kinematic"):
+    with pytest.raises(ValueError, match=r"no kinematic equation of the model determines Derivative\(f\(t\), t\)"):
         jk.convert.from_sympy(make(bodies=[bob]), {m: 1.0})
     P.set_vel(N, u * N.x)
     taken = me.Particle("bob", P, sm.Symbol("speeds"))
-    with pytest.raises(ValueError, match="cannot be called 'speeds'"):
+    with pytest.raises(ValueError, match="'speeds' cannot be the name of a parameter"):
         jk.convert.from_sympy(make(bodies=[taken]), {"speeds": 1.0})
-    with pytest.raises(TypeError, match="takes a KanesMethod"):
+    with pytest.raises(TypeError, match="needs a KanesMethod"):
         jk.convert.from_sympy(q.diff() - u, {})
 
 
@@ -279,9 +279,9 @@ def test_functions_are_those_of_sympy_or_refused_by_name(me):
     expected = float(force.subs({q: 0.3, u: 0.2})) / 1.5
     np.testing.assert_allclose(jk.accelerations(system, 0.0, [0.3], [0.2]), [expected], rtol=1e-14)
     for bad, words in (
-        (sm.gamma(q), "gamma has no counterpart"),
-        (sm.Heaviside(q), "Heaviside has no counterpart"),
-        (sm.Symbol("m", positive=True) * q, "two symbols are called m"),
+        (sm.gamma(q), "gamma is not supported"),
+        (sm.Heaviside(q), "Heaviside is not supported"),
+        (sm.Symbol("m", positive=True) * q, "two symbols named m"),
     ):
         with pytest.raises(ValueError, match=words):
             jk.convert.from_sympy(make(bad), {m: 1.0})

@@ -8,12 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from mechanisms import Crank, CrankAlone, OnACircle
 from scipy import stats
 from systems import Cart
 
 import jaxkane as jk
-from jaxkane._kane.constraints import configuration_residual
+from jaxkane._kane.constraint_residuals import configuration_residual
 from jaxkane.estimate import Filter, begin, nees, predict, update
+from jaxkane.estimate._filter import _of_rank
+from jaxkane.estimate._square_root import moments
 
 H, Q, SIGMA = 0.1, 0.2, {"x": 0.02, "x_dot": 0.1}
 CART = Cart(mass=1.0, stiffness=4.0, damping=0.3)
@@ -140,8 +143,14 @@ def sensed(v):
     return np.array([v[1], 1.0 - np.cos(v[0])])
 
 
+def symmetric(P):
+    """The symmetric root of the correlation matrix, times the deviations."""
+    size = np.sqrt(P.diagonal())
+    return size[:, None] * scipy.linalg.sqrtm(P / np.outer(size, size)).real
+
+
 def by_hand(method, m, P, torque, y, h, density, sigma, drift):
-    """One step of a filter by covariances: extended, or cubature with the noise among its points."""
+    """One step of a filter by covariances: extended, or cubature with additive noise."""
     flow = lambda z: stepped(z[:3], z[3:], torque, h)  # noqa: E731
     D = np.diag([0.0, 0.0, drift * h])
     if method == "extended":
@@ -150,11 +159,11 @@ def by_hand(method, m, P, torque, y, h, density, sigma, drift):
         C, expected = jacobian(sensed, m, 2), sensed(m)
         across, own = P @ C.T, C @ P @ C.T
     else:
-        S = scipy.linalg.block_diag(scipy.linalg.sqrtm(P).real, np.sqrt(density) * np.eye(3))
-        ends = np.array([flow(np.append(m, np.zeros(3)) + s * 6**0.5 * d) for s in (1, -1) for d in S.T])
-        m, P = ends.mean(axis=0), np.cov(ends.T, bias=True) + D
-        S = scipy.linalg.sqrtm(P).real
-        points = np.array([m + s * 3**0.5 * d for s in (1, -1) for d in S.T])
+        ends = np.array([stepped(m + s * 3**0.5 * d, np.zeros(3), torque, h) for s in (1, -1) for d in symmetric(P).T])
+        noise = [[stepped(m, s * density**0.5 * e, torque, h) for e in np.eye(3)] for s in (1, -1)]
+        C = np.subtract(*noise).T / 2
+        m, P = ends.mean(axis=0), np.cov(ends.T, bias=True) + C @ C.T + D
+        points = np.array([m + s * 3**0.5 * d for s in (1, -1) for d in symmetric(P).T])
         ys = np.array([sensed(v) for v in points])
         expected, own = ys.mean(axis=0), np.cov(ys.T, bias=True)
         across = (points - m).T @ (ys - expected) / 6
@@ -164,8 +173,7 @@ def by_hand(method, m, P, torque, y, h, density, sigma, drift):
 
 @METHODS
 def test_of_a_pendulum_it_is_the_filter_by_hand(method):
-    """An unscented filter depends on which root of the covariance it takes: where all is nearly linear, little."""
-    tolerance = 1e-10 if method == "extended" else 1e-7
+    tolerance = 1e-10
     h, density, drift, sigma = 0.05, 0.01, 0.02, {"rate": 0.05, "height": 0.01}
     filter = Filter(Pendulum(), sigma, noise={"rate": density}, drift={"pull": drift}, method=method)
     deviation = {"angle": 0.02, "rate": 0.03, "pull": 0.05}
@@ -177,6 +185,154 @@ def test_of_a_pendulum_it_is_the_filter_by_hand(method):
         belief, _ = update(filter, predict(filter, belief, h, {"torque": torque}), jnp.asarray(y))
         np.testing.assert_allclose(belief.mean[0], m, rtol=tolerance, atol=tolerance)
         np.testing.assert_allclose(belief.covariance(), P, rtol=1e3 * tolerance, atol=tolerance)
+
+
+def of_pendulum(lag=0, noise=None, method="unscented", deviation=1.0, **options):
+    """A filter that knows little, so that the motion is not linear within its deviations."""
+    options = {"noise": {"rate": 0.01} | (noise or {}), "drift": {"pull": 1e-3}} | options
+    filter = Filter(Pendulum(), {"height": 0.05}, method=method, lag=lag, **options)
+    start = jk.State(jnp.array([0.8]), jnp.array([0.3]))
+    return filter, begin(filter, start, {name: deviation for name in filter.names})
+
+
+def last_of(filter, belief, n=12):
+    """The belief after n steps."""
+
+    def step(belief, y):
+        return update(filter, predict(filter, belief, 0.1), y[None])[0], None
+
+    ys = 1.0 - np.cos(0.8 * np.cos(0.3 * np.arange(n))) + np.random.default_rng(0).normal(0.0, 0.05, n)
+    return jax.lax.scan(step, belief, jnp.asarray(ys))[0]
+
+
+MORE = {"lag": 2, "noise": {"torque": 1e-24, "rate": 0.01}}
+
+
+@pytest.mark.parametrize("options", [MORE, pytest.param({"lag": 20}, marks=pytest.mark.slow)])
+def test_the_present_does_not_depend_on_states_that_are_kept_nor_on_noise_that_is_negligible(options):
+    tolerance = 1e-10
+    first, other = last_of(*of_pendulum()), last_of(*of_pendulum(**options))
+    np.testing.assert_allclose(other.mean[0], first.mean[0], atol=tolerance)
+    np.testing.assert_allclose(other.covariance(), first.covariance(), atol=tolerance)
+
+
+def test_a_known_coordinate_and_units_change_no_unscented_estimate():
+    """A covariance without full rank has no triangle of its own; its symmetric root does not depend on rounding."""
+    filter, belief = of_pendulum(lag=1, drift={"pull": 0.0, "damping": 0.0})
+    belief = dataclasses.replace(belief, root=belief.root.at[:, 2:].set(0.0))  # both parameters are known
+    turned = np.linalg.qr(np.random.default_rng(0).normal(size=(8, 8)))[0]
+    one, other = (last_of(filter, dataclasses.replace(belief, root=belief.root @ Q)) for Q in (jnp.eye(8), turned))
+    np.testing.assert_allclose(other.mean, one.mean, atol=1e-10)
+    for age in (0, 1):
+        np.testing.assert_allclose(other.covariance(age), one.covariance(age), atol=1e-10)
+    across = [np.einsum("ik,jk->ij", x.root[0], x.root[1]) for x in (one, other)]
+    np.testing.assert_allclose(*across, atol=1e-10)
+    assert one.deviation()[0] > 0.01
+    assert one.deviation()[2] == 0.0
+
+
+def bent(v, w):
+    return jnp.stack([v[0] * v[1] + v[2] ** 2, jnp.sin(v[0]) + w[0] * v[1] + 2.0 * w[1], v[0] ** 3 - v[2]])
+
+
+@pytest.mark.parametrize("rank", [3, 2])
+def test_moments_of_a_function_have_exact_derivatives(rank):
+    """Of the mean, the covariance, and the covariance with what follows from the same x."""
+    rng, amplitude = np.random.default_rng(2), jnp.array([0.3, 0.2])
+    m, others = jnp.asarray(rng.normal(size=3)), jnp.asarray(rng.normal(size=(2, 5)))
+    own, turn = rng.normal(size=(3, rank)), rng.normal(size=(rank, 5))
+
+    def all_of(x):
+        S = jnp.asarray(own + x[0] * np.flip(own, 0) ** 2) @ jnp.asarray(turn + x[0] * turn**2)
+        mean, A = moments(bent, m + x, S, amplitude, "unscented")
+        return mean, A @ A.T, A[:, :5] @ (others + x[0]).T
+
+    at, d = jnp.zeros(1), 1e-5
+    slopes, all_of = jax.jit(jax.jacfwd(all_of)), jax.jit(all_of)
+    for slope, high, low in zip(slopes(at), all_of(at + d), all_of(at - d), strict=True):
+        np.testing.assert_allclose(slope[..., 0], (high - low) / (2 * d), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("rank", [3, 2])
+def test_moments_of_a_function_are_those_of_points(rank):
+    rng, amplitude = np.random.default_rng(2), jnp.array([0.3, 0.2])
+    m, S = rng.normal(size=3), rng.normal(size=(3, rank)) @ rng.normal(size=(rank, 5))
+    S[2] *= 1e-6  # another unit
+    L = symmetric(S @ S.T)
+    points = np.array([m + s * 3**0.5 * d for s in (1, -1) for d in L.T])
+    ends = np.array([bent(v, np.zeros(2)) for v in points])
+    C = np.array([(bent(m, w) - bent(m, -w)) / 2 for w in np.diag(amplitude)]).T
+    mean, A = moments(bent, jnp.asarray(m), jnp.asarray(S), amplitude, "unscented")
+    np.testing.assert_allclose(mean, ends.mean(axis=0), rtol=1e-7)
+    np.testing.assert_allclose(A @ A.T, np.cov(ends.T, bias=True) + C @ C.T, rtol=1e-6, atol=1e-9)
+    if rank == 3:  # the covariance with m + S x
+        across = (points - m).T @ (ends - ends.mean(axis=0)) / 6
+        np.testing.assert_allclose(S @ A[:, :5].T, across, rtol=1e-7, atol=1e-12)
+
+
+@pytest.mark.slow
+@METHODS
+def test_derivatives_of_smoothed_and_late_states_are_exact(method):
+    """Also where a parameter of the system is known, so that the covariance is singular."""
+
+    def cost(x):
+        filter, belief = of_pendulum(lag=2, method=method)
+        filter = eqx.tree_at(lambda f: (f.system.damping, f.sigma), filter, (x[0], x[1:2]))
+        belief = dataclasses.replace(belief, root=belief.root.at[:, 2].set(0.0) * x[2])
+        belief = last_of(filter, belief, 4)
+        belief, innovation = update(filter, belief, {"height": 0.3}, age=2)
+        late = belief.mean[1] @ belief.root[2] @ belief.root[0].T @ jnp.ones(3)
+        return jnp.sum(belief.mean[0] + belief.mean[2]) + innovation.nis + late
+
+    at = jnp.array([0.2, 0.05, 0.4])
+    slope = jax.jit(jax.grad(cost))(at)
+    cost, d = jax.jit(cost), 1e-5
+    numbers = [(cost(at + d * e) - cost(at - d * e)) / (2 * d) for e in jnp.eye(3)]
+    np.testing.assert_allclose(slope, numbers, rtol=1e-6, atol=1e-7)
+
+
+@ONE_QUICKLY
+def test_a_closed_loop_is_filtered_as_well_in_any_unit(method):
+    """The slider's place in metres, in units of 3.3 cm, and in metres where the crank is 30 m long."""
+    truth = jk.simulate(CrankAlone(), jk.State(jnp.array([0.52]), jnp.array([0.4])), np.arange(0.0, 1.45, 0.05))
+    ys = np.asarray(truth["ratio"])[1:] + np.random.default_rng(0).normal(0.0, 0.02, 28)
+
+    def of(system, q):
+        filter = Filter(system, {"ratio": 0.02}, noise={"rate": 0.05}, method=method)
+        belief = begin(filter, jk.State(jnp.array(q), jnp.array([0.5])), {"angle": 0.1, "rate": 0.3})
+        assert float(belief.deviation()[0]) == pytest.approx(0.1, rel=1e-12)  # the slider follows
+        return [np.asarray(x) for x in run(filter, belief)]
+
+    @jax.jit
+    def run(filter, belief):
+        def step(belief, y):
+            belief, _ = update(filter, predict(filter, belief, 0.05), y[None])
+            return belief, (belief.mean[0, 0], belief.deviation()[0])
+
+        return jax.lax.scan(step, belief, jnp.asarray(ys))[1]
+
+    mean, deviation = of(CrankAlone(), [0.4])
+    place = float(np.cos(0.4) + np.sqrt(9.0 - np.sin(0.4) ** 2))
+    others = [
+        of(Crank(radius=radius, unit=unit), [0.4, place * radius / unit])
+        for radius, unit in ((1.0, 1.0), (1.0, 0.033), (30.0, 1.0))
+    ]
+    for other in others:
+        np.testing.assert_allclose((other[0] - others[0][0]) / deviation, 0.0, atol=1e-9)
+        np.testing.assert_allclose(other[1], others[0][1], rtol=1e-9)
+        assert np.max(np.abs(other[0] - mean) / deviation) < 0.25
+        np.testing.assert_allclose(other[1], deviation, rtol=0.25)
+
+
+def test_deviations_at_the_start_meet_the_constraints():
+    """Of a point on a circle: y follows from x; if both are given, both are known independently of each other."""
+    x, y, a, b = 0.6, 0.8, 0.1, 0.05
+    filter, state = Filter(OnACircle(), {"x": 0.1}), jk.State(jnp.array([x, y]), jnp.array([0.0]))
+    follows = begin(filter, state, {"x": a})
+    np.testing.assert_allclose(follows.deviation(), [a, a * x / y, 0.0], rtol=1e-12)
+    both = begin(filter, state, {"x": a, "y": b})
+    along = 1 / np.sqrt((y / a) ** 2 + (x / b) ** 2)  # of the angle on the circle
+    np.testing.assert_allclose(both.deviation(), [y * along, x * along, 0.0], rtol=1e-12)
 
 
 def test_it_runs_in_loops_batches_and_derivatives():
@@ -294,16 +450,16 @@ def test_constraints_are_kept():
 @pytest.mark.parametrize(
     ("sensors", "options", "message"),
     [
-        ({"rat": 0.1}, {}, "`sensors` names 'rat'; did you mean 'rate'"),
-        ({"rate": 0.0}, {}, "`sensors` of rate is 0.0: it must be positive and finite"),
-        ({"rate": -1.0}, {}, "it must be positive and finite"),
-        ({"rate": 0.1}, {"noise": {"angle": 0.1}}, "`noise` names angle"),
-        ({"rate": 0.1}, {"noise": {"rate": float("nan")}}, "density of rate is not negative, and finite; got nan"),
-        ({"rate": 0.1}, {"drift": {"pul": 0.1}}, "`drift` names 'pul'; did you mean 'pull'"),
-        ({}, {}, "`sensors` names nothing"),
-        ({"rate": 0.1}, {"method": "particle"}, '`method` is "extended" or "unscented"'),
-        ({"rate": 0.1}, {"lag": -1}, "`lag` is a whole number of 0 at least"),
-        ({"rate": 0.1}, {"substeps": 0}, "`substeps` is a whole number of 1 at least"),
+        ({"rat": 0.1}, {}, "`sensors` contains the unknown name 'rat'; did you mean 'rate'"),
+        ({"rate": 0.0}, {}, "`sensors` of rate must be positive and finite, got 0.0"),
+        ({"rate": -1.0}, {}, "must be positive and finite, got -1.0"),
+        ({"rate": 0.1}, {"noise": {"angle": 0.1}}, "`noise` contains the unknown name angle"),
+        ({"rate": 0.1}, {"noise": {"rate": float("nan")}}, "density of rate must be finite and not negative, got nan"),
+        ({"rate": 0.1}, {"drift": {"pul": 0.1}}, "`drift` contains the unknown name 'pul'; did you mean 'pull'"),
+        ({}, {}, "`sensors` is empty"),
+        ({"rate": 0.1}, {"method": "particle"}, "`method` must be 'extended' or 'unscented'"),
+        ({"rate": 0.1}, {"lag": -1}, "`lag` must be an integer of at least 0"),
+        ({"rate": 0.1}, {"substeps": 0}, "`substeps` must be an integer of at least 1"),
     ],
 )
 def test_what_is_no_filter_is_named(sensors, options, message):
@@ -312,20 +468,75 @@ def test_what_is_no_filter_is_named(sensors, options, message):
 
 
 def test_what_is_no_measurement_is_named():
-    with pytest.raises(TypeError, match=r"`sensors` is a dict of numbers by name, got \['rate'\]"):
+    with pytest.raises(TypeError, match=r"`sensors` must be a dict of numbers by name, got \['rate'\]"):
         Filter(Pendulum(), ["rate"])
     filter = Filter(Pendulum(), {"rate": 0.1})
     state = jk.State(jnp.array([0.8]), jnp.array([-0.3]))
-    with pytest.raises(ValueError, match="`deviation` names 'torque'"):
+    with pytest.raises(ValueError, match="`deviation` contains the unknown name 'torque'"):
         begin(filter, state, {"torque": 0.1})
-    with pytest.raises(ValueError, match=r"the deviation of angle is -0\.1"):
+    with pytest.raises(ValueError, match=r"`deviation` of angle must be .*, got -0\.1"):
         begin(filter, state, {"angle": -0.1})
     belief = begin(filter, state, {"angle": 0.1})
-    with pytest.raises(ValueError, match="'rat' is measured; did you mean 'rate'"):
+    with pytest.raises(ValueError, match="the unknown name 'rat'; did you mean 'rate'"):
         update(filter, belief, {"rat": 0.1})
-    with pytest.raises(ValueError, match=r"has the shape \(2,\), not \(1,\)"):
+    with pytest.raises(ValueError, match=r"must have the shape \(1,\), got \(2,\)"):
         update(filter, belief, jnp.zeros(2))
-    with pytest.raises(ValueError, match="keeps 0 states before"):
+    with pytest.raises(ValueError, match="keeps 0 earlier states"):
         update(filter, belief, {"rate": 0.1}, age=1)
     with pytest.raises(ValueError, match="torqe"):
         predict(filter, belief, 0.1, {"torqe": 1.0})
+
+
+def test_numbers_that_no_filter_can_use_are_named():
+    filter = Filter(Pendulum(), {"rate": 0.1})
+    state = jk.State(jnp.array([0.8]), jnp.array([-0.3]))
+    belief = begin(filter, state, {"angle": 0.1})
+    with pytest.raises(ValueError, match=r"begin: the state is not finite: rate = nan\. Pass finite numbers"):
+        begin(filter, jk.State(state.q, jnp.array([jnp.nan])), {})
+    with pytest.raises(ValueError, match=r"begin: the time t = inf is not finite"):
+        begin(filter, state, {}, t=np.inf)
+    for measured in ({"rate": np.inf}, [-np.inf]):
+        with pytest.raises(
+            ValueError, match=r"update: a measurement is infinite: rate = -?inf\. If it is missing, pass NaN"
+        ):
+            update(filter, belief, measured)
+    assert not np.isfinite(jax.jit(lambda y: update(filter, belief, y)[0].mean)(jnp.array([jnp.inf]))).any()
+    with pytest.raises(TypeError, match=r"the measurement of 'rate' must be one number, got '0.1'"):
+        update(filter, belief, {"rate": "0.1"})
+    with pytest.raises(
+        TypeError, match=r"density of rate must be a concrete number, not one that is traced by jax\.jit"
+    ):
+        jax.grad(lambda x: Filter(Pendulum(), {"rate": 0.1}, noise={"rate": x}).density[0])(1.0)
+    with pytest.raises(TypeError, match=r"`sensors` of rate must be a concrete number"):
+        jax.jit(lambda x: Filter(Pendulum(), {"rate": x}).sigma)(1.0)
+
+
+def test_beliefs_and_truths_of_something_else_are_named():
+    filter, late = Filter(Pendulum(), {"rate": 0.1}), Filter(Pendulum(), {"rate": 0.1}, lag=2)
+    state = jk.State(jnp.array([0.8]), jnp.array([-0.3]))
+    belief, other = begin(filter, state, {"angle": 0.1}), begin(late, state, {"angle": 0.1})
+    for function, more in ((predict, (0.1,)), (update, ({"rate": 0.1},))):
+        with pytest.raises(
+            ValueError, match=r"the belief belongs to another filter: its mean has the shape \(3, 2\), but this"
+        ):
+            function(filter, other, *more)
+        with pytest.raises(TypeError, match=r"a Filter and a Belief, as from begin.*; got Filter and State"):
+            function(filter, state, *more)
+    with pytest.raises(
+        ValueError, match=r"`truth` must be an array \(2,\) in the order of `filter.names`, got State\. The order"
+    ):
+        nees(belief, state)
+    with pytest.raises(ValueError, match=r"got the shape \(3,\)"):
+        nees(belief, jnp.zeros(3))
+    for ask in (lambda: nees(belief, jnp.zeros(2), age=1), lambda: belief.covariance(1), lambda: belief.deviation(-1)):
+        with pytest.raises(ValueError, match="from 0 to the filter's lag 0, got"):
+            ask()
+
+
+def test_nees_counts_directions_of_any_unit():
+    """Among metres and nanometres: five deviations of the small one are 25, and a combination without variance is 0."""
+    P = jnp.diag(jnp.array([1.0, 1e-18]))
+    assert float(_of_rank(P, jnp.array([0.0, 5e-9]))) == pytest.approx(25.0)
+    together = jnp.array([[1.0, 1e-9], [1e-9, 1e-18]])
+    assert float(_of_rank(together, jnp.array([2.0, 2e-9]))) == pytest.approx(4.0)
+    assert float(_of_rank(jnp.zeros((2, 2)), jnp.ones(2))) == 0.0

@@ -1,6 +1,7 @@
 """Exported filters, compiled, give the numbers of `jaxkane.estimate`."""
 
 import ctypes
+import dataclasses
 import shutil
 import subprocess
 from typing import NamedTuple
@@ -9,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mechanisms import OnACircle
+from mechanisms import Crank, OnACircle
 
 import jaxkane as jk
 from jaxkane.estimate import Filter, begin, predict, update
@@ -59,6 +60,14 @@ def of_circle(**options):
     filter = Filter(OnACircle(), {"y_dot": 0.05}, **options)
     start = jk.assemble(OnACircle(), {"x": 0.6, "y": 0.7}, {"x_dot": 0.4})
     return filter, begin(filter, start, {"x": 0.1, "y": 0.05, "x_dot": 0.2})
+
+
+def of_crank(**options):
+    """A constraint of an angle, a length in units of 3.3 cm, and a parameter that is estimated."""
+    options = {"noise": {"rate": 0.05}, "drift": {"radius": 0.0}, "lag": 1} | options
+    filter = Filter(Crank(unit=0.033), {"x": 0.5}, **options)
+    start = jk.assemble(filter.system, {"angle": 0.4, "x": 117.0}, {"rate": 0.5}, free=["x"])
+    return filter, begin(filter, start, {"angle": 0.1, "rate": 0.3, "radius": 0.05})
 
 
 def of_bicycle(**options):
@@ -150,7 +159,9 @@ def test_c_makes_the_steps_of_the_library(method, tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("of", [of_circle, pytest.param(of_bicycle, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "of", [of_circle, *(pytest.param(of, marks=pytest.mark.slow) for of in (of_crank, of_bicycle))]
+)
 @pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.slow)])
 def test_constraints_are_kept_in_c(of, method, tmp_path):
     filter, belief = of(method=method)
@@ -205,14 +216,16 @@ def test_two_filters_stand_in_one_program(tmp_path):
 
 def test_what_cannot_be_exported_is_named(tmp_path):
     filter, belief = of_servo()
-    with pytest.raises(TypeError, match=r"exports a jaxkane\.estimate\.Filter, got"):
+    with pytest.raises(TypeError, match=r"needs a jaxkane\.estimate\.Filter, got"):
         jk.export.c_filter(Servo(), tmp_path / "f.h", belief)
-    with pytest.raises(ValueError, match=r"what jaxkane\.estimate\.begin gives for this filter"):
+    with pytest.raises(ValueError, match=r"Pass the result of jaxkane\.estimate\.begin"):
         jk.export.c_filter(filter, tmp_path / "f.h", of_servo(lag=0)[1])
-    with pytest.raises(ValueError, match="not finite"):
-        jk.export.c_filter(filter, tmp_path / "f.h", jax.tree.map(lambda x: x * jnp.nan, belief))
-    with pytest.raises(ValueError, match="`dt` is a time step"):
+    for part in ("t", "mean", "root"):
+        wrong = dataclasses.replace(belief, **{part: getattr(belief, part).at[..., 0].set(jnp.nan)})
+        with pytest.raises(ValueError, match="not finite"):
+            jk.export.c_filter(filter, tmp_path / "f.h", wrong)
+    with pytest.raises(ValueError, match="the time step `dt`"):
         jk.export.c_filter(filter, tmp_path / "f.h", belief, dt=-0.01)
-    with pytest.raises(TypeError, match="being traced"):
+    with pytest.raises(TypeError, match="is traced"):
         jax.jit(lambda belief: jk.export.c_filter(filter, tmp_path / "f.h", belief))(belief)
     assert not [*tmp_path.iterdir()]

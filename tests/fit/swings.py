@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxkane as jk
-from jaxkane.fit import KinematicSamples
+from jaxkane.fit.inverse.kinematics import KinematicSamples
 
 FRICTION = ("k1", "k2")
 ARMS = {"link1": ("m", "my", "Izz"), "link2": ("m", "my", "Izz")}

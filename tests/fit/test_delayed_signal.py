@@ -7,9 +7,10 @@ import pytest
 import scipy.integrate
 from systems import Track
 
-from jaxkane.fit import Delay, Gain, LowPass, Offset, Simulation, Trial, _model, fit, forward_selection
+from jaxkane.fit import Delay, Gain, LowPass, Offset, Simulation, Trial, fit, forward_selection
+from jaxkane.fit.problem import sensor_dynamics
 
-delayed_signal, low_passed = jax.jit(_model.delayed_signal), jax.jit(_model.low_passed)
+delayed_signal, low_passed = jax.jit(sensor_dynamics.delayed_signal), jax.jit(sensor_dynamics.low_passed)
 T = jnp.linspace(0.0, 1.0, 41)
 
 
@@ -87,17 +88,35 @@ def test_a_low_pass_is_selected_and_found(order):
     assert search.fit.variance < 1.3
 
 
+@pytest.mark.parametrize("unit", [2e-6, 1e3])  # [s] between samples: 500 kHz, and three times an hour
+@pytest.mark.parametrize(("kind", "true"), [(LowPass, 4.0), (Delay, 2.5)])
+def test_times_in_any_unit(unit, kind, true):
+    """A time constant and a delay of some samples, without a scale."""
+    t = np.arange(60.0)
+    push = np.sin(0.3 * t)
+    rate = np.concatenate([[0.0], np.cumsum(0.6 * (push[1:] + push[:-1]))])  # of x'' = 1.2 push, from rest
+    x = np.concatenate([[0.0], np.cumsum(rate[:-1] + 0.2 * (2 * push[:-1] + push[1:]))])
+    changed = (low_passed if kind is LowPass else delayed_signal)(jnp.asarray(t), jnp.asarray(x), jnp.array(true))
+    seen = np.asarray(changed) + 0.01 * np.random.default_rng(0).normal(size=t.size)
+    trial = Trial(unit * t, {"x": seen}, {"push": push}, sigma=0.01, initial={"x": 0.0, "x_dot": 0.0})
+    system, step = Track(gain=1.0 / unit**2), Simulation(step=unit)
+    found = fit(system, trial, ["gain", kind("x", of="sensor")], simulation=step)
+    gain, time = found.estimates.values()
+    assert found.ok, found
+    assert (gain * unit**2, time / unit) == pytest.approx((1.2, true), rel=0.02)
+
+
 def test_what_is_no_low_pass_is_refused():
     trials = tracks(1)[:1]
     for item, said in (
         (LowPass("push"), "no channel 'push'"),
-        (LowPass("x", of="input"), "`of` is 'sensor', or None"),
-        (LowPass("x", order=3), "`order` is 1 or 2"),
-        ((LowPass("x"), LowPass("x")), "twice"),
+        (LowPass("x", of="input"), "`of` must be 'sensor' or None"),
+        (LowPass("x", order=3), "`order` must be 1 or 2"),
+        ((LowPass("x"), LowPass("x")), "more than once"),
     ):
         with pytest.raises(ValueError, match=said):
             fit(Track(), trials, item)
-    with pytest.raises(TypeError, match="it takes the name of a channel"):
+    with pytest.raises(TypeError, match="must be the name of a channel"):
         fit(Track(), trials, LowPass(3))
-    with pytest.raises(ValueError, match=r"LowPass\('x'\): a filter of process noise .* `jaxkane.sensors.low_pass`"):
+    with pytest.raises(ValueError, match=r"LowPass\('x'\): a fit with `noise` .* `jaxkane.sensors.low_pass`"):
         fit(Track(), trials, LowPass("x"), noise={"x_dot": 0.1})

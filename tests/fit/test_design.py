@@ -6,8 +6,8 @@ import pytest
 from slopes import differences, slopes
 from systems import Track
 
-from jaxkane.fit import LeastSquares, Problem, Trial, design, minimize
-from jaxkane.fit._design import covariance_of, objective_of
+from jaxkane.fit import LeastSquares, Offset, Problem, Trial, design, minimize
+from jaxkane.fit.result.design import Design, covariance_of, objective_of
 
 t = np.arange(0.0, 4.0, 0.1)
 SIGMA = {"x": 0.01}
@@ -40,8 +40,27 @@ def exact_errors(push):
 
 
 def test_a_criterion_that_is_none_is_refused():
-    with pytest.raises(ValueError, match=r"`criterion` is 'D' or 'A', got 'E'"):
+    with pytest.raises(ValueError, match=r"`criterion` must be 'D' or 'A', got 'E'"):
         design(Track(), t, push, C, ("gain",), sigma=SIGMA, initial={"x": 0.1}, criterion="E")
+
+
+def test_the_printed_correlation_is_the_largest_off_the_diagonal():
+    """Mutation: with `initial=1.0` every printed design had a correlation of 1.000."""
+    trial = Trial(t, {"x": 0.0 * t}, sigma=SIGMA)
+    of_two = [[4.0, -1.0], [-1.0, 1.0]], [[1.0, 0.1], [0.1, 1.0]]
+    for names, before, after, printed in (
+        (("gain", "drift"), *of_two, "0.500 before, 0.100 after"),
+        (("gain",), [[4.0]], [[1.0]], "0.000 before, 0.000 after"),
+    ):
+        plan = Design(C, {}, trial, names, np.array(after), np.array(before), ())
+        assert str(plan).endswith(f"largest correlation: {printed}")
+
+
+def test_a_plan_is_about_parameters_and_not_about_offsets_of_each_trial():
+    free = ("gain", Offset("x", each="trial", prior=(0.0, 0.1)), "drift")
+    plan = design(Track(), t[:11], push, C, free, sigma=SIGMA, initial={"x": 0.1}, steps=1)
+    assert plan.names == ("gain", "drift")
+    assert plan.covariance.shape == (2, 2)
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ from systems import POSED, PUSH, SEEN, TRIAL, Track
 from systems import T as t
 
 from jaxkane.fit import (
-    BFGS,
     GradientDescent,
     LeastSquares,
     Problem,
@@ -18,7 +17,6 @@ from jaxkane.fit import (
     minimize,
     multi_start,
     profile,
-    read_trials,
 )
 from jaxkane.sweep import grid
 
@@ -62,7 +60,9 @@ def test_a_descent_goes_on_with_its_own_optimizer_only(name, problem, tmp_path):
     path = kept(problem, tmp_path / "fit.npz", GradientDescent(OPTIMIZERS[name]()))
     for other in OPTIMIZERS.values():
         for optimizer in (other(0.2), *([other()] if other is not OPTIMIZERS[name] else [None])):
-            with pytest.raises(ValueError, match=r"fit.npz is the state of another fit. It differs in optimizer \("):
+            with pytest.raises(
+                ValueError, match=r"fit.npz contains the state of another fit, which differs in optimizer \("
+            ):
                 minimize(problem, GradientDescent(optimizer), steps=5, checkpoint=path)
     resumed = minimize(problem, GradientDescent(OPTIMIZERS[name]()), steps=5, checkpoint=path)
     whole = minimize(problem, GradientDescent(OPTIMIZERS[name]()), steps=5)
@@ -91,7 +91,9 @@ def test_a_checkpoint_says_in_what_another_fit_differs(problem, tmp_path):
     }
     before = path.read_bytes()
     for message, run in others.items():
-        with pytest.raises(ValueError, match=rf"fit.npz is the state of another fit. It differs in .*{message}"):
+        with pytest.raises(
+            ValueError, match=rf"fit.npz contains the state of another fit, which differs in .*{message}"
+        ):
             run()
     assert path.read_bytes() == before
 
@@ -103,36 +105,11 @@ def test_a_checkpoint_that_cannot_be_read_is_named(how, problem, tmp_path):
     path.write_bytes({"empty": b"", "zeros": bytes(500), "cut": data[:-40], "text": b"thesis"}.get(how, data))
     if how == "older":
         np.savez(path, key=np.array("3f" * 32), damping=np.ones(()))
-    with pytest.raises(ValueError, match=r"fit.npz cannot be read as the state of a fit .*Delete it, or name another"):
+    with pytest.raises(
+        ValueError, match=r"fit.npz cannot be read as the state of a fit .*Delete it, or choose another file"
+    ):
         minimize(problem, LeastSquares(), checkpoint=path)
     assert [p.name for p in tmp_path.iterdir()] == ["fit.npz"]
-
-
-@pytest.mark.slow
-def test_bfgs_keeps_the_best_when_it_is_interrupted(problem, monkeypatch):
-    from jaxkane.fit import _optimizers as bfgs
-
-    whole = minimize(problem, BFGS())
-    assert whole.status == "converged"
-    assert minimize(problem, BFGS(), steps=2).status == "steps"
-    step, calls = bfgs._step, []
-
-    def interrupted(*args):
-        calls.append(1)
-        if len(calls) > 6:
-            raise KeyboardInterrupt
-        return step(*args)
-
-    monkeypatch.setattr(bfgs, "_step", interrupted)
-    best = minimize(problem, BFGS())
-    assert best.status == "interrupted"
-    assert whole.cost <= best.cost < best.history[0]
-    assert best.cost == pytest.approx(problem.cost(best.point), rel=1e-10)
-    assert len(best.history) == 7
-    calls += [1] * 10
-    at_once = minimize(problem, BFGS())
-    assert at_once.status == "interrupted"
-    assert at_once.cost == at_once.history[0]
 
 
 def test_many_starts_end_with_ctrl_c(problem):
@@ -145,7 +122,7 @@ def test_many_starts_end_with_ctrl_c(problem):
 
 
 def test_studies_of_fits_end_with_ctrl_c(problem, monkeypatch):
-    import jaxkane.fit._studies as module
+    import jaxkane.fit.result.studies as module
 
     fit = minimize(problem, LeastSquares())
     stopped = lambda *args, **options: minimize(*args, **{**options, "callback": after(0)})  # noqa: E731
@@ -158,41 +135,9 @@ def test_lack_of_memory_is_not_taken_for_a_bad_start(problem, monkeypatch):
     def exhausted(*_):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 bytes.")
 
-    monkeypatch.setattr("jaxkane.fit._problem.starts_of", exhausted)
+    monkeypatch.setattr("jaxkane.fit.problem.problem.starts_of", exhausted)
     with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
         problem.linearize(problem.start)
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
-def test_a_file_may_begin_with_a_byte_order_mark(encoding, tmp_path):
-    path = tmp_path / "rides.csv"
-    path.write_text("t,angle,Länge\n0,1,2\n0.1,,3\n", encoding=encoding)
-    (trial,) = read_trials(path, {"roll": "angle", "length": "Länge"}, sigma=1.0)
-    np.testing.assert_array_equal(trial.t, [0.0, 0.1])
-    np.testing.assert_array_equal(trial.measured["roll"], [1.0, np.nan])
-    np.testing.assert_array_equal(trial.measured["length"], [2.0, 3.0])
-
-
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (b"t,angle,angle\n0,1,2\n0.1,2,3\n", "rides.csv: more than one column is called angle: which"),
-        (b"t,t,angle\n0,1,2\n0.1,2,3\n", "rides.csv: more than one column is called t: which"),
-        ("t,angle\n0,1\n0.1,2\n".encode("utf-16"), "rides.csv is no CSV file in UTF-8"),
-        ("t,angle,Länge\n0,1,2\n".encode("latin-1"), "rides.csv is no CSV file in UTF-8"),
-        (b"t,angle\n0.1,1\n0,2\n", "the times are unsorted"),
-    ],
-)
-def test_files_that_say_two_things_are_refused(data, message, tmp_path):
-    (tmp_path / "rides.csv").write_bytes(data)
-    with pytest.raises(ValueError, match=message):
-        read_trials(tmp_path / "rides.csv", {"roll": "angle"}, sigma=1.0)
-
-
-def test_columns_that_nobody_asks_for_may_be_there_twice(tmp_path):
-    (tmp_path / "rides.csv").write_text("t,angle,note,note\n0,1,,\n0.1,2,a,b\n")
-    (trial,) = read_trials(tmp_path / "rides.csv", {"roll": "angle"}, sigma=1.0)
-    np.testing.assert_array_equal(trial.measured["roll"], [1.0, 2.0])
 
 
 def masked(values, *places):
@@ -224,5 +169,12 @@ def test_what_is_masked_was_not_measured():
     ids=["function", "controller", "jax"],
 )
 def test_feedback_belongs_into_loads(inputs):
-    with pytest.raises(ValueError, match=r"(is|got) a function.*Feedback.* belongs into the system's `loads`"):
+    with pytest.raises(ValueError, match=r"got a function.*feedback.* into the system's `loads`"):
         Trial(t, {"x": SEEN}, inputs, sigma=0.1)
+
+
+def test_entries_are_compared_without_code_of_python(problem):
+    """Ctrl-C in an `__eq__` of Python comes out of JAX as a ValueError."""
+    entry = problem.parameters.entries[0]
+    assert type(entry).__eq__ is tuple.__eq__
+    assert type(entry).__hash__ is tuple.__hash__

@@ -15,15 +15,16 @@ from jaxkane.fit import (
     Gain,
     GradientDescent,
     LeastSquares,
+    Offset,
     Problem,
     Simulation,
     Trial,
-    _optimizers,
     fit,
     identifiability,
     minimize,
 )
-from jaxkane.fit._block_lsq import Blocks, eliminate
+from jaxkane.fit.solve import optimizers
+from jaxkane.fit.solve.blocks import Blocks, eliminate
 
 TRUTH = DoublePendulum(mass=1.2, length=0.7)
 GUESS = DoublePendulum(mass=1.0, length=0.8)
@@ -51,14 +52,15 @@ def swings():
 
 @pytest.fixture(scope="module")
 def problem(swings):
-    return Problem.of(GUESS, swings, ("mass", "length"), sensor_bias=("theta2",), **OPTIONS)
+    return Problem.of(GUESS, swings, ("mass", "length", Offset("theta2", each="trial")), **OPTIONS)
 
 
 @pytest.mark.slow
 def test_jacobian_against_central_differences(swings):
     tolerance = 1e-6
-    free = (Free("mass", prior=(1.0, 0.3)), "length", Gain("elbow_torque"))
-    problem = Problem.of(GUESS, swings, free, sensor_bias={"theta2": 0.1}, input_bias=("shoulder_torque",), **OPTIONS)
+    own = (Offset("theta2", each="trial", prior=(0.0, 0.1)), Offset("shoulder_torque", each="trial"))
+    free = (Free("mass", prior=(1.0, 0.3)), "length", Gain("elbow_torque"), *own)
+    problem = Problem.of(GUESS, swings, free, **OPTIONS)
     window = jax.tree.map(lambda x: x[1], problem.windows)
     point = problem.start
 
@@ -74,9 +76,9 @@ def test_jacobian_against_central_differences(swings):
 
     # The triangle that `linearize` keeps of it has the same J^T J and J^T r, priors included.
     def at(x):
-        z = jnp.zeros_like(point.z).at[1].set(x[:4])
-        b = jnp.zeros_like(point.b).at[0].set(x[4:6])
-        return eqx.tree_at(lambda p: (p.z, p.b, p.x), point, (z, b, x[6:]))
+        z = jnp.zeros_like(point.window_starts).at[1].set(x[:4])
+        b = jnp.zeros_like(point.trial_unknowns).at[0].set(x[4:6])
+        return eqx.tree_at(lambda p: (p.window_starts, p.trial_unknowns, p.parameters), point, (z, b, x[6:]))
 
     R = problem.linearize(at(x)).blocks.R[1]
     A = jnp.column_stack([exact, here])
@@ -116,7 +118,7 @@ def check(result):
         error = result.estimates[name] - float(getattr(TRUTH, name))
         assert abs(error) < 3.0 * result.standard_errors[name] < 0.1
     for trial in result.trial_names:
-        assert result.nuisance[trial]["bias of theta2"] == pytest.approx(0.05, abs=0.01)
+        assert result.nuisance[trial]["offset of theta2"] == pytest.approx(0.05, abs=0.01)
         assert np.isnan(result.residuals[trial]["theta1"]).sum() == 5
     assert "mass" in result.table(TRUTH)
 
@@ -133,7 +135,7 @@ def test_gradient_descent(problem):
 
 
 def test_any_optax_optimizer(problem):
-    check(minimize(problem, GradientDescent(optax.adam(optax.cosine_decay_schedule(0.2, 100)), rtol=1e-4)))
+    check(minimize(problem, GradientDescent(optax.adam(optax.cosine_decay_schedule(0.2, 100)), rtol=0.03)))
 
 
 def test_plain_coordinates_go_down(problem):
@@ -143,19 +145,19 @@ def test_plain_coordinates_go_down(problem):
 
 
 def test_an_interrupted_fit_keeps_the_best(problem, monkeypatch):
-    calls, step = [], _optimizers._guarded
+    calls, step = [], optimizers._guarded
 
     def interrupted(*arguments):
         calls.append(1)
-        if len(calls) > 4:
+        if len(calls) > 1:
             raise KeyboardInterrupt
         return step(*arguments)
 
-    monkeypatch.setattr(_optimizers, "_guarded", interrupted)
+    monkeypatch.setattr(optimizers, "_guarded", interrupted)
     result = minimize(problem, GradientDescent())
     assert result.status == "interrupted"
-    assert "best so far" in result.message
-    assert len(result.history) == 5
+    assert "best result so far" in result.message
+    assert len(result.history) == 2
     assert result.cost == min(result.history) < result.history[0]
 
 
@@ -186,5 +188,7 @@ def test_a_parameter_without_influence_is_named(swings):
 
 @pytest.mark.slow
 def test_a_start_that_cannot_be_simulated_is_named(swings):
-    with pytest.raises(ValueError, match=r"1\.5 s: with the initial guess from 0 to 0\.68 s there are no finite"):
+    with pytest.raises(
+        ValueError, match=r"1\.5 s: with the initial guess the residuals from 0 to 0\.68 s are not finite"
+    ):
         fit(GUESS, swings, "mass", simulation=Simulation(max_steps=1), **OPTIONS)

@@ -1,12 +1,19 @@
 """What a model lacks is found by name, what it does not lack is not; simulated pendulums whose truth is known."""
 
 import dataclasses
+import itertools
 import types
 
+import equinox as eqx
 import jax.numpy as jnp
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from systems import Track
+from systems import Cart, T, Track, programs
 
 import jaxkane as jk
 from jaxkane.fit import (
@@ -19,16 +26,17 @@ from jaxkane.fit import (
     Offset,
     Simulation,
     Trial,
-    _problem,
     compare,
     cross_validate,
     fit,
     forward_selection,
     save_report,
 )
-from jaxkane.fit._candidates import AugmentedProblem, checked_candidates, compatible_groups
-from jaxkane.fit._linearize import blocks_of
-from jaxkane.fit._statistics import bic_change
+from jaxkane.fit.extend.candidates import augmented_problem, checked_terms, compatible_groups
+from jaxkane.fit.problem import problem as problem_module
+from jaxkane.fit.result.comparison import energy_sources
+from jaxkane.fit.result.linearized import LinearizedProblem, score_test, solved
+from jaxkane.fit.result.statistics import serial_correlation
 
 TS = np.linspace(0.0, 2.0, 41)
 NOISE = {"angle": 0.004, "rate": 0.02}
@@ -78,8 +86,8 @@ FREE = ("stiffness", "damping")
 FIVE = ("dry", "quadratic", "spring", Gain("torque"), Offset("angle", scale=0.1))
 
 
-def fitted(trials, **more) -> Fit:
-    return fit(Pendulum(), trials, FREE, **{**POSED, **more})
+def fitted(trials, *free, **more) -> Fit:
+    return fit(Pendulum(), trials, (*FREE, *free), **{**POSED, **more})
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +112,8 @@ def test_dry_friction_is_found_among_five(rubbing, found):
     assert best.predicted_cost == pytest.approx(best.cost, rel=0.05)
     assert found.fit.names == (*FREE, "dry")
     assert found.fit.variance < 1.3 < rubbing.variance
-    assert best.errors["dry"] == pytest.approx(found.fit.standard_errors["dry"], rel=0.05)
+    # Clusters are enough: the scatter from trial to trial, not the formal errors.
+    assert best.errors["dry"] == pytest.approx(found.fit.clustered_errors["dry"], rel=0.05)
 
 
 @pytest.mark.slow
@@ -153,7 +162,7 @@ def test_a_beam_finds_what_an_impostor_hides(beams):
     assert {"dry", "spring"} in sets  # beside the impostor with one of them, which does the same
     assert {"both", "dry"} in sets or {"both", "spring"} in sets
     assert beam.fit.cost <= greedy.fit.cost * (1 + 1e-6)
-    assert "These data do not tell it from" in str(beam)
+    assert "These data do not distinguish it from" in str(beam)
     assert "Alternatives." in str(beam)
     assert "predicts as well" in beam._repr_html_()
     costs = [one.held_out_cost for one in beam.alternatives]
@@ -163,10 +172,10 @@ def test_a_beam_finds_what_an_impostor_hides(beams):
 @pytest.mark.slow
 def test_what_is_not_there_is_not_taken():
     taken = 0
-    for seed in range(20):
+    for seed in range(10):
         without = fitted(record(seed))
         taken += bool(forward_selection(without, ("dry", "spring", Offset("angle", scale=0.1)), refits=1).selected)
-    assert taken <= 3  # at a level of 0.05 one is expected, and more than three come once in sixty
+    assert taken <= 2  # at a level of 0.05, more than two are accepted in one of a hundred repetitions
 
 
 @pytest.mark.slow
@@ -190,14 +199,9 @@ def test_negative_friction_is_not_believed(rubbing):
 def test_one_sensor_is_off_in_all_trials():
     trials = record(3, angle=0.05)
     kinds = (Offset("angle", scale=0.1), Offset("rate"), Gain("rate"), Delay("torque"), Delay("rate"), "dry")
-    own = Candidate("zeros", sensor_bias="angle")  # of every trial: more unknowns for what is one number
-    found = forward_selection(fitted(trials), (own, *kinds), refits=2)
+    found = forward_selection(fitted(trials), kinds, refits=2)
     assert found.selected == ("offset of angle",)
     assert found.fit.estimates["offset of angle"] == pytest.approx(0.05, abs=4 * found.best.errors["offset of angle"])
-    zeros = next(row for row in found.rounds[0] if row.name == "zeros")
-    anew = fitted(trials, sensor_bias="angle")
-    assert zeros.cost == pytest.approx(anew.cost, rel=1e-5)
-    assert zeros.predicted_cost == pytest.approx(anew.cost, rel=0.05)
 
 
 @pytest.mark.slow
@@ -247,13 +251,13 @@ def test_another_system_with_a_state():
 
 @pytest.mark.slow
 def test_what_data_cannot_tell_is_said(rubbing):
-    posed = {"input_bias": "torque"}
-    found = forward_selection(
-        fitted(rubbing.problem.trials, **posed), ["unused", Offset("torque"), Candidate("own", input_gain="torque")]
-    )
+    posed = fitted(rubbing.problem.trials, Offset("torque", each="trial"))
+    found = forward_selection(posed, ["unused", Offset("torque")])
+    with pytest.raises(ValueError, match="own: a candidate with `each` is not supported"):
+        forward_selection(posed, Candidate("own", free=Gain("torque", each="trial")))
     reasons = {row.name: row.reason for row in found.rounds[0]}
     assert reasons["unused"] == "these data do not depend on unused"
-    assert reasons["offset of torque"] == "offset of torque cannot be distinguished from what is free"
+    assert reasons["offset of torque"] == "offset of torque cannot be distinguished from the free parameters"
     assert "unused" in str(found)
     assert np.isnan(next(row for row in found.rounds[0] if row.name == "unused").errors["unused"])
 
@@ -262,34 +266,39 @@ def test_what_data_cannot_tell_is_said(rubbing):
 def test_one_trial_alone(rubbing):
     alone = fitted(rubbing.problem.trials[:1])
     found = forward_selection(alone, ["dry", "spring"])
-    assert "nothing is left out" in found.tables[0][0]
+    assert "there is no held-out cost" in found.tables[0][0]
     assert np.isnan(found.rounds[0][0].held_out_cost)
     assert found.selected == ("dry",)
-    with pytest.raises(ValueError, match="one trial alone cannot be left out"):
+    with pytest.raises(ValueError, match="needs at least two trials"):
         forward_selection(alone, "dry", folds=2)
 
 
 @pytest.mark.parametrize(
     ("asked", "options", "message"),
     [
-        ((), {}, "There is no candidate"),
-        (("damping",), {}, "damping: damping is free in the fit already"),
-        (("dry", "dry"), {}, "Two candidates are called dry"),
-        (("dry", Candidate("bound", free=Free("dry", bounds=(-1.0, 1.0)))), {}, "free dry in different ways"),
+        ((), {}, "`candidates` is empty"),
+        (("damping",), {}, "damping: the fit already estimates damping"),
+        (("dry", "dry"), {}, "Two candidates have the name dry"),
+        (("dry", Candidate("bound", free=Free("dry", bounds=(-1.0, 1.0)))), {}, "free dry with different options"),
         (("dyr",), {}, "Pendulum has no parameter 'dyr'; did you mean 'dry'"),
-        ((Candidate("nothing"),), {}, "nothing: nothing is freed"),
-        ((Candidate("again", unknown="angle"),), {}, "the start of angle is unknown already"),
-        ((Candidate("a", free="dry", plausible={"dyr": (0, 1)}),), {}, "a: `plausible` names dyr"),
-        pytest.param(("dry",), {"plausible": {"dyr": (0.0, 1.0)}}, "`plausible` names dyr", marks=pytest.mark.slow),
-        (("dry",), {"plausible": {"damping": (1.0, 0.0)}}, "nothing lies between"),
-        (("dry",), {"plausible": {"dry": 0.2}}, "a share is positive, and of a start that is not zero"),
-        (("dry",), {"level": 0.0}, "`level` is a probability"),
-        (("dry",), {"depth": 0}, "`depth` is a whole number of 1"),
-        (("dry",), {"beam": 0}, "`beam` is a whole number of 1"),
-        (("dry",), {"refits": -1}, "`refits` is a whole number of 0"),
+        ((Candidate("nothing"),), {}, "nothing: the candidate adds no parameter"),
+        ((Candidate("again", unknown="angle"),), {}, "initial values of angle are already `unknown`"),
+        ((Candidate("a", free="dry", plausible={"dyr": (0, 1)}),), {}, "a: `plausible` contains unknown names: dyr"),
+        pytest.param(
+            ("dry",),
+            {"plausible": {"dyr": (0.0, 1.0)}},
+            "`plausible` contains unknown names: dyr",
+            marks=pytest.mark.slow,
+        ),
+        (("dry",), {"plausible": {"damping": (1.0, 0.0)}}, "must be less than the upper end"),
+        (("dry",), {"plausible": {"dry": 0.2}}, "a relative deviation must be positive, and needs an initial guess"),
+        (("dry",), {"level": 0.0}, "`level` must be a probability"),
+        (("dry",), {"depth": 0}, "`depth` must be an integer of at least 1"),
+        (("dry",), {"beam": 0}, "`beam` must be an integer of at least 1"),
+        (("dry",), {"refits": -1}, "`refits` must be an integer of at least 0"),
         ((Offset("angel"),), {}, "no input or channel 'angel'; did you mean 'angle'"),
         ((Gain("torque", of="start"),), {}, "no coordinate, independent speed or state 'torque'"),
-        ((Delay("angle", of="start"),), {}, "`of` is 'input' or 'sensor', or None"),
+        ((Delay("angle", of="start"),), {}, "`of` must be 'input', 'sensor' or None"),
     ],
 )
 def test_what_cannot_be_asked_is_named(rubbing, asked, options, message):
@@ -298,7 +307,7 @@ def test_what_cannot_be_asked_is_named(rubbing, asked, options, message):
 
 
 def test_what_is_asked_of_a_fit_at_a_minimum(rubbing):
-    with pytest.raises(TypeError, match="forward_selection takes a Fit"):
+    with pytest.raises(TypeError, match="forward_selection requires a Fit"):
         forward_selection(rubbing.problem, "dry")
     with pytest.raises(ValueError, match="has not converged"):
         forward_selection(dataclasses.replace(rubbing, status="steps"), "dry")
@@ -312,7 +321,7 @@ def test_fits_beside_each_other(rubbing, found):
     text = str(table)
     # Where a search starts says nothing: of what nothing is said, anything is believed.
     assert compare({"viscous": rubbing}).bound_violations["viscous"] == ()
-    for words in ("with friction", "dry", f"{found.fit.cost:.6g}", "swing 5", "neighbours' correlation", "Held out"):
+    for words in ("with friction", "dry", f"{found.fit.cost:.6g}", "swing 5", "residuals' correlation", "Held out"):
         assert words in text
     assert f"{found.fit.cost:.6g}" in table._repr_html_()
     assert "status" in text
@@ -323,42 +332,50 @@ def test_fits_beside_each_other(rubbing, found):
     ]
     said = {"damping": (0.0, 0.45), "gain of angle": 0.2}  # as a search was given
     assert compare({"viscous": rubbing}, plausible=said).bound_violations["viscous"]
-    with pytest.raises(ValueError, match="`plausible` names dampign; did you mean 'damping'"):
+    with pytest.raises(ValueError, match="`plausible` contains unknown names: dampign; did you mean 'damping'"):
         compare([rubbing], plausible={"dampign": 0.5})
-    with pytest.raises(ValueError, match="There is no fit"):
+    with pytest.raises(ValueError, match="`fits` is empty"):
         compare({})
-    with pytest.raises(TypeError, match="got one Fit"):
+    with pytest.raises(TypeError, match="`fits` is one Fit"):
         compare(rubbing)
     with pytest.raises(ValueError, match="same free parameters"):
         compare([rubbing, rubbing])
-    with pytest.raises(TypeError, match="compare takes a Fit"):
+    with pytest.raises(TypeError, match="compare requires a Fit"):
         compare([rubbing.problem])
 
 
 def test_a_fit_of_one_candidate_runs_the_program_of_all(rubbing, monkeypatch):
     """Nothing is compiled for it, and it has the derivatives of a program of its own."""
-    candidates = checked_candidates(rubbing, ["dry", Gain("torque"), "spring"])
-    order, minimum = [c.name for c in candidates], (rubbing.problem, rubbing.point)
-    augmented = AugmentedProblem.of(rubbing, minimum, candidates, (), order)
-    augmented.problem.linearize(augmented.point)
-    compiled = blocks_of.jitted._cached._cache_size()
-    fits = [augmented.with_only(candidate, np.ones(0)) for candidate in candidates]
-    together = [problem.linearize(dataclasses.replace(point, x=point.x + 0.01)) for problem, point in fits]
-    assert blocks_of.jitted._cached._cache_size() == compiled
-    monkeypatch.setattr(_problem, "MOST_SPARE_DERIVATIVES", 0)
-    for (problem, point), at in zip(fits, together, strict=True):
-        alone = problem.linearize(dataclasses.replace(point, x=point.x + 0.01))
+    asked = checked_terms(rubbing, ["dry", Gain("torque"), "spring"])
+    problem, point = augmented_problem(asked.base, (rubbing.problem, rubbing.point, rubbing.names), asked.candidates)
+    problem.linearize(point)
+    compiled = programs()
+
+    def of_one(i):
+        parameters = problem.parameters.subset([0, 1, 2 + i], point.parameters)
+        one = dataclasses.replace(problem, model=eqx.tree_at(lambda m: m.parameters, problem.model, parameters))
+        return one, dataclasses.replace(point, parameters=point.parameters[parameters.places] + 0.01)
+
+    fits = [of_one(i) for i in range(3)]
+    together = [one.linearize(at) for one, at in fits]
+    assert programs() <= compiled
+    monkeypatch.setattr(problem_module, "MOST_SPARE_DERIVATIVES", 0)
+    for (one, moved), at in zip(fits, together, strict=True):
+        alone = one.linearize(moved)
         assert at.blocks.n_x == alone.blocks.n_x == 3
         np.testing.assert_allclose(at.simulated, alone.simulated, rtol=1e-12)
         squares = [np.swapaxes(R, 1, 2) @ np.asarray(R) for R in (at.blocks.R, alone.blocks.R)]
         np.testing.assert_allclose(*squares, rtol=1e-10, atol=1e-10)
-    assert blocks_of.jitted._cached._cache_size() == compiled + 1
+    assert len(programs() - compiled) == 1
 
 
 def test_a_page_of_the_report(found, tmp_path):
     page = save_report(found.fit, tmp_path / "fit.html", forward_selection=found).read_text(encoding="utf-8")
     assert "Model extensions" in page
     assert "no more than chance" in page
+    ticks = [label.get_text() for label in jk.plot.selection_path(found).get_xticklabels()]
+    assert ticks == ["before", *found.selected]
+    plt.close("all")
     assert "Selected: dry" in found._repr_html_()
 
 
@@ -378,20 +395,11 @@ class Squared(Track):
         return super().loads(t, q, u, motion, {"push": inputs["push"] ** 2})
 
 
-def test_the_criterion_of_what_is_not_nested():
-    """By hand, n log(after / before) + k log n; residuals that correlate are fewer."""
-    rtol = 1e-12
-    assert bic_change(3836.0, 455.0, 0, 400, 0.0) == pytest.approx(400 * np.log(455 / 3836), rel=rtol)
-    assert bic_change(100.0, 99.0, 2, 400, 0.0) == pytest.approx(400 * np.log(0.99) + 2 * np.log(400), rel=rtol)
-    assert bic_change(100.0, 90.0, 2, 400, 0.5) == pytest.approx(400 / 3 * np.log(0.9) + 2 * np.log(400 / 3), rel=rtol)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("n", "criterion"), [(4, "trials left out"), (1, "BIC")])
-def test_what_is_not_nested_is_no_matter_of_an_f_test(n, criterion):
-    """Another system without one parameter more, beside what is promising, with one refit."""
+def test_a_candidate_that_is_not_nested():
+    """Another system without one parameter more, beside what is promising, with one refit: trials left out decide."""
     rng, times, trials = np.random.default_rng(7), np.linspace(0.0, 3.0, 31), []
-    for i in range(n):
+    for i in range(4):
         push = 2.0 * np.sin(2.0 * times + i)
         ride = jk.simulate(Squared(gain=1.5, drift=-0.4), jk.State({"x": 0.2}, {"x_dot": 0.0}), jnp.asarray(times),
                            {"push": jnp.asarray(push)}, step=0.05)  # fmt: skip
@@ -404,11 +412,213 @@ def test_what_is_not_nested_is_no_matter_of_an_f_test(n, criterion):
     row = next(row for row in found.rounds[0] if row.name == "squared")
     assert row.cost == pytest.approx(right.cost, rel=1e-4)
     assert row.cost < 0.1 * wrong.cost
-    assert (row.criterion, row.accepted, np.isnan(row.p)) == (criterion, True, True)
+    assert (row.criterion, row.accepted, np.isnan(row.p)) == ("trials left out", True, True)
     assert found.selected == ("squared",)
-    assert f"squared (not nested: by {criterion})" in found.conclusion
-    assert criterion in str(found)
-    back = forward_selection(right, Candidate("not squared", system=Track()))
-    assert not back.selected
-    assert back.rounds[0][0].criterion == criterion
+    assert "squared (not nested: by trials left out)" in found.conclusion
+    assert not forward_selection(right, Candidate("not squared", system=Track())).selected
     assert forward_selection(wrong, asked, refits=0).rounds[0][-1].reason == "not nested, not fitted"
+    alone = fit(Track(), trials[:1], ["gain", "drift"], **posed)
+    (row,) = forward_selection(alone, asked[0]).rounds[0]
+    assert row.reason == "not nested, and no trial can be left out"
+
+
+class Loaded(Cart):
+    """A cart with forces that a search may add."""
+
+    drag: jk.Scalar = jk.parameter(0.0)  # [N s^2/m^2]
+    cubic: jk.Scalar = jk.parameter(0.0)  # [N/m^3]
+    other: jk.Scalar = jk.parameter(0.0)  # [N s/m]
+
+    def loads(self, t, q, u, motion, inputs):
+        x, v = q["x"], u["x_dot"]
+        more = self.drag * jk.loads.quadratic(v, 1.0) + self.cubic * x**3 + self.other * jnp.sin(3.0 * v) / 3.0
+        return (*super().loads(t, q, u, motion, inputs), jk.Force(-more * motion.N.x, motion["cart"]))
+
+
+TIMES = np.linspace(0.0, 3.0, 31)
+POSE = {"optimizer": LeastSquares(), "simulation": Simulation(step=0.1)}
+
+
+def carts(force, n=6, seed=0, sigma=0.01, mass=1.0, noise=None, size=lambda i: 1.0, **more):
+    """Trials of x'' = push - 4 x - force(x, x'), by Runge and Kutta. `noise`: (n, n_t) in units of sigma."""
+    rng, trials = np.random.default_rng(seed), []
+    for i in range(n):
+        push, state, xs = size(i) * 3.0 * np.sin((1.5 + 0.3 * i) * TIMES + i), np.array([0.3, 0.0]), [0.3]
+        for a, b in itertools.pairwise(push):
+            for k in range(4):
+                rate = lambda s, f: np.array([s[1], f - 4.0 * s[0] - force(*s)])  # noqa: E731
+                f, h = a + (b - a) * (k + np.array([0.0, 0.5, 1.0])) / 4, 0.025
+                k1 = rate(state, f[0])
+                k2 = rate(state + h / 2 * k1, f[1])
+                k3 = rate(state + h / 2 * k2, f[1])
+                state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(state + h * k3, f[2]))
+            xs.append(state[0])
+        y = np.array(xs) + sigma * (rng.normal(size=31) if noise is None else noise[i])
+        labels = {key: value(i) for key, value in more.items()}
+        start = {"x": 0.3, "x_dot": 0.0}
+        trials.append(Trial(TIMES, {"x": y}, {"push": mass * push}, sigma=sigma, initial=start, labels=labels))
+    return trials
+
+
+def loaded(trials, free=("stiffness",), **values):
+    return fit(Loaded(**{"damping": 0.0, **values}), trials, free, **POSE)
+
+
+def row_of(found, name):
+    return next(row for round in found.rounds for row in round if row.name == name)
+
+
+def test_units_do_not_matter():
+    """Masses of 1e-12 and 1e12 kg: a candidate that starts at zero has a scale of its own."""
+    rows = []
+    for mass in (1.0, 1e-12, 1e12):
+        trials = carts(lambda x, v: 0.3 * v, n=4, mass=mass)
+        found = forward_selection(loaded(trials, mass=mass, stiffness=4.0 * mass), ["damping", Offset("push")])
+        assert found.selected == ("damping",)
+        assert found.fit.identifiability.ok
+        assert found.fit.estimates["damping"] == pytest.approx(0.3 * mass, rel=0.03)
+        rows.append([(row.name, row.cost, row.predicted_cost, row.p) for row in found.rounds[0]])
+    for other in rows[1:]:
+        for one, same in zip(rows[0], other, strict=True):
+            assert one[0] == same[0]
+            assert one[1:] == pytest.approx(same[1:], rel=1e-4)
+
+
+def test_refits_that_were_asked_for_are_made():
+    """However little a score test says of a candidate: the linearization may hardly see a damper."""
+    found = forward_selection(
+        loaded(carts(lambda x, v: 0.3 * v, n=3)), ["drag", "cubic", "other", Gain("x")], level=1e-9
+    )
+    assert sum(np.isfinite(row.cost) for row in found.rounds[0]) == 3
+    fitted_rows = [row for row in found.rounds[0] if np.isfinite(row.cost)]
+    assert {row.criterion for row in fitted_rows} == {"Wald test"}
+    assert all(row.reason == "no more than chance" for row in found.rounds[0] if row.p >= 1e-9 / 4)
+
+
+def test_a_term_is_replaced():
+    """The fit has viscous friction, the cart has drag: nothing else is left of it once drag is there."""
+    before = loaded(carts(lambda x, v: 0.3 * v * abs(v)), ("stiffness", "damping"), damping=0.2)
+    found = forward_selection(before, ["drag", "cubic"], remove="damping")
+    assert (found.selected, found.removed) == (("drag",), ())  # the value of the system, 0.2, would stay
+    without = fit(Loaded(damping=0.0), before.problem.trials, ["stiffness", Free("damping", start=0.1)], **POSE)
+    found = forward_selection(without, ["drag", "cubic"], remove="damping")
+    assert (found.selected, found.removed) == (("drag",), ("damping",))
+    assert found.fit.names == ("stiffness", "drag")
+    assert found.fit.estimates["drag"] == pytest.approx(0.3, abs=0.02)
+    assert found.best.name == "drag instead of damping"
+    assert found.best.predicted_cost == pytest.approx(found.best.cost, rel=0.3)  # about the dropped one at zero
+    assert "Removed: damping." in found.conclusion
+    assert found.fit.cost == pytest.approx(found.best.cost, rel=1e-6)
+    kept = forward_selection(without, ["drag"])
+    assert kept.fit.names == ("stiffness", "damping", "drag")
+    with pytest.raises(ValueError, match="`remove` contains unknown names: dampign"):
+        forward_selection(without, "drag", remove="dampign")
+
+
+def test_a_pair_of_which_neither_is_accepted_alone():
+    """Two forces that are nearly alike, with opposite signs: only their difference acts."""
+    trials = carts(lambda x, v: v - 1.6 * np.sin(3.0 * v) / 3.0, sigma=0.02, size=lambda i: 0.25)
+    before = loaded(trials)
+    alone = forward_selection(before, ["damping", "other", "cubic"], depth=2)
+    assert not alone.selected
+    found = forward_selection(before, ["damping", "other", "cubic"], depth=2, exchange=True)
+    assert found.selected == ("damping", "other")
+    assert found.best.name == "damping and other"
+    assert found.best.p < 0.01
+    with pytest.raises(ValueError, match="needs at least two trials"):
+        forward_selection(loaded(trials[:1]), "damping", exchange=True)
+
+
+def test_what_cannot_be_negative_is_tested_on_one_side():
+    before = loaded(carts(lambda x, v: 0.006 * v, sigma=0.02))
+    both = row_of(forward_selection(before, "damping", refits=0), "damping")
+    one = row_of(forward_selection(before, Free("damping", bounds=(0.0, None)), refits=0), "damping")
+    other = row_of(forward_selection(before, "damping", plausible={"damping": (None, 0.0)}, refits=0), "damping")
+    assert both.values["damping"] > 0
+    assert one.p == pytest.approx(both.p / 2, rel=1e-6)
+    assert other.p == pytest.approx(1 - both.p / 2, rel=1e-6)
+    assert other.bound_violations
+
+
+def test_trials_of_another_kind_are_held_out():
+    """A cubic spring stands in for drag as long as all amplitudes are alike."""
+    trials = carts(lambda x, v: 0.5 * v, n=6, size=lambda i: 1.0 + i % 2, amplitude=lambda i: 1 + i % 2)
+    found = forward_selection(loaded(trials), "damping", folds="amplitude")
+    assert found.held_out == "each amplitude: 1.0, 2.0"
+    assert "each amplitude: 1.0, 2.0" in found.conclusion
+    by_numbers = forward_selection(loaded(trials), "damping", folds=[[0, 2, 4], [1, 3, 5]])
+    assert found.held_out_costs == by_numbers.held_out_costs
+    left_out = cross_validate(loaded(trials), folds="amplitude")
+    assert "(left out: each amplitude: 1.0, 2.0)" in left_out.conclusion
+    with pytest.raises(ValueError, match="trial has no label 'speed'; the labels of these trials are: amplitude"):
+        cross_validate(found.fit, folds="speed")
+    with pytest.raises(ValueError, match=r"all trials have the same amplitude, 1\.0"):
+        cross_validate(loaded(trials[::2]), folds="amplitude")
+
+
+def test_estimates_that_were_free_before_are_judged_too():
+    """A negative damping makes up for an offset: it is named, and it is no reason against what is found."""
+    trials = carts(lambda x, v: -0.1 * v + 0.3)
+    before = loaded(trials, ("stiffness", "damping"))
+    found = forward_selection(before, Offset("push"), plausible={"damping": (0.0, None)})
+    assert found.selected == ("offset of push",)
+    (violation,) = found.bound_violations
+    assert violation.startswith("damping = -0.1")
+    assert violation.endswith("is below 0")
+    assert f"Not plausible: {violation}." in found.conclusion
+    # Nobody has said what is plausible: what adds energy at every instant is not. A spring or an offset does not.
+    sources = energy_sources(found.fit)
+    assert [*sources] == ["damping"]
+    assert "adds energy at every sample" in sources["damping"]
+    assert energy_sources(loaded(carts(lambda x, v: 0.1 * v), ("stiffness", "damping"))) == {}
+
+
+def test_a_parameter_rests_at_its_bound():
+    """Predictions do not move it beyond the bound. The fit of a candidate may take it off the bound."""
+    trials = carts(lambda x, v: 0.1 * v - 0.2 * np.sin(3.0 * v), n=4, sigma=0.02, size=lambda i: 0.25)
+    before = loaded(trials, ("stiffness", Free("damping", start=0.1, bounds=(0.0, None))))
+    assert before.status == "bound"
+    found = forward_selection(before, ["other", Offset("x")], refits=2)
+    assert found.held_out_costs[0] == pytest.approx(before.held_out_cost, rel=1e-6)
+    offset, other = (row_of(found, name) for name in ("offset of x", "other"))
+    assert offset.predicted_cost == pytest.approx(offset.cost, rel=0.01)  # beyond the bound: lower by an eighth
+    assert offset.values["damping"] == pytest.approx(0.0, abs=1e-6)
+    assert other.values["damping"] == pytest.approx(0.1, abs=0.05)
+
+
+def test_a_thrust_is_no_negative_damping():
+    """It adds energy as long as the cart moves forward, but not if the same motion is run backwards."""
+    forward = Trial(T, {"x": 0.4 * T**2}, {"push": 0.0 * T}, sigma=0.1)
+    assert energy_sources(fit(Track(), forward, "drift", simulation=Simulation(step=0.1))) == {}
+
+
+def white(rng, *shape):
+    return rng.normal(size=shape)
+
+
+def slow(rng, *shape):
+    """White noise with a slow error of 0.4 sigma, of which neighbours correlate by 0.14 only."""
+    e = rng.normal(size=shape)
+    for k in range(1, shape[-1]):
+        e[..., k] = 0.95 * e[..., k - 1] + (1 - 0.95**2) ** 0.5 * e[..., k]
+    return rng.normal(size=shape) + 0.4 * e
+
+
+@pytest.mark.parametrize("noise", [white, slow])
+@pytest.mark.parametrize("T", [3, 6, 12])
+def test_false_positives(T, noise):
+    """Of 300 sets without any of three candidates, at a level of 5 %: at most 6 %, plus what 300 draws may be off."""
+    rng, times, taken = np.random.default_rng(T), np.linspace(0.0, 6.0, 60), 0
+    for _ in range(300):
+        rates = np.array([1.0, 2.2, 1.5, 3.1, 0.6]) * (1 + 0.2 * rng.normal(size=(T, 1, 5)))
+        A = np.sin(rates * times[:, None] + rng.uniform(0, 6, (T, 1, 5)))
+        r = noise(rng, T, times.size)
+        x = solved(A[..., :2].reshape(-1, 2), r.ravel())
+        r = r + A[..., :2] @ x  # at the minimum of the model with two parameters
+        residuals = {f"{k}": {"y": r[k]} for k in range(T)}
+        rows = LinearizedProblem(np.concatenate([A, r[..., None]], axis=2), np.zeros((5, 6)),
+                                 np.linalg.norm(A, axis=(0, 1)))  # fmt: skip
+        c, freedom = max(serial_correlation(residuals).values()), r.size - 2
+        p = [score_test(rows, [0, 1], [i], degrees_of_freedom=freedom, correlation=c).p for i in (2, 3, 4)]
+        taken += min(p) < 0.05 / 3
+    assert taken / 300 <= 0.06 + 2 * (0.05 * 0.95 / 300) ** 0.5, taken / 300

@@ -1,5 +1,7 @@
 """What a fit reports, against linear least squares in closed form: every number is computed here a second time."""
 
+import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -10,21 +12,23 @@ from systems import Track
 from jaxkane.fit import (
     Free,
     LeastSquares,
+    Offset,
     Problem,
     Simulation,
     Trial,
+    bootstrap,
     compare,
     cross_validate,
     fit,
     identifiability,
-    laplace,
     minimize,
     profile,
     report,
     validate,
 )
+from jaxkane.fit.result.statistics import _freedom_of
 
-TIGHT = 1e-6
+TIGHT, METHOD = 1e-6, LeastSquares(rtol=1e-12)
 t = np.arange(0.0, 4.0, 0.1)
 N = 6
 SIGMA = np.repeat([0.02, 0.05], t.size)  # of positions [m], then speeds [m/s], as all rows of a trial
@@ -104,11 +108,12 @@ def by_trial(records):
 
 
 FREE = (Free("gain", prior=PRIOR), "drift")
-OPTIONS = {"unknown": ("x", "x_dot"), "sensor_bias": {"x": BIAS}}
+OWN = Offset("x", each="trial", prior=(0.0, BIAS))
+OPTIONS = {"unknown": ("x", "x_dot")}
 
 
 def fitted(records, *free, start=None, **options):
-    problem = Problem.of(Track() if start is None else start, trials_of(records), free, **(OPTIONS | options))
+    problem = Problem.of(Track() if start is None else start, trials_of(records), (*free, OWN), **(OPTIONS | options))
     return minimize(problem, LeastSquares(rtol=1e-14, damping=1e-7))
 
 
@@ -117,29 +122,44 @@ def case(request):
     records = recorded(1, wander=request.param)
     found = fitted(records, *FREE)
     assert found.ok, found.message
-    assert found.uses_clustered_errors == (request.param > 0)
+    assert found.uses_clustered_errors
     A, y = dense(records)
     best = np.linalg.lstsq(A, y, rcond=None)[0]
     return records, found, A, y, best
 
 
 def left_out_in_turn(rows, priors):
-    """The jackknife: all solved for again without each of the `rows`, beside `priors`, which were measured apart."""
+    """The jackknife: all solved for again without each of the `rows`, beside `priors`, which were measured apart. It is
+    scaled to be unbiased for white errors; with the degrees of freedom of its variances.
 
-    def solved(left):
-        A = np.vstack([*left, priors])
-        return np.linalg.lstsq(A[:, :-1], A[:, -1], rcond=None)[0]
+    Every estimate is a matrix times the right-hand sides; so is its change if a cluster is left out.
+    """
+    ends = np.cumsum([0, *map(len, rows)])
+    A = np.vstack([*rows, priors])
+    of_data = np.arange(len(A)) < ends[-1]
 
-    best, G = solved(rows), len(rows)
-    moved = np.array([solved(rows[:g] + rows[g + 1 :]) - best for g in range(G)])
-    whole = np.vstack([*rows, priors])[:, :-1]
-    bread = np.linalg.inv(whole.T @ whole)
-    return best, (G - 1) / G * moved.T @ moved + bread @ (priors[:, :-1].T @ priors[:, :-1]) @ bread
+    def estimator(left_out):
+        kept = np.setdiff1d(np.arange(len(A)), left_out)
+        matrix = np.zeros(A[:, :-1].T.shape)
+        matrix[:, kept] = np.linalg.pinv(A[kept, :-1])
+        return matrix
+
+    whole = estimator([])
+    moved = np.array([estimator(np.arange(*pair)) - whole for pair in itertools.pairwise(ends)])  # (G, n, m)
+    d, O = moved @ A[:, -1], np.einsum("gnm,hnm->ngh", moved[..., of_data], moved[..., of_data])
+    trace = np.einsum("ngg->n", O)
+    of_priors = whole[:, ~of_data] @ whole[:, ~of_data].T
+    scale = np.sum(whole[:, of_data] ** 2, axis=1) / trace
+    C = d.T @ d * np.sqrt(np.outer(scale, scale)) + of_priors
+    share = scale * np.sum(d**2, axis=0) / C.diagonal()
+    freedom = [_freedom_of(np.linalg.eigvalsh(of / tr)) for of, tr in zip(O, trace, strict=True)]
+    return whole @ A[:, -1], C, freedom / share**2
 
 
 def errors_by_trial(records):
+    """The covariance, and its degrees of freedom."""
     rows = [np.column_stack(pair) for pair in by_trial(records)]
-    return left_out_in_turn(rows, np.array([[1.0, 0.0, PRIOR[0]]]) / PRIOR[1])[1]
+    return left_out_in_turn(rows, np.array([[1.0, 0.0, PRIOR[0]]]) / PRIOR[1])[1:]
 
 
 def formal(A, y, priors=N + 1):
@@ -154,12 +174,12 @@ def formal(A, y, priors=N + 1):
 def test_estimates_and_formal_errors(case):
     records, found, A, y, best = case
     np.testing.assert_allclose(list(found.estimates.values()), best[:2], rtol=TIGHT)
-    own = [[x["start of x"][0], x["start of x_dot"][0], x["bias of x"]] for x in found.nuisance.values()]
+    own = [[x["start of x"][0], x["start of x_dot"][0], x["offset of x"]] for x in found.nuisance.values()]
     np.testing.assert_allclose(np.ravel(own), best[2:], rtol=TIGHT, atol=TIGHT)
     rss = np.sum((A @ best - y) ** 2)
     assert found.cost == pytest.approx(rss, rel=TIGHT)
     C, variance, freedom = formal(A, y)
-    assert found.degrees_of_freedom == pytest.approx(N - 1 if found.uses_clustered_errors else freedom, rel=TIGHT)
+    assert found.identifiability.degrees_of_freedom == pytest.approx(freedom, rel=TIGHT)
     assert found.variance == pytest.approx(variance, rel=TIGHT)
     np.testing.assert_allclose(found.covariance, C[:2, :2], rtol=10 * TIGHT)
     assert found.correlation[0, 1] == pytest.approx(C[0, 1] / np.sqrt(C[0, 0] * C[1, 1]), rel=TIGHT)
@@ -176,7 +196,10 @@ def test_estimates_and_formal_errors(case):
 
 def test_errors_by_trial(case):
     records, found, *_ = case
-    np.testing.assert_allclose(found.clustered_covariance, errors_by_trial(records), rtol=1e-4)
+    C, freedom = errors_by_trial(records)
+    np.testing.assert_allclose(found.clustered_covariance, C, rtol=1e-4)
+    assert [*found.degrees_of_freedom.values()] == pytest.approx(freedom, rel=1e-3)
+    assert [*found.error_kinds.values()] == ["trial", "trial"]
 
 
 @pytest.mark.slow
@@ -197,19 +220,21 @@ def test_errors_by_window():
             rows.append(all_of_it - Q @ (Q.T @ all_of_it))
     priors = np.column_stack([np.diag([1 / PRIOR[1], 0, 1 / BIAS, 1 / BIAS]), [PRIOR[0] / PRIOR[1], 0, 0, 0]])
 
-    best, C = left_out_in_turn(rows, priors)
+    best, C, _ = left_out_in_turn(rows, priors)
     np.testing.assert_allclose(list(found.estimates.values()), best[:2], rtol=TIGHT)
     np.testing.assert_allclose(found.clustered_covariance, C[:2, :2], rtol=1e-4)
     # With links between them windows are no longer apart.
     chained = fitted(records, *FREE, window=1.0, defect_std={"x": 0.1, "x_dot": 0.1})
     assert chained.clusters == ("", 0)
     assert np.all(np.isnan(chained.clustered_covariance))
+    with pytest.raises(ValueError, match="bootstrap: 2 trials are too few"):
+        bootstrap(chained)
 
 
 def test_intervals_and_profiles_have_the_same_freedom(case):
     records, found, *_, best = case
-    C = errors_by_trial(records) if found.uses_clustered_errors else found.covariance
-    half = stats.t.ppf(0.95, found.degrees_of_freedom) * np.sqrt(C.diagonal())
+    C, freedom = errors_by_trial(records)
+    half = stats.t.ppf(0.95, freedom) * np.sqrt(C.diagonal())
     for i, name in enumerate(("gain", "drift")):
         low, high = best[i] - half[i], best[i] + half[i]
         assert found.intervals(0.9)[name] == pytest.approx((low, high), abs=1e-4 * half[i])
@@ -220,12 +245,12 @@ def test_intervals_and_profiles_have_the_same_freedom(case):
 def test_what_a_plan_will_determine_follows_from_sigma():
     """Simulated measurements are met exactly: what the plan determines depends on `sigma` alone."""
     records = [C @ [1.0, 0.0, 0.1, -0.2, 0.0] for C in COLUMNS]
-    seen = identifiability(Problem.of(Track(), trials_of(records), FREE, **OPTIONS))
+    seen = identifiability(Problem.of(Track(), trials_of(records), (*FREE, OWN), **OPTIONS))
     A = dense(records)[0]
     np.testing.assert_allclose(seen.covariance, np.linalg.inv(A.T @ A)[:2, :2], rtol=TIGHT)
     assert seen.ok
     loud = [Trial(x.t, x.measured, x.inputs, sigma=1e4 * SIGMA[0]) for x in trials_of(records)]
-    assert not identifiability(Problem.of(Track(), loud, ("gain", "drift"), **OPTIONS)).ok
+    assert not identifiability(Problem.of(Track(), loud, ("gain", "drift", OWN), **OPTIONS)).ok
 
 
 def test_trials_left_out(case):
@@ -247,15 +272,17 @@ def test_trials_left_out(case):
 
 def test_the_held_out_cost_is_that_of_fits_of_the_others(case):
     rtol = 1e-5  # of starts and offsets that are searched for
-    options = OPTIONS | {"sensor_bias": {"x_dot": 0.5}}  # which starts cannot stand for
-    found = fit(Track(), trials_of(recorded(3)), ("gain", "drift"), **options)
+    free = ("gain", "drift", Offset("x_dot", each="trial", prior=(0.0, 0.5)))  # which starts cannot stand for
+    found = fit(Track(), trials_of(recorded(3)), free, **OPTIONS)
     assert found.held_out_cost == pytest.approx(cross_validate(found).held_out.sum(), rel=rtol)
     assert found.held_out_cost > found.cost
     told = f"{found.held_out_cost:.6g}"
     assert f"({told} of trials left out in turn)" in str(found)
     assert f"({told} of trials left out in turn)" in report(found)
-    alone = fit(Track(), trials_of(recorded(3))[:1], ("gain", "drift"), **options)
-    for other in (alone, case[1], validate(found, trials_of(recorded(4)))):  # one trial; a prior; nothing was fitted
+    alone = fit(Track(), trials_of(recorded(3))[:1], free, **OPTIONS)
+    with_prior = case[1]
+    assert with_prior.held_out_cost == pytest.approx(cross_validate(with_prior).held_out.sum(), rel=1e-4)
+    for other in (alone, validate(found, trials_of(recorded(4)))):  # one trial; nothing was fitted
         assert math.isnan(other.held_out_cost)
         assert "left out in turn" not in str(other)
     row = next(line for line in str(compare({"all": found, "one": alone})).splitlines() if "left out in turn" in line)
@@ -268,9 +295,9 @@ def test_the_evidence_is_the_density_of_the_data():
     at_rest = trials_of(records, initial={"x": 0.0, "x_dot": 0.0})
     free = (Free("gain", prior=(1.0, 0.5), scale=7.0), Free("drift", prior=(0.0, 2.0)))
     starts = {"x": 0.4, "x_dot": 0.3}
-    gaussian = laplace(
-        minimize(Problem.of(Track(), at_rest, free, **(OPTIONS | {"unknown": starts})), LeastSquares(rtol=1e-14))
-    )
+    gaussian = minimize(
+        Problem.of(Track(), at_rest, (*free, OWN), **(OPTIONS | {"unknown": starts})), LeastSquares(rtol=1e-14)
+    ).laplace()
     y, sigma = np.concatenate(records), np.tile(SIGMA, N)
     y, sigma = y[np.isfinite(y)], sigma[np.isfinite(y)]
     A = dense(records)[0][: -N - 1] * sigma[:, None]
@@ -292,7 +319,7 @@ def evidence():
     records = recorded(2)
 
     def of(*free):
-        return laplace(fitted(records, *free, start=Track(gain=1.1, drift=0.2)))
+        return fitted(records, *free, start=Track(gain=1.1, drift=0.2)).laplace()
 
     return of
 
@@ -339,7 +366,7 @@ def test_a_wider_prior_pays_for_itself(evidence):
     assert np.isnan(none.log_evidence)
     assert "any value of gain is as likely" in none.message
     assert none.sample(3)["gain"].shape == (3,)
-    with pytest.raises(ValueError, match="`n` is how many are drawn"):
+    with pytest.raises(ValueError, match="`n` must be an integer"):
         none.sample(-1)
 
 
@@ -347,7 +374,7 @@ def test_what_has_no_influence_takes_no_error_from_the_others():
     """Without a push its gain is free: infinite errors of both kinds, and those of the drift as without it."""
     trials = [Trial(t, x.measured, {"push": 0.0 * t}, sigma=SIGMA[0]) for x in trials_of(recorded(5, wander=0.2))]
     both, alone = (
-        minimize(Problem.of(Track(), trials, free, **OPTIONS), LeastSquares(rtol=1e-14))
+        minimize(Problem.of(Track(), trials, (*free, OWN), **OPTIONS), LeastSquares(rtol=1e-14))
         for free in (("gain", "drift"), ("drift",))
     )
     assert both.uses_clustered_errors
@@ -364,7 +391,7 @@ def test_the_verdict_does_not_know_units():
         trials = trials_of(records)
         for trial in trials:
             trial.inputs["push"] = trial.inputs["push"] * unit
-        problem = Problem.of(Track(gain=1.1 / unit, drift=0.2), trials, ("gain", "drift"), **OPTIONS)
+        problem = Problem.of(Track(gain=1.1 / unit, drift=0.2), trials, ("gain", "drift", OWN), **OPTIONS)
         return minimize(problem, LeastSquares(rtol=1e-12))
 
     for noise in (0.0, 300.0):
@@ -373,6 +400,21 @@ def test_the_verdict_does_not_know_units():
         assert other.ok == one.ok == (noise == 0.0)
         assert len(other.identifiability.messages) == len(one.identifiability.messages)
         assert other.standard_errors["gain"] == pytest.approx(1e3 * one.standard_errors["gain"], rel=1e-6)
+
+
+def test_the_verdict_does_not_know_the_start():
+    """A small initial guess is a small scale; the estimate is known to a hundredth of itself all the same."""
+    trials = trials_of(recorded(3))
+    for start in (1.0, 1e-6):
+        found = minimize(Problem.of(Track(gain=start, drift=0.2), trials, ("gain", "drift", OWN), **OPTIONS), METHOD)
+        assert found.ok, found
+        assert found.standard_errors["gain"] < 0.05 * found.estimates["gain"]
+    # The data say of a value that is zero within its error no more than before.
+    flat = [Trial(x.t, {"x_dot": SIGMA[-1] * np.random.default_rng(k).normal(size=t.size)}, x.inputs, sigma=SIGMA[-1])
+            for k, x in enumerate(trials)]  # fmt: skip
+    unknown = {**OPTIONS, "unknown": "x_dot"}
+    found = minimize(Problem.of(Track(gain=1e-6, drift=0.2), flat, ("gain", "drift"), **unknown), METHOD)
+    assert "gain is undetermined" in found.message
 
 
 def test_as_many_unknowns_as_residuals():
@@ -398,3 +440,50 @@ def test_outputs_are_channels_of_their_own():
     double = Trial(t, {"double": 2.0 * x}, push, sigma=0.2)
     found = fit(Doubled(), double, "gain", **fixed)
     assert found.estimates["gain"] == pytest.approx(column @ x / (column @ column), rel=TIGHT)
+
+
+def test_errors_by_part():
+    """Two trials of three parts: each part is left out in turn. Starts and offsets are estimated again too."""
+    records = recorded(2, wander=0.2)[:2]
+    found = fitted(records, *FREE)
+    assert found.clusters == ("part", 6)
+    rows = []  # by gain, drift, and of each trial start, speed, offset
+    for k, (C, record) in enumerate(zip(COLUMNS, records, strict=False)):
+        A, y = weighed(C, record)
+        for w in range(3):
+            at = np.tile(np.arange(t.size) // -(-t.size // 3) == w, 2)
+            own = np.zeros((at.sum(), 6))
+            own[:, 3 * k : 3 * k + 3] = A[at, 2:]
+            rows.append(np.column_stack([A[at][:, :2], own, y[at]]))
+    priors = np.zeros((3, 9))
+    priors[0, [0, -1]], priors[1, 4], priors[2, 7] = [1 / PRIOR[1], PRIOR[0] / PRIOR[1]], 1 / BIAS, 1 / BIAS
+    best, C, _ = left_out_in_turn(rows, priors)
+    np.testing.assert_allclose(list(found.estimates.values()), best[:2], rtol=TIGHT)
+    np.testing.assert_allclose(found.clustered_covariance, C[:2, :2], rtol=1e-3)
+
+
+def test_the_held_out_cost_beside_a_bound():
+    """A parameter at its bound is fixed: as in a fit that does not free it."""
+    records, bounded = trials_of(recorded(3)), Free("gain", start=0.5, bounds=(0.0, 1.0))  # it is 1.2
+    at_bound = fit(Track(), records, (bounded, "drift"), **OPTIONS)
+    fixed = fit(Track(gain=1.0), records, "drift", **OPTIONS)
+    assert at_bound.identifiability.at_bound == ("gain",)
+    at_bound = dataclasses.replace(at_bound, status="converged")
+    assert at_bound.held_out_cost == pytest.approx(fixed.held_out_cost, rel=1e-3)
+    assert at_bound.message.startswith("converged: gain rests at its bound")
+
+
+def test_the_priors_of_a_subset_are_its_own():
+    """Of three parameters, the last alone with its prior: as one that was never posed with the others."""
+    records = trials_of(recorded(3))
+    priors = (Free("gain", prior=(1.0, 0.5), bounds=(0.0, 9.0)), Free("drift", prior=(0.1, 0.01)))
+    problem = Problem.of(Track(), records, priors, **OPTIONS)
+    subset = problem.parameters.subset([1], problem.start.parameters)
+    problem = dataclasses.replace(problem, model=dataclasses.replace(problem.model, parameters=subset))
+    alone = Problem.of(Track(), records, priors[1], **OPTIONS)
+    assert subset.log_prior_constants == pytest.approx(alone.parameters.log_prior_constants)
+    point = dataclasses.replace(problem.start, parameters=alone.start.parameters)
+    assert problem.cost(point) == pytest.approx(alone.cost(alone.start), rel=TIGHT)
+    assert minimize(problem, LeastSquares(), start=point).estimates == pytest.approx(
+        minimize(alone, LeastSquares()).estimates, rel=1e-5
+    )

@@ -9,7 +9,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.fit import LeastSquares, Trial, fit_bicycle
+from jaxkane.fit import LeastSquares, Offset, Trial, fit_bicycle
 
 STARTS = {"roll": 0.1, "steer": None, "roll_rate": None, "steer_rate": None}
 
@@ -45,10 +45,11 @@ def test_the_damping_of_the_robot_bicycle(steered):
     bicycle = WhippleBicycle.from_parameters(jk.data.robot_bicycle().parameters)
     options = {
         "unknown": STARTS,
-        "input_bias": {"roll_torque": 10.0, "steer_torque": 0.5},
         "zero_order_hold": ("steer_torque",),
     }
-    found = fit_bicycle(steered, bicycle, "steer_damping", optimizer=LeastSquares(), **options)
+    torques = {"roll_torque": 10.0, "steer_torque": 0.5}
+    offsets = [Offset(name, each="trial", prior=(0.0, deviation)) for name, deviation in torques.items()]
+    found = fit_bicycle(steered, bicycle, ("steer_damping", *offsets), optimizer=LeastSquares(), **options)
     assert found.status == "converged"
     # The linear model's 465 are of twice as many samples.
     assert len(steered) == 38

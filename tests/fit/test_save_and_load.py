@@ -8,7 +8,6 @@ from systems import T as t
 import jaxkane as jk
 from jaxkane._common.files import differences
 from jaxkane.fit import (
-    GradientDescent,
     LeastSquares,
     Problem,
     Simulation,
@@ -16,16 +15,13 @@ from jaxkane.fit import (
     cross_validate,
     fit,
     identifiability,
-    laplace,
     load,
-    log_density,
     minimize,
     multi_start,
     profile,
     report,
-    trajectories,
 )
-from jaxkane.fit._io import described
+from jaxkane.fit.solve.checkpoints import described
 
 TRIALS = [Trial(t, {"x": SEEN + 0.01 * k}, {"push": PUSH}, sigma=0.1, initial={"x_dot": 0.0}) for k in (0, 1)]
 FREE = ["gain", "drift"]
@@ -61,7 +57,7 @@ def test_a_fit_comes_back_as_it_was(result, path):
 
 
 def test_to_look_at_a_fit_simulates_nothing(path, monkeypatch):
-    from jaxkane.fit import _problem as problem
+    from jaxkane.fit.problem import problem
 
     again = load(path, pose())
 
@@ -77,7 +73,7 @@ def test_to_look_at_a_fit_simulates_nothing(path, monkeypatch):
     assert again.tests
     assert again.variance_accounted_for
     with pytest.raises(AssertionError, match="was simulated"):
-        trajectories(again)
+        again.trajectories()
 
 
 class Slow(Track):
@@ -100,7 +96,9 @@ def test_a_fit_of_changed_code_comes_back_only_where_its_cost_is_the_same(result
     for kind in (Slow, Rewritten):
         kind.__name__ = "Track"
     assert load(path, pose(Rewritten())).estimates == result.estimates
-    with pytest.raises(ValueError, match=r"a.npz: the code has changed .* jax .*sum of squares .* then, .* now"):
+    with pytest.raises(
+        ValueError, match=r"a.npz: the sum of squares is now .*, but was .* jax .* The code has changed"
+    ):
         load(path, pose(Slow()))
 
 
@@ -115,7 +113,9 @@ def test_a_fit_of_another_problem_is_refused(path):
         (pose(simulation=Simulation(rtol=1e-7)), r"rtol \("),
         (pose(Track(gain=2.0)), r"initial guesses, priors \("),
     ):
-        with pytest.raises(ValueError, match=rf"a.npz is the fit of another problem. It differs in .*{message}"):
+        with pytest.raises(
+            ValueError, match=rf"a.npz contains the fit of another problem, which differs in .*{message}"
+        ):
             load(path, other)
 
 
@@ -136,25 +136,25 @@ def test_a_file_that_is_no_fit_is_named(path, tmp_path):
     problem, data = pose(), path.read_bytes()
     for damaged in (b"", bytes(500), data[:-40], b"thesis"):
         path.write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"a.npz cannot be read as the state of a fit .*it is damaged"):
+        with pytest.raises(ValueError, match=r"a.npz cannot be read as the state of a fit .*It is damaged"):
             load(path, problem)
     kept = tmp_path / "checkpoint.npz"
     minimize(problem, LeastSquares(), steps=1, checkpoint=kept)
     with pytest.raises(ValueError, match=r"checkpoint.npz is the checkpoint of a fit"):
         load(kept, problem)
     path.write_bytes(data)
-    with pytest.raises(ValueError, match=r"a.npz is the state of another fit. It differs in"):
+    with pytest.raises(ValueError, match=r"a.npz contains the state of another fit, which differs in"):
         minimize(problem, LeastSquares(), checkpoint=path)
     with pytest.raises(FileNotFoundError):
         load(tmp_path / "nothing.npz", problem)
 
 
 def test_a_problem_before_a_fit_and_a_fit_after_it(result):
-    for ask in (identifiability, log_density, multi_start):
-        with pytest.raises(TypeError, match=rf"{ask.__name__} takes a Problem, as in .*fit.problem"):
+    for ask in (identifiability, multi_start):
+        with pytest.raises(TypeError, match=rf"{ask.__name__} requires a Problem, as in .*fit.problem"):
             ask(result)
-    for ask in (laplace, cross_validate, lambda problem: profile(problem, "gain")):
-        with pytest.raises(TypeError, match=r"takes a Fit, as in .*got Problem"):
+    for ask in (cross_validate, lambda problem: profile(problem, "gain")):
+        with pytest.raises(TypeError, match=r"requires a Fit, as in .*got Problem"):
             ask(result.problem)
     seen = identifiability(result.problem, at=result.point)
     np.testing.assert_allclose(seen.singular_values, result.singular_values, rtol=1e-9)
@@ -164,7 +164,7 @@ def test_a_problem_before_a_fit_and_a_fit_after_it(result):
 def test_options_of_the_optimizer_and_of_the_simulation_are_two(result):
     coarse = fit(Track(gain=3.0), TRIALS, FREE, unknown=("x",), optimizer=LeastSquares(rtol=0.5, damping=3.0))
     assert coarse.status == "converged"
-    assert coarse.cost > 1.001 * result.cost
+    assert coarse.cost > (1 + 1e-6) * result.cost
     tight = fit(
         Track(),
         TRIALS,
@@ -176,19 +176,15 @@ def test_options_of_the_optimizer_and_of_the_simulation_are_two(result):
     )
     assert tight.problem.model.settings.rtol == 1e-9
     for optimizer in ("least_squares", LeastSquares):
-        with pytest.raises(TypeError, match=r"`optimizer` is such as LeastSquares\(\), GradientDescent\(\) .*; got"):
+        with pytest.raises(
+            TypeError, match=r"`optimizer` must be an optimizer such as LeastSquares\(\) or GradientDescent\(\), got"
+        ):
             minimize(result.problem, optimizer)
-    with pytest.raises(TypeError, match=r"`simulation=` takes a Simulation, as in Simulation\(step=0.01\); got dict"):
+    with pytest.raises(
+        TypeError, match=r"`simulation=` requires a Simulation, as in Simulation\(step=0.01\); got dict"
+    ):
         pose(simulation={"step": 0.1})
-    assert np.isnan(tight.step_error)
-
-
-def test_a_descent_whose_rate_follows_from_its_steps_goes_on_for_as_many_only(result, tmp_path):
-    path, problem = tmp_path / "descent.npz", result.problem
-    begun = minimize(problem, GradientDescent(rtol=0.0), steps=2, checkpoint=path)
-    assert begun.status == "steps"
-    with pytest.raises(ValueError, match=r"It differs in steps of its schedule \(2 there, 4 here\)"):
-        minimize(problem, GradientDescent(rtol=0.0), steps=4, checkpoint=path)
+    assert tight.step_error < 1e-6  # with tolerances too
 
 
 def test_true_values_are_known_by_name(result):
@@ -196,5 +192,5 @@ def test_true_values_are_known_by_name(result):
     assert "truth" in result.table(Track(gain=1.5))
     with pytest.raises(ValueError, match=r"truth.* gian; did you mean 'gain'\?"):
         result.table({"gian": 1.0})
-    with pytest.raises(TypeError, match="a Track, or values by name; got Cart"):
+    with pytest.raises(TypeError, match="a Track or a dict of values by name, got Cart"):
         report(result, Cart())

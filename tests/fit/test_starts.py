@@ -7,6 +7,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane.fit import LeastSquares, Problem, Simulation, Trial, minimize
+from jaxkane.fit.result.diagnostics import wrong_sigma
 
 t = np.linspace(0.0, 1.0, 3)
 
@@ -66,7 +67,7 @@ def test_a_start_that_is_measured_later_is_no_start():
         ([late], {"window": 2.0}, 2),
         ([late.between(0.0, 1.0), late.between(2.0, 4.0)], {}, 2),
     ):
-        message = rf"late: x is not measured at t = {where} s, where a window starts. Name it in `unknown`"
+        message = rf"late: x is not measured at t = {where} s, where a window starts. Add it to `unknown`"
         with pytest.raises(ValueError, match=message):
             posed(wire, ["mass"], *trials, **options)
         posed(wire, ["mass"], *trials, **options, unknown=["x"])
@@ -78,8 +79,8 @@ def test_a_start_that_is_measured_later_is_no_start():
 
 def starts(problem):
     """The coordinates (W, n_q) where the windows start."""
-    consistent = jax.jit(jax.vmap(lambda window, z: problem.model.consistent(window, z, problem.start.x)))
-    return np.asarray(consistent(problem.windows, problem.start.z))[:, : len(problem.system.coordinates)]
+    consistent = jax.jit(jax.vmap(lambda window, z: problem.model.consistent(window, z, problem.start.parameters)))
+    return np.asarray(consistent(problem.windows, problem.start.window_starts))[:, : len(problem.system.coordinates)]
 
 
 def bead(initial, **measured):
@@ -103,7 +104,7 @@ def test_what_contradicts_itself_is_moved_to_the_nearest():
 
 
 def test_a_trial_that_does_not_say_what_others_do_is_named():
-    reason = r"bead \['x'\] says nothing of y, which other trials fix at their start: name it in `initial`"
+    reason = r"bead \['x'\]: there are no data for y, whose initial value .* Add it to `initial`"
     with pytest.raises(ValueError, match=reason):
         posed(Wire(), "mass", bead({"x": 0.3}), bead({"y": 0.3}))
     of_each = posed(Wire(follows=("y",)), "mass", bead({"x": 0.3}), bead({}))
@@ -148,9 +149,14 @@ def test_four_measured_euler_parameters_are_brought_to_unit_norm(system):
     for unknown in ((), E, E[:3]):
         problem = posed(system, "inertia", measured, unknown=unknown)
         window = jax.tree.map(lambda x: x[0], problem.windows)
-        first = problem.model.consistent(window, problem.start.z[0], problem.start.x)
+        first = problem.model.consistent(window, problem.start.window_starts[0], problem.start.parameters)
         found = np.asarray(first)[: len(system.coordinates)][-4:]
         np.testing.assert_allclose(found, raw / np.linalg.norm(raw), atol=1e-12)
+        # The fourth follows from the norm of three: to estimate it, too, is no remedy for large residuals.
+        (note,) = wrong_sigma(problem, 4.0, 100.0)
+        fixed = ", ".join(name for name in E if name not in system.dependent_coordinates)
+        assert ("start at measured samples" in note) == (not unknown)
+        assert (f"samples of {fixed}," in note) == (not unknown)
 
 
 def turning(sigma=0.01):
@@ -216,3 +222,21 @@ def test_the_recorded_tosses_begin_where_they_were_measured():
 
 
 TURNS = {"omega": ("w1", "w2", "w3"), "v": ("vx", "vy", "vz")}
+
+
+def test_a_speed_that_nobody_states_is_named():
+    def notes_of(*trials, **options):
+        problem = posed(Wire(follows=("y",)), "mass", *trials, **options)
+        return [note for note in minimize(problem, LeastSquares(), steps=0).notes if "starts at zero" in note]
+
+    x = {"x": [0.1, 0.2, 0.3]}
+    silent, still = Trial(t, x, sigma=0.1, name="a"), Trial(t, x, sigma=0.1, initial={"x_dot": 0.0}, name="b")
+    gap = Trial(t, x | {"x_dot": [np.nan] * 3}, sigma=0.1, name="c")
+    (note,) = notes_of(silent)
+    assert note.startswith("x_dot starts at zero in all trials: not measured, not in `initial` and not in `unknown`.")
+    assert "`unknown=('x_dot',)`" in note
+    assert "`initial={'x_dot': 0.0}`" in note
+    (note,) = notes_of(silent, still, gap)
+    assert note.startswith("x_dot starts at zero in a, c:")
+    assert not notes_of(silent, unknown=["x_dot"])
+    assert not notes_of(Trial(t, x | {"x_dot": [0.1, 0.1, np.nan]}, sigma=0.1))

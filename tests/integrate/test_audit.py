@@ -165,6 +165,75 @@ def test_quadrature_of_pieces_is_exact_for_cubics():
     np.testing.assert_allclose(pieces.rate(values)[known], np.array(seven)[known], rtol=1e-8, atol=1e-8)
 
 
+class Oscillator(jk.System):
+    """3.2 periods in a second, damped."""
+
+    coordinates, speeds = ("x",), ("v",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x))])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force((-400.0 * q["x"] - 0.4 * u["v"]) * motion.N.x, motion.bodies[0])
+
+
+@pytest.mark.parametrize("times", [2, 5, 33])
+def test_work_between_few_samples_is_not_known(times):
+    """With 33 samples in 10 s, a sample a period, all rules of quadrature agree to 4e-8 and are wrong."""
+    start = jk.State([0.1], [0.0])
+    audit = jk.audit(
+        Oscillator(), jk.simulate(Oscillator(), start, np.linspace(0.0, 10.0, times), rtol=1e-9, atol=1e-9)
+    )
+    assert audit.ok
+    assert 2 * audit.work_error > np.abs(audit.energy_error).max() > 1.0
+
+
+def test_a_coarse_run_with_a_damper_is_found_out():
+    ride = jk.simulate(Oscillator(), jk.State([0.1], [0.0]), np.linspace(0.0, 1.0, 97), rtol=1e-2, atol=1e-2)
+    audit = jk.audit(Oscillator(), ride)
+    assert audit.energy_balance > 1e-3
+    assert not audit.ok
+
+
+class Rod(jk.System):
+    """A particle on a massless rod, in x and y: x follows from y."""
+
+    length: jk.Scalar = jk.parameter(1.0)
+    gravity: jk.Scalar = jk.parameter(9.81)
+    coordinates, speeds = ("y", "x"), ("v",)
+    dependent_speeds, dependent_coordinates = ("x_dot",), ("x",)
+
+    def configuration_constraints(self, t, q):
+        return (q["x"] ** 2 + q["y"] ** 2 - self.length**2,)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion(
+            [jk.Body(2.0, 0.0, O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["x_dot"], u["v"], 0.0)))]
+        )
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, self.gravity * motion.N.x)
+
+
+def test_a_change_of_units_changes_no_verdict():
+    """Lengths of 1e-6 to 1e6 m and times of 1e-12 s; a loop that is open by one per cent is found in all units."""
+    tables = []
+    for length, time in ((1.0, 1.0), (1e6, 1.0), (1e-6, 1e3), (1.0, 1e-12)):
+        system = Rod(length=length, gravity=9.81 * length / time**2)
+        start = jk.State([0.6 * length, 0.8 * length], [0.5 * length / time])
+        ts = np.linspace(0.0, time, 21)
+        ride = jk.simulate(system, start, ts, rtol=1e-8, atol=1e-8 * length * min(1.0, 1.0 / time))
+        audit = jk.audit(system, ride)
+        assert audit.ok, audit
+        tables.append([line for line in audit.lines() if line[0] in ("configuration", "velocity constraints")])
+        open_loop = jk.audit(system, dataclasses.replace(ride, q=1.01 * ride.q))
+        assert [verdict for what, _, verdict in open_loop.lines() if what == "configuration"] == ["bad"]
+    for table in tables:
+        assert [verdict for *_, verdict in table] == ["ok", "ok"]
+
+
 def test_a_batch_is_refused():
     system, swing = run("DoublePendulum", 1.0, 11)
     batch = jk.Trajectory(**{f: getattr(swing, f) for f in swing.__dataclass_fields__} | {"t": swing.t[None]})
@@ -194,3 +263,18 @@ def test_metres_beside_radians_are_no_bad_condition():
     audit = jk.audit(Satellite(), ride)
     np.testing.assert_allclose(audit.condition_M, 1.0)
     assert audit.ok
+
+
+def test_reflected_inertias_have_no_momentum():
+    """A free chain with geared motors conserves the angular momentum of its links."""
+    bar = {"mass": 2.0, "center": (0.0, 0.0, -0.2), "inertia": (0.03, 0.03, 0.002)}
+    chain = [
+        jk.joints.Link("a", None, jk.joints.free("root"), **bar),
+        jk.joints.Link("b", "a", jk.joints.hinge("h", (0, 1, 0), armature=0.2, stiffness=3.0), (0, 0, -0.4), **bar),
+    ]
+    system = jk.joints.mechanism(chain, gravity=(0, 0, 0))
+    start = jk.assemble(system, {"h": 0.7}, {"root_w1": 1.0, "root_w2": -0.5, "h_rate": 2.0})
+    audit = jk.audit(system, jk.simulate(system, start, np.linspace(0.0, 0.5, 41), rtol=1e-10, atol=1e-10))
+    np.testing.assert_allclose(audit.angular_momentum, audit.angular_momentum[:1].repeat(41, 0), atol=1e-8)
+    assert np.ptp(audit.kinetic_energy) > 0.01
+    assert audit.energy_balance < 1e-7  # their kinetic energy is counted

@@ -10,7 +10,7 @@ import jaxkane as jk
 from jaxkane._integrate.audit import _quantities
 from jaxkane._kane import kanes_method as rates
 from jaxkane._scalarjit import components
-from jaxkane._scalarjit.function import Program
+from jaxkane._scalarjit.program import Program
 
 TILTS = ((0.3, 0.5, 0.81), (0.7, -0.2, 0.4), (-0.4, 0.6, 0.5))
 

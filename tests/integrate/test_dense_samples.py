@@ -7,7 +7,8 @@ import pytest
 from test_zero_order_hold import Cart
 
 import jaxkane as jk
-from jaxkane._integrate.inputs import _needed_knots, _needed_times, discontinuities_of
+from jaxkane._integrate.discontinuities import _needed_knots, _needed_times, discontinuities_of
+from jaxkane._integrate.inputs import count_until
 
 
 def wave(t):
@@ -108,3 +109,17 @@ def test_each_jump_of_a_zero_order_hold_ends_a_step():
     )
     np.testing.assert_array_equal(held.times, ts)
     assert np.isfinite(linear.times).sum() < 20
+
+
+def test_a_few_entries_of_long_samples_are_those_that_numpy_finds():
+    # From 32768 samples on a CPU, bisection and reading go entry by entry.
+    rng = np.random.default_rng(0)
+    ts = np.cumsum(rng.uniform(0.5, 1.5, 40_000))
+    values = rng.normal(size=ts.size)
+    t = np.concatenate([[ts[0] - 1.0, ts[0], ts[-1], ts[-1] + 1.0], ts[[1, 777, -2]], rng.uniform(ts[0], ts[-1], 5)])
+    linear, held = (jk.Samples(ts, values, zero_order_hold=z) for z in (False, True))
+    read = jax.jit(lambda t: (count_until(jnp.asarray(ts), t), linear.piece(t, t), held.piece(t, t)))
+    count, between, last = read(jnp.asarray(t))
+    np.testing.assert_array_equal(count, np.searchsorted(ts, t, side="right"))
+    np.testing.assert_allclose(between, np.interp(t, ts, values), rtol=1e-12)
+    np.testing.assert_array_equal(last, values[np.clip(np.searchsorted(ts, t, side="right") - 1, 0, None)])

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._integrate.steps import UnrolledERK
-from jaxkane._kane.rhs import rates_are_native
-from jaxkane._scalarjit.backends import native
+from jaxkane._integrate.solvers import UnrolledERK
+from jaxkane._kane.right_hand_side import rates_are_native
+from jaxkane._scalarjit.backends import native as native_kernels
 from jaxkane._system.system import packed
 
 
@@ -53,16 +53,15 @@ def test_the_same_steps_numbers_and_derivatives(method, jump):
     np.testing.assert_allclose(other_slope, slope, rtol=rtol, atol=rtol)
 
 
-@pytest.mark.skipif(not native.is_on(), reason="needs native kernels")
-def test_they_are_written_out_where_the_right_hand_side_is_a_native_kernel():
+def test_they_are_written_out_where_the_right_hand_side_is_a_native_kernel(native):
     system = jk.catalog.DoublePendulum(mass=1.0, length=0.7)
     y = packed(jk.State(jnp.zeros(2), jnp.zeros(2)))
     assert rates_are_native(system, jnp.zeros(()), y, {})
-    native.use(False)
+    native_kernels.use(False)
     try:
         assert not rates_are_native(system, jnp.zeros(()), y, {})
     finally:
-        native.use(True)
+        native_kernels.use(True)
 
 
 class Rod(jk.System):

@@ -9,7 +9,7 @@ from benchmarks.chain import Chain
 import jaxkane as jk
 from jaxkane._kane import kanes_method as rates
 from jaxkane._scalarjit import components
-from jaxkane._scalarjit.function import Program
+from jaxkane._scalarjit.program import Program
 
 
 class DampedChain(Chain):

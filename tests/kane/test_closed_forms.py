@@ -3,12 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxkane as jk
 from jaxkane._kane.kanes_method import KaneEquations
 from jaxkane.catalog import CATALOG
 
 
+@pytest.mark.many_steps
 def test_steady_precession_of_the_top():
     # About O, with I_O = I + m L^2 and the axis at the angle theta from the vertical (Goldstein, section 5.7):
     # I_O cos(theta) Omega^2 - I3 omega3 Omega + m g L = 0, here the slow root

@@ -10,7 +10,7 @@ from sympy_systems import FourBarLinkage
 
 import jaxkane as jk
 from jaxkane import best_dependent_speeds
-from jaxkane._kane.constraints import dependent_speeds_from, projected, relative_condition
+from jaxkane._kane.constraint_residuals import dependent_speeds_from, projected, relative_condition
 
 HELD = 1e-9
 
@@ -209,3 +209,52 @@ def test_one_residual_is_weighed_against_the_other_speeds():
     assert "well chosen" in str(best_dependent_speeds(Wedge(small=2.0), 0.0, q))
     scaled = relative_condition(1e6 * np.array([[[1e-9, 1.0]], [[0.0, 1.0]], [[3.0, 4.0]]]), [0])
     np.testing.assert_allclose(scaled, [1e9, np.inf, 5 / 3], rtol=1e-9)  # the unit of a residual does not matter
+
+
+class Repeated(jk.System):
+    """A point on a circle in a plane; its configuration constraint, twice that, and one that vanishes identically."""
+
+    radius: jk.Scalar = jk.parameter(1.0)
+    coordinates, speeds = ("x", "y", "z"), ("x_dot", "z_dot")
+    dependent_speeds = ("y_dot",)
+
+    def q_dot(self, t, q, u):
+        return u["x_dot"], u["y_dot"], u["z_dot"]
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(N.vector(*q), N.vector(u["x_dot"], u["y_dot"], u["z_dot"]))
+        return jk.Motion([jk.Body(1.0, 0.0, P)], [q["x"] * u["x_dot"] + q["y"] * u["y_dot"]])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def configuration_constraints(self, t, q):
+        h = q["x"] ** 2 + q["y"] ** 2 - self.radius**2
+        return [h, 2.0 * h, 0.0 * q["z"]]
+
+
+def test_residuals_that_repeat_or_vanish_are_projected_with_derivatives():
+    q = jnp.array([0.6001, 0.8001, 0.3])
+
+    def nearest(q, radius):
+        return projected(Repeated(radius), 0.0, q, steps=2)
+
+    def right(q, radius):
+        return jnp.concatenate([radius * q[:2] / jnp.linalg.norm(q[:2]), q[2:]])
+
+    def with_derivatives(f):
+        modes = f, jax.jacfwd(f, (0, 1)), jax.jacrev(f, (0, 1))
+        return jax.jit(lambda q, radius: [mode(q, radius) for mode in modes])(q, 1.0)
+
+    found, expected = map(with_derivatives, (nearest, right))
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=1e-9), found, expected)
+
+
+def test_a_simulation_is_led_back_where_residuals_repeat():
+    state = jk.State(jnp.array([0.6, -0.8, 0.0]), jnp.array([1.0, 0.5]))
+    ts = jnp.linspace(0.0, 1.0, 3)
+    for options in ({"project": True}, {"stabilize": 5.0}):
+        ride = jk.simulate(Repeated(), state, ts, step=0.01, **options)
+        assert ride.ok
+        np.testing.assert_allclose(jnp.sum(ride.q[:, :2] ** 2, axis=1), 1.0, atol=1e-6)

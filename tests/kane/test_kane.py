@@ -200,6 +200,32 @@ def test_float32_stays_float32():
     assert jax.grad(lambda u: jk.accelerations(bike, 0.0, q, u).sum())(u).dtype == jnp.float32
 
 
+class Beads(jk.System):
+    """So many beads on one line that the equations are not written out, each on a spring to the ground."""
+
+    stiffness: jk.Scalar = jk.parameter(3.0)
+    coordinates = tuple(f"x{i}" for i in range(13))
+    speeds = tuple(f"v{i}" for i in range(13))
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        points = [O.moving(x * N.x, v * N.x) for x, v in zip(q, u, strict=True)]
+        return jk.Motion([jk.Body(2.0, 0.0, point, name=f"bead{i}") for i, point in enumerate(points)])
+
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force(-self.stiffness * q[i] * motion.N.x, body) for i, body in enumerate(motion.bodies)]
+
+
+def test_a_second_call_outside_of_jit_traces_nothing(monkeypatch):
+    """Of a system of many speeds, whose solve was traced in every call."""
+    q, u, traced, solve = np.linspace(-1.0, 1.0, 13), np.zeros(13), [], jax.lax.custom_linear_solve
+    monkeypatch.setattr(jax.lax, "custom_linear_solve", lambda *args, **more: traced.append(1) or solve(*args, **more))
+    for _ in range(3):
+        np.testing.assert_allclose(jk.accelerations(Beads(), 0.0, q, u), -1.5 * q, rtol=1e-14)
+    assert len(traced) == 1
+    np.testing.assert_allclose(jk.mass_matrix(Beads(), 0.0, q, u), 2.0 * np.eye(13), atol=1e-15)
+
+
 @pytest.mark.slow
 def test_a_long_chain():
     """Ten speeds: M and f by closed form, derivatives in both modes."""

@@ -57,6 +57,35 @@ def test_wheel_forces_of_the_moving_bicycle_balance_its_momentum():
     np.testing.assert_allclose(forces["S"] + forces["Q"] + 7 / 94 * weight, front, rtol=0, atol=RTOL * 900)
 
 
+class Disc(jk.System):
+    """A rolling disc whose centre is built from the ground below it, as in `docs/constraints.md`."""
+
+    coordinates, speeds = ("yaw", "lean", "spin", "x", "y"), ("yaw_rate", "lean_rate", "spin_rate")
+    dependent_speeds = ("x_dot", "y_dot")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        L = N.rotate(3, q["yaw"], u["yaw_rate"]).rotate(1, q["lean"], u["lean_rate"])
+        D = L.rotate(2, q["spin"], u["spin_rate"])
+        ground = O.moving(q["x"] * N.x + q["y"] * N.y, u["x_dot"] * N.x + u["y_dot"] * N.y)
+        center = ground.fixed(-0.3 * L.z)
+        contact = center.fixed(0.3 * L.z, D)
+        disc = jk.Body(1.0, (0.02, 0.04, 0.02), center, L, D.angular_velocity)
+        slip = [contact.velocity.dot(N.x), contact.velocity.dot(N.y)]
+        return jk.Motion([disc], slip, points={"contact": contact, "ground": ground})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, 9.81 * motion.N.z)
+
+
+def test_contact_force_of_a_disc_is_the_sum_at_its_contact_and_at_the_ground():
+    disc, q, u = Disc(), jnp.array([0.2, 0.1, 0.0, 0.0, 0.0]), jnp.array([0.5, -0.4, 2.0])
+    forces = constraint_forces(disc, 0.0, q, u)
+    whole = momentum_rate(disc, q, u) - np.array([0.0, 0.0, 9.81])
+    np.testing.assert_allclose(forces["contact"] + forces["ground"], whole, rtol=RTOL, atol=10 * RTOL)
+    np.testing.assert_allclose(forces["contact"], [*whole[:2], 0.0], rtol=RTOL, atol=10 * RTOL)
+
+
 def test_joint_forces_of_a_pendulum_are_newtons():
     # By hand: link 2 is carried at A, both at O; the acceleration of a mass centre from angles, rates and their rates.
     system, q, u = moving("DoublePendulum")
@@ -214,5 +243,5 @@ def test_along_a_trajectory_under_jit_and_in_gradients():
         return constraint_forces(jk.catalog.DoublePendulum(mass=mass), 0.0, q, u)["O"][1]
 
     np.testing.assert_allclose(jax.grad(tension)(2.0), tension(1.0), rtol=RTOL)  # proportional to the mass
-    with pytest.raises(TypeError, match="holds coordinates"):
+    with pytest.raises(TypeError, match="already contains coordinates"):
         constraint_forces(system, swing, q, u)

@@ -108,7 +108,7 @@ def test_ends_of_an_interval():
     np.testing.assert_allclose(other(x), [-2.0, 0.0, 0.0, 0.0], atol=3e-7)
     np.testing.assert_allclose(both(x), one(x) + other(x), atol=1e-15)
     assert np.all(np.diff(np.asarray(both(jnp.linspace(-1.0, 2.0, 3001)))) > 0)
-    with pytest.raises(ValueError, match="give one end at least"):
+    with pytest.raises(ValueError, match="pass at least one of `lower`"):
         dead_zone(1.0, None, None)
 
 

@@ -154,12 +154,43 @@ def test_no_length_however_it_is_written(length):
     together = (1.0, 1.0, 1.0, 1.0)
     law = lambda P, Q, i: jk.loads.spring(P, Q, 10.0, length)  # noqa: E731
     if isinstance(length, jax.Array):  # an array is a number that may change: it has no direction where it is zero
-        with pytest.raises(ValueError, match=r"Two: the force at 'P', the force at 'Q' are not finite \(between two"):
+        with pytest.raises(
+            ValueError, match=r"Two: the force at 'P', the force at 'Q' are not finite \(two points coincide"
+        ):
             forces(law, together)
         return
     np.testing.assert_array_equal(forces(law, together), np.zeros((2, 2)))
 
 
 def test_a_spring_between_points_that_are_always_in_one_place():
-    with pytest.raises(ValueError, match=r"is zero, and has no direction: .* the line between two points"):
+    with pytest.raises(ValueError, match=r"is zero, so it has no direction. .* two points always coincide"):
         forces(lambda P, Q, i: jk.loads.spring(P, P.fixed(0.0 * P.velocity.frame.x), 10.0, 0.5), Q0)
+
+
+LAWS = {
+    "coulomb": (jk.loads.coulomb, {"v": 1.0, "level": 2.0, "width": 0.1}),
+    "stribeck": (jk.loads.stribeck, {"v": 1.0, "kinetic": 1.0, "static": 2.0, "falloff": 0.1, "exponent": 1.0}),
+    "quadratic": (jk.loads.quadratic, {"v": 1.0, "coefficient": 2.0}),
+    "dead_zone": (jk.loads.dead_zone, {"x": 1.0, "lower": -1.0, "upper": 1.0, "width": 0.1}),
+    "dc_motor": (jk.loads.dc_motor, {"voltage": 1.0, "rate": 0.0, "constant": 0.1, "resistance": 1.0}),
+    "bouc_wen": (jk.loads.bouc_wen, {"v": 1.0, "z": 0.1, "stiffness": 2.0, "yield_force": 1.0, "share": 0.5}),
+    "lugre": (
+        jk.loads.lugre,
+        {"v": 1.0, "z": 0.0, "stiffness": 1.0, "damping": 0.1, "kinetic": 1.0, "static": 2.0, "falloff": 0.1},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_what_is_no_number_of_a_law_is_named(name):
+    law, numbers = LAWS[name]
+    law(**numbers)
+    law(**{key: np.float32(x) for key, x in numbers.items()})
+    for key in numbers:
+        with pytest.raises(
+            TypeError, match=rf"{name}: `{key}` must be one number, got 'rate'. By name it is q\['rate'\]"
+        ):
+            law(**numbers | {key: "rate"})
+        for wrong in (True, [1.0], np.array("1")):
+            with pytest.raises(TypeError, match=f"{name}: `{key}` must be one number, got"):
+                law(**numbers | {key: wrong})

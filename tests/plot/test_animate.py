@@ -21,6 +21,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import jaxkane as jk
+from jaxkane._animate._animate import _Painter, zigzag
 from jaxkane._animate._figures import record
 from jaxkane._animate._scene import _quaternions, project, upward_axis
 
@@ -250,13 +251,13 @@ def test_a_figure_lives_no_longer_than_its_user_wants(swing):
 def test_what_cannot_be_animated_is_refused(ride, swing, tmp_path):
     system, trajectory, animation = swing
     two = jax.tree.map(lambda x: jnp.stack([x, x]), trajectory)
-    with pytest.raises(ValueError, match="of a batch of shape"):
+    with pytest.raises(ValueError, match="is a batch of shape"):
         jk.animate(system, two)
-    with pytest.raises(ValueError, match="the motion of another system"):
+    with pytest.raises(ValueError, match="belongs to another system"):
         jk.animate(ride[0], trajectory)
-    with pytest.raises(ValueError, match="`up` is one of"):
+    with pytest.raises(ValueError, match="`up` must be one of"):
         jk.animate(system, trajectory, up="north")
-    with pytest.raises(ValueError, match="`theme` is one of"):
+    with pytest.raises(ValueError, match="`theme` must be one of"):
         jk.animate(system, trajectory, theme="blue")
     for wrong in ({"speed": 0.0}, {"speed": np.inf}, {"height": -4}):
         with pytest.raises(ValueError, match="must be positive"):
@@ -290,6 +291,73 @@ def test_a_gif_shows_every_colour_on_its_paper(swing, tmp_path, theme):
     cold = (first[..., 2] - first[..., 0]) > 60  # blue
     assert warm.sum() > 40
     assert cold.sum() > 40
+
+
+def test_a_track_in_a_gif_ends_where_the_point_is(swing):
+    """At the i-th of the drawn times a track has i + 1 points, the last of them that of the present."""
+
+    class Paper:
+        lines = []
+
+        def line(self, at, *args, **style):
+            self.lines.append(at)
+
+        def __getattr__(self, name):
+            return lambda *args, **style: None
+
+    scene = jk.animate(*swing[:2], ground=False).scene
+    tracks = [shape for shape in scene.shapes if shape.kind == "trace"]
+    assert tracks
+    x, _ = scene.at(scene.t[:4])
+    painter = _Painter(scene, (100, 80), False)
+    for i in (0, 2):
+        Paper.lines = []
+        painter.paint(Paper(), i, x, lambda places: places, ())
+        drawn = Paper.lines[: len(tracks)] if i else []
+        for shape, at in zip(tracks, drawn, strict=False):
+            np.testing.assert_allclose(at, painter.pixels(x[: i + 1, shape.first]))
+
+
+class Sprung(jk.System):
+    """A particle between a spring and a damper, and a turning carrier without mass."""
+
+    coordinates, speeds = ("x", "angle"), ("x_dot", "rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(3, q["angle"], u["rate"])
+        mass, wall = O.moving(q["x"] * N.x, u["x_dot"] * N.x), O.fixed(-1.0 * N.x)
+        bodies = [jk.Body(1.0, 0.0, mass, name="mass"), jk.Body(0.0, 0.0, mass, B, name="carrier")]
+        return jk.Motion(bodies, points={"wall": wall, "end": O.fixed(2.0 * N.x)})
+
+    def loads(self, t, q, u, motion, inputs):
+        mass, wall = motion["mass"], motion["wall"]
+        beside = jk.loads.damper(wall, mass, 0.5), jk.loads.spring(mass, wall, 40.0, 1.0)
+        return jk.weight(motion, -9.81 * motion.N.y), *beside, jk.loads.damper(mass, motion["end"], 1.0)
+
+
+def test_springs_dampers_and_bodies_without_inertia_are_drawn(tmp_path):
+    t = np.linspace(0.0, 1.0, 21)
+    q = np.stack([0.3 * np.sin(4.0 * t), 2.0 * t], axis=1)
+    animation = jk.animate(Sprung(), moved(Sprung(), t, q, np.zeros((21, 2))))
+    x, _ = animation.scene.at(t[5])
+    (spring,) = shapes(animation, "spring")
+    ends = x[0, spring.first : spring.first + 2, 0]
+    np.testing.assert_allclose(sorted(ends), [-1.0, q[5, 0]], atol=1e-12)
+    lines = [np.ptp(x[0, s.first : s.first + s.count], axis=0) for s in shapes(animation, "line") if s.color == "grey"]
+    np.testing.assert_allclose(lines, [[2.0 - q[5, 0], 0.0, 0.0]], atol=1e-12)  # not the damper beside the spring
+    assert {s.color for s in shapes(animation, "line")} == {"grey", "red", "green", "blue"}  # the axes of the carrier
+    assert {(s.label, s.width) for s in shapes(animation, "center")} == {("mass", 9.0)}
+    assert np.isfinite(animation.scene.vertex).all()
+    animation.save(tmp_path / "spring.gif", size=(200, 160), seconds=0.2)
+
+
+def test_corners_of_a_spring_lie_on_both_sides_of_its_axis():
+    corners = np.array(zigzag([(10.0, 20.0), (10.0, 120.0)]))
+    np.testing.assert_allclose(corners[[0, -1]], [[10.0, 20.0], [10.0, 120.0]])
+    assert (corners[2:-2:2, 0] == 0.0).all()  # 5 pixels, twice as many on the enlarged page
+    assert (corners[3:-2:2, 0] == 20.0).all()
+    assert np.isfinite(zigzag([(1.0, 1.0), (1.0, 1.0)])).all()
 
 
 @pytest.mark.skipif(NODE is None, reason="no node on the PATH")

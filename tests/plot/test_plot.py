@@ -206,7 +206,7 @@ def test_results_of_stability_are_taken_as_they_are(style):
     assert [ax.get_title().split(":")[0] for ax in axes] == ["weave", "capsize", "castering"]
     with pytest.raises(ValueError, match="3 names"):
         jk.plot.eigenvalues(found, modes=("a", "b", "c"))
-    with pytest.raises(ValueError, match="say `at` which value"):
+    with pytest.raises(ValueError, match="pass `at`, a value"):
         jk.plot.mode_shapes(found)
     with pytest.raises(TypeError, match="or the result of"):
         jk.plot.eigenvalues(np.ones(3))
@@ -232,7 +232,7 @@ def test_mode_shapes_are_turned_to_their_largest_state():
     np.testing.assert_allclose(arrows[0], [(0.0, 1.0), (-np.pi / 2, 0.5)], atol=1e-12)
     np.testing.assert_allclose(arrows[1], [(0.0, 1.0), (np.pi, 0.5)], atol=1e-12)
     assert [ax.get_title() for ax in axes] == ["-1 ± 2i 1/s", "-3 1/s"]
-    with pytest.raises(ValueError, match="there is no state pitch; there are roll, steer"):
+    with pytest.raises(ValueError, match="the model has no state pitch; there are roll, steer"):
         jk.plot.mode_shapes(np.array([-3.0]), np.ones((2, 1)), ["roll", "steer"], only=("pitch",))
 
 
@@ -248,7 +248,7 @@ def test_audits(style, audited):
     assert axes.shape == (2, 2)
     assert is_legible(axes, style)
     np.testing.assert_allclose(axes[0, 0].lines[0].get_ydata(), audited.kinetic_energy)
-    with pytest.raises(TypeError, match=r"draws an Audit, jk.audit\(system, ride\); got a str"):
+    with pytest.raises(TypeError, match=r"needs an Audit, e\.g\. jk.audit\(system, trajectory\); got a str"):
         jk.plot.audit("ride")
 
 
@@ -282,7 +282,7 @@ def test_fits(style):
     np.testing.assert_allclose(line.get_ydata() - dots.get_ydata(), np.degrees(0.1))
     np.testing.assert_allclose(axes[1, 1].lines[0].get_ydata(), 0.5)
     assert jk.plot.fits(fit, ["ride 3"], ["roll"], residuals=False).shape == (1, 1)
-    with pytest.raises(ValueError, match="there is no trial 'ride 12'"):
+    with pytest.raises(ValueError, match="the fit has no trial 'ride 12'"):
         jk.plot.fits(fit, ["ride 12"])
     with pytest.raises(ValueError, match="no channel pitch; there are roll, yaw_rate"):
         jk.plot.fits(fit, channels=["pitch"])
@@ -298,3 +298,44 @@ def test_a_real_fit_is_drawn(real):
     axes = jk.plot.fits(real)
     assert axes.shape == (2, 1)
     np.testing.assert_allclose(axes[0, 0].lines[1].get_ydata(), next(iter(real.fitted["trial"].values())))
+
+
+def test_residuals_are_drawn_over_any_quantity(real, style):
+    for over in ("t", "x", "push", "x_dot", lambda trial: trial.measured["x"] ** 2):
+        axes = jk.plot.residuals(real, over, bins=3)
+        dots, mean = axes[0, 0].lines
+        assert (len(dots.get_xdata()), len(mean.get_xdata())) == (11, 2)
+        assert np.average(mean.get_ydata(), weights=[6, 5]) == pytest.approx(np.mean(dots.get_ydata()), abs=1e-12)
+    assert is_legible(axes, style)
+    with pytest.raises(ValueError, match="residuals: the fit has no channel y"):
+        jk.plot.residuals(real, channels=["y"])
+    with pytest.raises(KeyError, match="pull"):
+        jk.plot.residuals(real, "pull")
+
+
+def test_costs_and_estimates_of_a_fit(real, style):
+    ax = jk.plot.costs(real)
+    assert [text.get_text() for text in ax.texts] == [f"{real.tests['trial']['x'].rms ** 2:.2g}"]
+    assert is_legible([ax], style)
+    ax = jk.plot.estimates({"one": real, "same": real}, start=True)
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["gain", "drift"]
+    intervals = [line.get_xdata() for line in ax.lines if len(line.get_xdata()) == 2 and line.get_linewidth() == 3]
+    np.testing.assert_allclose(intervals[0], intervals[2])
+    low, high = (x / real.estimates["gain"] * 100 - 100 for x in real.intervals()["gain"])
+    np.testing.assert_allclose(intervals[0], [low, high])
+
+
+def test_the_path_of_a_selection(style):
+    one = lambda name, cost, held_out, accepted: types.SimpleNamespace(  # noqa: E731
+        name=name, cost=cost, held_out_cost=held_out, accepted=accepted
+    )
+    best, worse, last = one("dry", 50.0, 60.0, True), one("wet", 80.0, 90.0, True), one("wet", 49.0, 70.0, False)
+    selection = types.SimpleNamespace(
+        rounds=((best, worse), (last,)), costs=(100.0, 50.0), held_out_costs=(110.0, 60.0)
+    )
+    ax = jk.plot.selection_path(selection)
+    others, more, fitted, held_out = ax.lines
+    assert [*others.get_ydata(), *more.get_ydata()] == [90.0, 70.0]
+    assert ([*fitted.get_ydata()], [*held_out.get_ydata()]) == ([100.0, 50.0], [110.0, 60.0])
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["before", "dry"]
+    assert is_legible([ax], style)

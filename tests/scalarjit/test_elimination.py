@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from jaxkane._scalarjit import elimination
-from jaxkane._scalarjit.backends import native
 from jaxkane._scalarjit.elimination import ScalarSolve, graph_of_solution
-from jaxkane._scalarjit.function import ScalarFunction
+from jaxkane._scalarjit.scalar_function import ScalarFunction
 
 N = 9
 
@@ -47,7 +46,7 @@ def two_as_one(p, x):
 
 
 tree, singular, rounded = (ScalarSolve(f, by_lapack) for f in (along_a_tree, without_the_last, two_as_one))
-pytestmark = pytest.mark.skipif(not native.is_on(), reason="needs native kernels")
+pytestmark = pytest.mark.usefixtures("native")
 
 
 def numbers(batch=()):

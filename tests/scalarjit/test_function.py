@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane._scalarjit import function
+from jaxkane._scalarjit import program as programs
 from jaxkane._scalarjit.backends import xla
 from jaxkane._scalarjit.compat import jaxpr_as_fun
 from jaxkane._scalarjit.components import add, determinant, mul, solve, sub
-from jaxkane._scalarjit.function import Packed, ScalarFunction, tree_of
 from jaxkane._scalarjit.jaxpr import cse, tangent_program, transposed_program
+from jaxkane._scalarjit.scalar_function import Packed, ScalarFunction, tree_of
 
 
 def plain(a, b, x):
@@ -128,7 +128,7 @@ def test_every_operation_as_windows(dtype, by_xla, monkeypatch):
 
 
 @pytest.mark.optimized
-def test_windows_are_not_cut(by_xla, monkeypatch):
+def test_windows_are_not_cut(by_xla, on_cpu, monkeypatch):
     """Else a division that is read more than once ends a kernel, and every kernel has sines of its own."""
 
     def divided(a, x):
@@ -199,7 +199,7 @@ def test_it_is_traced_once():
 CRASHES = """
 import jax, jax.numpy as jnp
 jax.config.update("jax_enable_x64", True)
-from jaxkane._scalarjit.function import ScalarFunction
+from jaxkane._scalarjit.scalar_function import ScalarFunction
 program = ScalarFunction(lambda a, b, t, x: (jnp.sin(x[0]) * a + t + jnp.cos(x[1]), 0.0 * b))
 x = jnp.ones(3)
 def loop(f, n=5):
@@ -225,10 +225,10 @@ def test_the_process_stays_alive():
     assert run.stdout.strip() == "alive", run.stderr[-2000:]
 
 
-def test_a_batch_without_jit_is_compiled_once(monkeypatch):
+def test_a_batch_without_jit_is_compiled_once(on_cpu, monkeypatch):
     f = ScalarFunction(lambda x, a: jnp.sin(a * x))
-    lowered, lower = [], function.Program.target
-    monkeypatch.setattr(function.Program, "target", lambda self, *batch: lowered.append(batch) or lower(self, *batch))
+    lowered, lower = [], programs.Program.target
+    monkeypatch.setattr(programs.Program, "target", lambda self, *batch: lowered.append(batch) or lower(self, *batch))
     x = jnp.linspace(0.0, 1.0, 5)
     for a in (1.0, 2.0, 3.0):
         np.testing.assert_allclose(jax.vmap(f, (0, None))(x, a), np.sin(a * x), rtol=1e-14)
@@ -309,7 +309,7 @@ SLOW = {
 
 @pytest.mark.parametrize("name", SLOW)
 def test_what_cannot_be_one_function_is_told_once_by_name(name, monkeypatch):
-    monkeypatch.setattr(function, "_told", set())
+    monkeypatch.setattr(programs, "_warned", set())
     f = ScalarFunction(SLOW[name])
     ball, x = Ball(jnp.array(1.5)), jnp.array(0.4)
     with pytest.warns(UserWarning, match=rf"Ball: its description uses .*`{name}`.* cannot be part of one") as told:
@@ -341,7 +341,7 @@ def test_lapack_of_the_method_itself_is_not_told():
 
 @pytest.mark.usefixtures("native")
 def test_what_kernels_cannot_do_is_told_once_by_name(monkeypatch):
-    monkeypatch.setattr(function, "_told", set())
+    monkeypatch.setattr(programs, "_warned", set())
     f = ScalarFunction(lambda ball, x: ball.a * jnp.asarray(x).astype(jnp.int32).astype(float))
     match = "Ball: its description uses convert_element_type of float64, which native"
     with pytest.warns(UserWarning, match=match) as told:

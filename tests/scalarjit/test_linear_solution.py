@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from jaxkane import catalog
-from jaxkane._kane.rhs import _vector_field
+from jaxkane._kane.right_hand_side import _vector_field
 from jaxkane._scalarjit.compat import jaxpr_as_fun
 from jaxkane._scalarjit.components import as_vector, solve_positive
 from jaxkane._scalarjit.elimination import LinearSolution
-from jaxkane._scalarjit.function import ScalarFunction
+from jaxkane._scalarjit.scalar_function import ScalarFunction
 
 
 def matrix_and_forces(a, z):

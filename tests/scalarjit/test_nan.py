@@ -7,7 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane._scalarjit.nan import derivative_free_where_not_finite, nan_derivative_where, nan_where, negligible
+from jaxkane._scalarjit.nan import (
+    derivative_free_where_not_finite,
+    nan_beyond_second_derivative,
+    nan_derivative_where,
+    nan_where,
+)
 
 P = {"a": jnp.array(0.7), "b": jnp.array([0.2, -0.4]), "n": 3}
 MISSING = jnp.array([False, False, True, True])
@@ -166,30 +171,15 @@ def test_values_without_entries_in_a_batch_in_a_loop():
     assert jax.jvp(f, (x,), (x,))[1].shape == (1, 2, 4, 0)
 
 
-def product(a, b, n=3):
-    """Nothing where a = b[0] + 0.5, as is its first derivative."""
-    difference = a - b[0] - 0.5
-    return difference * jnp.stack([jnp.sinh(a * b[1]) * difference, difference * b[1] ** n])
+def test_derivatives_beyond_the_second_order_are_nan_only_where_they_are_not_exact():
+    def f(rough, x):
+        return nan_beyond_second_derivative(rough, x**3, x)
 
-
-@pytest.mark.parametrize("modes", ORDERS, ids=named)
-@pytest.mark.parametrize("in_batch", [False, True])
-def test_the_negligible_has_its_second_derivatives(modes, in_batch):
-    rtol = 1e-13
-    a, b = jnp.array(0.7), jnp.array([0.2, -0.4])
-    found, exact = (derivative(modes, f) for f in (lambda a, b: negligible(product, a, b), product))
-    if in_batch:
-        found, exact = (jax.vmap(f, in_axes=(0, None)) for f in (found, exact))
-        a = jnp.stack([a, a])
-    jax.tree.map(
-        lambda x, y: np.testing.assert_allclose(x, y if modes[1:] else 0.0, rtol=rtol, atol=1e-15),
-        found(a, b),
-        exact(a, b),
-    )
-
-
-def test_derivatives_of_the_negligible_are_not_compiled_before_they_are_asked_for():
-    f = lambda a, b: negligible(product, a, b)  # noqa: E731
-    for modes, count in (((jax.jacfwd,), 0), ((jax.jacrev,), 0), ((jax.jacfwd, jax.jacfwd), 1)):
-        text = derivative(modes, f).lower(jnp.array(0.7), jnp.array([0.2, -0.4])).compile().as_text()
-        assert (text.count(" cosh(") + text.count(" exponential(") > 0) == bool(count)
+    for rough, third in ((jnp.array(True), np.nan), (jnp.array(False), 6.0)):
+        found = [f(rough, jnp.array(2.0))]
+        g = lambda x, rough=rough: f(rough, x)  # noqa: E731
+        for _ in range(3):
+            g = jax.jacfwd(g)
+            found.append(g(jnp.array(2.0)))
+        np.testing.assert_allclose(found, [8.0, 12.0, 12.0, third], rtol=1e-14)
+        assert float(jax.grad(lambda x, rough=rough: f(rough, x))(2.0)) == 12.0

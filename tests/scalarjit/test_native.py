@@ -1,6 +1,9 @@
 """Native kernels: machine code through LLVM gives what XLA gives, in every shape of a batch."""
 
+import re
+import textwrap
 import warnings
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +13,11 @@ from operations import ODD, OPERATIONS
 
 import jaxkane as jk
 from jaxkane._kane.kanes_method import _motion_rates, motion_rates
-from jaxkane._scalarjit import function
+from jaxkane._scalarjit import program as programs
 from jaxkane._scalarjit.backends import llvm
 from jaxkane._scalarjit.backends import native as native_kernels
-from jaxkane._scalarjit.function import Program, ScalarFunction
+from jaxkane._scalarjit.program import Program
+from jaxkane._scalarjit.scalar_function import ScalarFunction
 
 LARGEST = 19
 
@@ -74,7 +78,7 @@ def test_a_member_does_not_depend_on_its_place():
 
 
 @pytest.mark.usefixtures("native")
-@pytest.mark.parametrize("made", [ScalarFunction, ScalarFunction.once], ids=["optimized", "once"])
+@pytest.mark.parametrize("made", [ScalarFunction, ScalarFunction.compile_cheaply], ids=["optimized", "once"])
 def test_a_kernel_of_many_blocks(made, native, monkeypatch):
     """What all lanes share, what differs from lane to lane, and both."""
     monkeypatch.setattr(llvm, "_BLOCK", 2)
@@ -107,16 +111,15 @@ def test_batches_of_batches():
     assert jax.jit(jax.vmap(f, (0, None, None)))(jnp.zeros(0), 1.0, x[0, 0]).shape == (0, 3)
 
 
-@pytest.mark.usefixtures("native")
 @ScalarFunction
 def spring(parameters, x):
     m, k, rest, signs = parameters
     return -k / m * (x - rest) * signs
 
 
-def test_numbers_that_stay_are_one_argument_of_a_kernel(monkeypatch):
+def test_numbers_that_stay_are_one_argument_of_a_kernel(native, monkeypatch):
     """m, k and rest are one array, where all lanes share them; values and derivatives are those of plain JAX."""
-    monkeypatch.setattr(function, "_FEW", 1)
+    monkeypatch.setattr(programs, "_FEW", 1)
     parameters, x = (2.0, 5.0, 0.1, jnp.array([1.0, -1.0])), jnp.array([0.3, -0.2])
     plain = spring.__wrapped__
     shared = lambda f: jax.vmap(f, in_axes=(None, 0))  # noqa: E731
@@ -135,13 +138,13 @@ def test_numbers_that_stay_are_one_argument_of_a_kernel(monkeypatch):
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), found, expected)
 
 
-def test_what_cannot_be_written_is_left_to_xla():
+def test_what_cannot_be_written_is_left_to_xla(native):
     whole = lambda x: x.astype(jnp.int32).astype(x.dtype)  # noqa: E731
     f = ScalarFunction(lambda x: whole(x) + jnp.sin(x))
-    function._told.clear()
+    programs._warned.clear()
     with pytest.raises(native_kernels.NotScalarError, match="convert_element_type of float64"):
         native_kernels.Scalars(jax.make_jaxpr(whole)(jnp.array(1.0)))
-    match = "uses convert_element_type of float64, which native kernels do not know"
+    match = "uses convert_element_type of float64, which native kernels do not support"
     with pytest.warns(UserWarning, match=match) as told:
         found = jax.jit(f)(jnp.array(1.7)), *jax.jit(jax.vmap(f))(jnp.array([1.7, 2.2]))
     np.testing.assert_allclose(found, np.floor([1.7, 1.7, 2.2]) + np.sin([1.7, 1.7, 2.2]))
@@ -216,3 +219,23 @@ def test_single_precision_without_x64():
         ride = jk.simulate(system, jk.State(entry.q, entry.u), jnp.linspace(0.0, 0.5, 3))
     assert ride.q.dtype == jnp.float32
     assert ride.status == jk.Status.COMPLETED
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("native")
+def test_the_commands_of_the_readme_work(capsys, monkeypatch):
+    """All backends agree, and the commands for a wrong kernel print what they promise. Tolerance: 1e-12."""
+    page = (Path(native_kernels.__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    names, was_wanted = {}, native_kernels.is_wanted()
+    monkeypatch.setenv("JAXKANE_NATIVE", "1")  # `native.use` changes it
+    try:
+        for block in re.findall(r"^ *```python\n(.*?)^ *```", page, re.DOTALL | re.MULTILINE):
+            exec(textwrap.dedent(block), names)
+    finally:
+        native_kernels.use(was_wanted)
+    expected = names["found"]["plain JAX"]
+    for found in names["found"].values():
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-12), tuple(found), tuple(expected))
+    text = capsys.readouterr().out
+    assert "Node(operation='sub'" in text
+    assert "define void @it" in text

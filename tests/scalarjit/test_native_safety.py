@@ -9,14 +9,13 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import jaxlib
 import numpy as np
 import pytest
 
 from jaxkane._scalarjit.backends import compiler as objects
-from jaxkane._scalarjit.backends import llvm, native
+from jaxkane._scalarjit.backends import ffi_layout, llvm, native
 from jaxkane._scalarjit.backends.compiler import LLVMCompiler
-from jaxkane._scalarjit.function import ScalarFunction
+from jaxkane._scalarjit.scalar_function import ScalarFunction
 
 pytestmark = pytest.mark.usefixtures("native")
 
@@ -107,7 +106,7 @@ def test_damaged_code_is_thrown_away_by_name(damage, tmp_path):
         assert found == expected
         files.append(tmp_path / f"{compiler.name_of(text)}.o")
     damage(*files)
-    with pytest.warns(UserWarning, match=rf"{files[0]} is damaged: it is thrown away and made again") as told:
+    with pytest.warns(UserWarning, match=rf"{files[0]} is damaged. It is deleted and compiled again") as told:
         assert value(SQUARE, tmp_path)[0] == 9.0
     assert len(told) == 1
     assert value(SQUARE, tmp_path)[0] == 9.0  # and now it is whole: nothing is said
@@ -115,7 +114,7 @@ def test_damaged_code_is_thrown_away_by_name(damage, tmp_path):
 
 def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.warns(UserWarning, match=r"Compiled code could not be kept in .*file.*: Not a directory") as told:
+    with pytest.warns(UserWarning, match=r"Compiled code could not be stored in .*file.*: Not a directory") as told:
         assert value(SQUARE, tmp_path / "file" / "folder")[0] == 9.0
     assert len(told) == 1
 
@@ -141,129 +140,88 @@ def test_a_folder_that_goes_and_many_who_write(tmp_path):
     assert sorted(path.suffix for path in folder.iterdir()) == [".o", ".o"]  # no scratch is left
 
 
-def test_places_are_those_of_the_header_of_jaxlib():
-    header = Path(jaxlib.__file__).parent / "include/xla/ffi/api/c_api.h"
-    if not header.exists():
-        pytest.skip(f"this jaxlib ships no header: {header}")
-    text = re.sub(r"//[^\n]*", "", header.read_text())
-    text = re.sub(r"_XLA_FFI_API_STRUCT_FIELD\((\w+)\);", r"\1* \1;", text)
-    bodies = dict(re.findall(r"struct (\w+) \{([^{}]*)\}", text))
-    scalars = {"size_t": 8, "int64_t": 8, "int32_t": 4, "int": 4, "uint32_t": 4, "XLA_FFI_Handler_Traits": 4}
-    scalars |= dict.fromkeys(re.findall(r"enum \{[^{}]*\} (\w+);", text), 4)
+HEADER = Path(jax.ffi.include_dir(), "xla/ffi/api/c_api.h")
 
-    def fields(struct):
-        """Where each field begins, how large it is; and at last the largest alignment."""
-        at, largest, found = 0, 8, {}
-        for kind, name in re.findall(r"([\w\s]+?[\s*]+)(\w+);", bodies[struct]):
-            kind = kind.strip().removeprefix("const ").removeprefix("struct ").strip()
-            size = 8 if "*" in kind else scalars.get(kind) or size_of(kind)
-            step = min(size, 8) if "*" in kind or kind in scalars else 8
-            at = -(-at // step) * step
-            found[name] = at, size
-            at += size
-        return found, -(-at // largest) * largest
 
-    def size_of(struct):
-        return fields(struct)[1]
+def test_offsets_are_those_of_the_header_of_jaxlib():
+    if not HEADER.exists():
+        pytest.skip(f"this jaxlib ships no header: {HEADER}")
+    assert ffi_layout.layout_of(HEADER.read_text()) == ffi_layout.LAYOUT
+    assert ffi_layout.mismatch() is None
 
-    def at(struct, field):
-        return fields(struct)[0][field][0]
 
-    def stated(struct):
-        """The size that a structure states: to the end of the field which its traits name."""
-        last = re.search(rf"XLA_FFI_DEFINE_STRUCT_TRAITS\({struct},\s*(\w+)\)", text).group(1)
-        return sum(fields(struct)[0][last])
-
-    frame, arguments, base = "XLA_FFI_CallFrame", "XLA_FFI_Args", "XLA_FFI_Extension_Base"
-    base = base if base in bodies else "XLA_FFI_InternalExtension"
-    assert re.search(r"#define XLA_FFI_API_MAJOR 0\b", text)
-    for lists, items in ((arguments, "args"), ("XLA_FFI_Rets", "rets")):
-        places = at(lists, "size"), at(lists, items), stated(lists)
-        assert places == (llvm.LAYOUT.list_count, llvm.LAYOUT.list_items, llvm.LAYOUT.list_size), lists
-    version = at("XLA_FFI_Metadata", "api_version")
-    expected = llvm.Layout(
-        frame_size=stated(frame),
-        frame_extension=at(frame, "extension_start"),
-        frame_api=at(frame, "api"),
-        frame_arguments=at(frame, "args"),
-        frame_results=at(frame, "rets"),
-        list_size=stated(arguments),
-        list_count=at(arguments, "size"),
-        list_items=at(arguments, "args"),
-        buffer_size=stated("XLA_FFI_Buffer"),
-        buffer_data=at("XLA_FFI_Buffer", "data"),
-        extension_type=at(base, "type"),
-        extension_metadata=at("XLA_FFI_Metadata_Extension", "metadata"),
-        metadata_major=version + at("XLA_FFI_Api_Version", "major_version"),
-        metadata_minor=version + at("XLA_FFI_Api_Version", "minor_version"),
-        metadata_traits=at("XLA_FFI_Metadata", "traits"),
-        api_error_create=at("XLA_FFI_Api", "XLA_FFI_Error_Create"),
-        error_size=stated("XLA_FFI_Error_Create_Args"),
-        error_message=at("XLA_FFI_Error_Create_Args", "message"),
-        error_code=at("XLA_FFI_Error_Create_Args", "errc"),
-    )
-    assert expected == llvm.LAYOUT
+CHANGES = {
+    "another order": (
+        "XLA_FFI_DataType dtype;\n  void* data;",
+        "void* data;\n  XLA_FFI_DataType dtype;",
+        "buffer_data is",
+    ),
+    "another field": (
+        "  const XLA_FFI_Api* api;\n",
+        "  const XLA_FFI_Api* api;\n  void* more;\n",
+        "frame_arguments is",
+    ),
+    "another version": ("XLA_FFI_API_MAJOR 0", "XLA_FFI_API_MAJOR 1", "XLA_FFI_API_MAJOR is not 0"),
+    "another name": ("XLA_FFI_Metadata_Extension", "XLA_FFI_MetadataExtension", "KeyError"),
+    "arguments otherwise than results": (
+        "  void** rets;",
+        "  int64_t more;\n  void** rets;",
+        "not listed in the same way",
+    ),
+    "nothing in it": (None, "", "XLA_FFI_API_MAJOR is not 0"),
+}
 
 
 @pytest.fixture
-def unproven(tmp_path, monkeypatch):
-    """A process that has tried nothing yet, and folders without verdicts."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(native, "cache_folder", lambda: None)
+def unknown(monkeypatch):
+    """A process that has not compared the header yet."""
     monkeypatch.setattr(native, "_told", set())
-    native._probed.cache_clear()
-    yield tmp_path
+    native._refused.cache_clear()
+    yield
     monkeypatch.undo()
-    native._probed.cache_clear()
+    native._refused.cache_clear()
 
 
-# Places that make a wild pointer of the buffers' list, and a size that the handler finds wrong.
-@pytest.mark.parametrize(("place", "number", "how"), [("list_items", 24, "signal"), ("list_size", 48, "another way")])
-def test_a_moved_structure_leaves_the_work_to_xla(place, number, how, unproven, monkeypatch):
-    monkeypatch.setattr(llvm, "LAYOUT", llvm.LAYOUT._replace(**{place: number}))
-    f = ScalarFunction(lambda x: jnp.sin(x) * number)
-    with pytest.warns(UserWarning, match=f"no native kernels, XLA does their work: a first kernel.*{how}") as told:
+@pytest.mark.parametrize("change", CHANGES)
+def test_another_header_leaves_the_work_to_xla(change, tmp_path, unknown, monkeypatch):
+    old, new, words = CHANGES[change]
+    text = HEADER.read_text()
+    assert old is None or old in text
+    header = tmp_path / "c_api.h"
+    header.write_text("" if old is None else text.replace(old, new))
+    why = ffi_layout.mismatch(header)
+    assert words in (why or "")
+    monkeypatch.setattr(native, "mismatch", lambda: why)
+    f = ScalarFunction(lambda x: jnp.sin(x) * 1.25)
+    with pytest.warns(UserWarning, match="jaxkane does not use native kernels: ") as told:
         found = jax.jit(f)(0.5), *jax.jit(jax.vmap(f))(jnp.ones(3))
-    np.testing.assert_allclose(found, np.sin([0.5, 1.0, 1.0, 1.0]) * number)
+    np.testing.assert_allclose(found, np.sin([0.5, 1.0, 1.0, 1.0]) * 1.25)
     assert len(told) == 1
     assert not native.is_on()
-    assert "first kernel" in (native.why_not() or "")
-    # The next process reads it, and tries for itself again a day later.
-    native._probed.cache_clear()
-    monkeypatch.setattr(subprocess, "run", None)
-    assert not native.is_on()
-    monkeypatch.setattr(native, "_A_DAY", -1.0)
-    native._probed.cache_clear()
-    with pytest.raises(TypeError):
-        native.is_on()
+
+
+def test_without_the_header_xla_does_the_work(tmp_path):
+    assert "cannot be read" in (ffi_layout.mismatch(tmp_path / "c_api.h") or "")
+
+
+def test_a_structure_may_grow_at_its_end(tmp_path):
+    """Fields that a later jaxlib appends are not read."""
+    text = HEADER.read_text()
+    (body,) = re.findall(r"struct XLA_FFI_Buffer \{[^}]*", text)
+    grown = text.replace(body, f"{body}  void* more;\n").replace(
+        "XLA_FFI_DEFINE_STRUCT_TRAITS(XLA_FFI_Buffer, dims)", "XLA_FFI_DEFINE_STRUCT_TRAITS(XLA_FFI_Buffer, more)"
+    )
+    header = tmp_path / "c_api.h"
+    header.write_text(grown)
+    assert ffi_layout.layout_of(grown).buffer_size > ffi_layout.LAYOUT.buffer_size
+    assert ffi_layout.mismatch(header) is None
 
 
 def test_a_handler_that_finds_a_moved_structure_makes_an_error(monkeypatch):
     assert native.is_on()
     monkeypatch.setattr(llvm, "LAYOUT", llvm.LAYOUT._replace(frame_size=4096))
-    with pytest.raises(jax.errors.JaxRuntimeError, match=r"calls native kernels in another way .*native=False"):
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"uses another calling convention .*native=False"):
         jax.block_until_ready(jax.jit(ScalarFunction(lambda x: jnp.cos(x) * 1.25))(0.5))
-
-
-def test_the_probe_is_not_run_again_nor_where_kernels_are_off(unproven, monkeypatch):
-    assert native.is_on()
-    (verdict,) = (unproven / "jaxkane").glob("kernels-*.json")
-    monkeypatch.setattr(subprocess, "run", None)  # whoever calls it fails
-    native._probed.cache_clear()
-    assert native.is_on()
-    verdict.write_text("{")
-    native._probed.cache_clear()
-    with pytest.raises(TypeError):
-        native.is_on()
-    monkeypatch.setattr(native, "_wanted", False)
-    assert not native.is_on()
-
-
-def test_without_a_place_for_the_verdict(unproven, monkeypatch):
-    (unproven / "file").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(unproven / "file"))
-    monkeypatch.setattr(native, "_tried", lambda machine: (None, True))
-    assert native.is_on()
 
 
 class Text:
@@ -281,7 +239,7 @@ def test_an_error_of_llvm_leaves_the_work_to_xla(monkeypatch):
     f = ScalarFunction(lambda x: jnp.sin(x) * 1.75)
     with monkeypatch.context() as broken:
         broken.setattr(native, "Writer", Text)
-        with pytest.warns(UserWarning, match="XLA does their work: LLVM fails at A function") as told:
+        with pytest.warns(UserWarning, match="does not use native kernels: LLVM fails at A function") as told:
             found = [*jax.jit(jax.vmap(f))(jnp.ones(1)), *jax.jit(jax.vmap(f))(jnp.ones(3))]
         np.testing.assert_allclose(found, np.sin(np.ones(4)) * 1.75)
         assert len(told) == 1
@@ -291,5 +249,5 @@ def test_an_error_of_llvm_leaves_the_work_to_xla(monkeypatch):
 def test_a_function_that_is_missing_leaves_the_work_to_xla(monkeypatch):
     """LLVM would end the process."""
     monkeypatch.setattr(LLVMCompiler, "has", lambda self, function: function != "fmod")
-    with pytest.warns(UserWarning, match=r"uses fmod \(not in the mathematical library here\)"):
+    with pytest.warns(UserWarning, match=r"uses fmod \(not in the mathematical library of this computer\)"):
         np.testing.assert_allclose(jax.jit(ScalarFunction(lambda x: jax.lax.rem(x, 0.7)))(2.0), 2.0 % 0.7)

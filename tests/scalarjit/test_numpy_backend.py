@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._kane.assemble import newton, newton_in_numbers
-from jaxkane._scalarjit.function import ScalarFunction
+from jaxkane._kane.consistent_state import newton, newton_compiled
+from jaxkane._scalarjit.scalar_function import ScalarFunction
 
 ARGUMENTS = ({"a": jnp.array(0.7)}, np.array(-1.2), np.array([0.3, 0.9, -0.4]))
 
@@ -109,7 +109,7 @@ def test_newtons_method_finds_in_numbers_what_it_finds_compiled(base, start):
     """Where there is one place, two rods in line, none, and no number; from beside, and from where all slopes agree."""
     system = eqx.tree_at(lambda s: s.base, Rods(), jnp.array(base))
     q = jnp.array([*start, 0.2])
-    found, right = (f(system, q, jnp.array(0.0), (0, 1), False) for f in (newton_in_numbers, newton))
+    found, right = (f(system, q, jnp.array(0.0), (0, 1), False) for f in (newton, newton_compiled))
     assert bool(found.converged) == bool(right.converged)
     assert float(found.remainder) == pytest.approx(float(right.remainder), abs=1e-12) or not right.converged
     if right.converged:

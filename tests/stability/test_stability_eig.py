@@ -12,7 +12,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane.stability import linearize, straight_ahead
-from jaxkane.stability._eig_of_matrix import CHUNK, eig, eigvals, qr_eigenvalues
+from jaxkane.stability._matrix_eigenvalues import CHUNK, eig, eigvals, qr_eigenvalues
 
 BIKE = jk.catalog.WhippleBicycle.benchmark()
 LATERAL = ("roll", "steer", "roll_rate", "steer_rate")
@@ -177,7 +177,7 @@ import sys, threading
 import jax, jax.numpy as jnp, numpy as np
 jax.config.update("jax_enable_x64", True)
 from jaxkane._scalarjit.backends import native
-from jaxkane.stability._eig_of_matrix import eig, eigvals
+from jaxkane.stability._matrix_eigenvalues import eig, eigvals
 native.use(sys.argv[1] == "native")
 
 @jax.jit

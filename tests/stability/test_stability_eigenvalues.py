@@ -16,7 +16,7 @@ import jaxkane as jk
 from jaxkane import Scalar, parameter
 from jaxkane.bicycles import sharp_motorcycle
 from jaxkane.stability import critical_speeds, eigenvalues, linearize, straight_ahead
-from jaxkane.stability._modes import _track_and_name, conjugate_pairs, track
+from jaxkane.stability._modes import _assigned, _numbers, _track_and_name, conjugate_pairs, track
 
 BIKE = jk.catalog.WhippleBicycle.benchmark()
 PUBLISHED = json.loads((Path(__file__).parents[1] / "data" / "meijaard2007.json").read_text())
@@ -164,7 +164,9 @@ def test_weave_and_capsize_speeds(published, recwarn):
     np.testing.assert_array_equal(found.direction, [-1, 1])
     assert (found["weave"], found["capsize"]) == tuple(found.values)
     assert np.isnan(found["castering"])
-    assert repr(found).startswith("CriticalSpeeds(weave stable from 4.292382536 (3.435 rad/s), capsize unstable")
+    assert repr(found).startswith(
+        "CriticalSpeeds(forward speed [m/s]: weave stable from 4.292382536 (3.435 rad/s), capsize unstable"
+    )
     assert not recwarn  # as many eigenvalues come to grow as pass the axis
 
 
@@ -328,7 +330,7 @@ def in_order(v):
     A = canonical(v)
     values, vectors = np.linalg.eig(A)
     left = np.linalg.inv(vectors).conj().swapaxes(1, 2)
-    order, clear = _track_and_name((v, values, left, vectors), LATERAL, {})
+    order, clear, _ = _track_and_name((v, values, left, vectors), LATERAL, {})
     return np.take_along_axis(values, order, axis=1), clear
 
 
@@ -360,13 +362,50 @@ def test_names_are_right_or_not_given(reference, first, n, step):
 def test_a_doubtful_name_is_not_given_and_a_warning_says_so():
     """From 0.22 to 12 m/s in one step two real modes become the weave; which of four cannot be told."""
     speeds = jnp.repeat(jnp.array([0.22, 12.0]), jnp.array([50, 51]), total_repeat_length=101)
-    with pytest.warns(UserWarning, match="which modes are weave, .*capsize.* is not clear: numbered instead"):
+    with pytest.warns(UserWarning, match="the modes weave, .*capsize.* cannot be identified and are numbered"):
         found = eigenvalues(BIKE, speeds)
     assert found.modes[0] == "mode 1"
 
 
+def test_a_pair_without_a_clear_name_is_one_mode():
+    """Two pairs at all values, a pair that becomes real, and two real modes that are always real."""
+    pair, other = np.array([-1 + 2j, -1 - 2j]), np.array([-3 + 0.5j, -3 - 0.5j])
+    splits = np.array([[-4 + 1j, -4 - 1j], [-4.0, -5.0], [-3.0, -6.0]])
+    values = np.stack([np.concatenate([pair, other[::-1], row, [-7.0, -8.0]]) for row in splits])
+    assert _numbers(values).tolist() == [0, 0, 3, 3, 4, 5, 6, 7]
+    assert _numbers(values[:1]).tolist() == [0, 0, 3, 3, 4, 4, 6, 7]
+    assert _numbers(values[:0]).tolist() == list(range(8))
+
+
+def test_a_pair_is_continued_by_a_pair():
+    """Where the least sum of changes would continue a pair by a real eigenvalue and by one of another pair."""
+    last = np.array([-3.9 + 5.3j, -3.9 - 5.3j, -17 + 34j, -17 - 34j])
+    values = np.array([-4.5 + 16j, -4.5 - 16j, -21.0, -57.0])
+    change = np.array([[0.2, 9, 0.3, 9], [9, 0.1, 0.3, 9], [0.3, 9, 9, 0.5], [9, 0.9, 0.4, 0.5]])
+    change[0, 2], change[1, 2] = 0.05, 0.05
+    assert np.argmin(change[0]) == 2
+    order = _assigned(change, last, values)
+    assert order[:2].tolist() == [0, 1]
+    assert sorted(order[2:].tolist()) == [2, 3]
+    assert _assigned(np.ones((4, 4)) - np.eye(4), last, values).tolist() == [0, 1, 2, 3]
+
+
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:which modes are")
+@pytest.mark.filterwarnings("ignore:the modes .* cannot be identified")
+def test_a_pair_of_a_motorcycle_without_a_clear_name_is_one_mode():
+    """Sharp's motorcycle in steps of 10 m/s: the weave and the wobble are pairs at all speeds, the rear tyre is not."""
+    found = eigenvalues(sharp_motorcycle(), jnp.array([10.0, 20.0, 30.0]))
+    pairs = np.argwhere(conjugate_pairs(np.asarray(found.eigenvalues)).all(axis=0))
+    assert len(pairs) == 2
+    for i, j in pairs:
+        assert found.modes[i] == found.modes[j]
+        assert found[found.modes[i]].shape == (3, 2)
+    assert len(set(found.modes)) == 6
+    assert "mode 1" in found.modes
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the modes .* cannot be identified")
 def test_names_of_a_motorcycle_at_one_speed_and_in_coarse_steps():
     """What is named weave, wobble or capsize is it, and no pair has two names."""
     motorcycle = sharp_motorcycle()
@@ -431,9 +470,9 @@ def test_any_parameter_of_any_system():
 
 def test_what_is_missing_is_asked_for():
     system = Inverted(mass=2.0, length=0.6, spring=20.0, damper=1.0)
-    with pytest.raises(ValueError, match=r"Inverted has no family of steady motions by default: give `motion`"):
+    with pytest.raises(ValueError, match=r"Inverted has no default family of steady motions. Pass `motion`"):
         eigenvalues(system, jnp.linspace(0.0, 1.0, 3))
-    with pytest.raises(ValueError, match="Give the values of the parameter"):
+    with pytest.raises(ValueError, match="Pass the values of the parameter"):
         eigenvalues(BIKE)
     found = eigenvalues(system, motion=jk.State(jnp.zeros(1), jnp.zeros(1)), modes=("fall", "recoil"))
     np.testing.assert_allclose(found.eigenvalues.sum(), -1 / 0.72, rtol=1e-12)

@@ -13,7 +13,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane._kane.checks import check_system
-from jaxkane._kane.constraints import configuration_residual
+from jaxkane._kane.constraint_residuals import configuration_residual
 from jaxkane._scalarjit.digest import digest
 
 distributed = pytest.importorskip("distributed")
@@ -71,7 +71,7 @@ def test_a_worker_with_another_global_is_refused(module, client, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(client, "submit", by_another)
-        with pytest.raises(RuntimeError, match=r"another program .* changed after the import"):
+        with pytest.raises(RuntimeError, match=r"different program. .* changed after the import"):
             fallen(module, client)
     np.testing.assert_allclose(fallen(module, client), 1.62 / 2, rtol=1e-7)  # now both have it
 

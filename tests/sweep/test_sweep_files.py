@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import errno
 import json
 import os
 import subprocess
@@ -83,7 +84,7 @@ CHANGES = {
 @pytest.mark.parametrize("name", CHANGES)
 def test_numbers_that_the_description_reads_belong_to_the_sweep(name, copy, monkeypatch, rides):
     CHANGES[name](monkeypatch)
-    with pytest.raises(ValueError, match=r"holds another sweep. It differs in program \("):
+    with pytest.raises(ValueError, match=r"belongs to another sweep. It differs in program \("):
         run(copy)
     monkeypatch.undo()
     np.testing.assert_array_equal(run(copy).q, rides.q)
@@ -145,13 +146,13 @@ class Bead(jk.System):  # on a ring, pushed
 from jaxkane.sweep._chunks import Task, trace
 from jaxkane.sweep._members import as_table, members_of
 from jaxkane._integrate.settings import settings_for
-from jaxkane._integrate.simulate import checked_times
+from jaxkane._integrate.simulate import checked_times, clock_of
 ts = checked_times(np.linspace(0.0, 1.0, 3), float)
 def found(k):
     start, push = jk.State(np.array([0.0, 1.0]), np.ones(1)), {"push": lambda t, s: k * s["x"]}
-    members, shared, n = members_of(Bead(), start, push, as_table({"x": np.array([0.1, 0.2])}), ts)
+    members, shared, n = members_of(Bead(), start, push, as_table({"x": np.array([0.1, 0.2])}), ts, ts.dtype)
     own = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members)
-    return trace(Task(shared, ts, settings_for(ts, step=0.1), None, None), own)[0]
+    return trace(Task(shared, *clock_of(ts, ts.dtype), settings_for(ts, step=0.1), None, None), own)[0]
 first = found(1.0), digest({"a": np.ones(2), "b": {"c", "d", "e"}})
 """
     here: dict[str, Any] = {}
@@ -204,8 +205,8 @@ def test_what_a_killed_writer_left_behind_blocks_nothing(name, tmp_path, rides):
         (bytes(100), r"sweep\.json cannot be read"),
         (b"\xff\xfe\x00", r"sweep\.json cannot be read"),
         (b'{"system": {"cl', r"sweep\.json cannot be read"),
-        (b"[1, 2]", r"sweep\.json is no manifest of a sweep"),
-        (b'{"name": "vacuum"}', r"sweep\.json is no manifest of a sweep"),
+        (b"[1, 2]", r"sweep\.json is not the manifest of a sweep"),
+        (b'{"name": "vacuum"}', r"sweep\.json is not the manifest of a sweep"),
         (b'{"system": {}, "times": "", "layout": {}}', r"an earlier version of jaxkane"),
     ],
 )
@@ -259,15 +260,20 @@ def test_chunks_that_changed_places_are_computed_again(copy, finished, rides):
     whole = first.read_bytes()
     first.write_bytes(second.read_bytes())
     second.write_bytes(whole)
-    with pytest.warns(UserWarning, match=r"2 chunks cannot be read .*it belongs elsewhere"):
+    with pytest.warns(UserWarning, match=r"2 chunks cannot be read .*the file was renamed"):
         np.testing.assert_array_equal(run(copy).q, rides.q)
     assert contents(copy) == contents(finished)
 
 
 def test_a_file_in_the_place_of_the_folder(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match="file is a file: `folder` is the name of a folder"):
+    with pytest.raises(ValueError, match=r"file is a file\. Pass the name of a folder"):
         run(tmp_path / "file")
+    with pytest.raises(OSError, match=r"sweep.json could not be written: .* A part of the path is a file"):
+        run(tmp_path / "file" / "sweep")
+    (tmp_path / "other" / "sweep.json").mkdir(parents=True)
+    with pytest.raises(ValueError, match=r"sweep.json is a folder, not the manifest of a sweep"):
+        run(tmp_path / "other")
 
 
 def manifest(name):
@@ -289,7 +295,7 @@ def test_of_two_sweeps_that_begin_at_once_one_is_refused(tmp_path):
         [t.start() for t in threads]
         [t.join() for t in threads]
         assert (len(opened), len(refused)) == (2, 2)
-        assert all("holds another sweep" in text for text in refused)
+        assert all("belongs to another sweep" in text for text in refused)
         assert json.loads((tmp_path / str(i) / "sweep.json").read_text())["program"] in "ab"
         assert [path.name for path in (tmp_path / str(i)).iterdir()] == ["sweep.json"]
 
@@ -337,6 +343,73 @@ def test_files_are_whole_or_not_there(tmp_path):
         assert path.read_bytes() == b"whole"
 
 
+@pytest.fixture
+def fails(monkeypatch):
+    """The third chunk fails."""
+    import jaxkane.sweep._chunks as solving
+
+    calls, original = [], solving._solve
+
+    def solve(*args):
+        calls.append(1)
+        if len(calls) == 3:
+            raise RuntimeError("out of memory")
+        return original(*args)
+
+    monkeypatch.setattr(solving, "_solve", solve)
+
+
+def test_finished_members_are_returned_after_an_exception(fails, rides):
+    said = r"64 of 70 members are finished and returned; .* because of RuntimeError: out of memory. Pass `folder`"
+    with pytest.warns(RuntimeWarning, match=said):
+        part = run()
+    assert part.counts == {"completed": 64, "interrupted": 6}
+    np.testing.assert_array_equal(part.q[:64], rides.q[:64])
+    assert np.isnan(part.q[64:]).all()
+
+
+def test_an_exception_with_a_folder_says_that_it_can_be_resumed(fails, rides, tmp_path):
+    with pytest.raises(RuntimeError, match="out of memory") as seen:
+        run(tmp_path)
+    assert f"64 of 70 members are finished and saved in {tmp_path}. Call sweep again" in seen.value.__notes__[0]
+    np.testing.assert_array_equal(run(tmp_path).q, rides.q)
+
+
+def test_a_full_disk_says_which_chunk_and_what_to_do(rides, tmp_path, monkeypatch):
+    fsync, calls = os.fsync, []
+
+    def full(handle):
+        calls.append(1)
+        if len(calls) == 5:  # manifest and its folder, a chunk and its folder
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    said = r"chunk-00000032.npz could not be written: No space left on device. Free space .* call sweep again"
+    with pytest.raises(OSError, match=said) as seen:
+        run(tmp_path)
+    assert seen.value.errno == errno.ENOSPC
+    assert [*contents(tmp_path)] == ["chunk-00000000.npz", "sweep.json"]
+    np.testing.assert_array_equal(run(tmp_path).q, rides.q)
+
+
+def test_a_lost_manifest_is_written_again(copy, finished, rides, tmp_path_factory):
+    (copy / "sweep.json").unlink()
+    (copy / "chunk-00000032.npz").write_bytes(b"damaged")
+    with pytest.warns(UserWarning, match="1 chunks cannot be read"):
+        np.testing.assert_array_equal(run(copy).q, rides.q)
+    assert contents(copy) == contents(finished)
+    (copy / "sweep.json").unlink()
+    with pytest.raises(
+        ValueError, match=r"has no sweep.json, and its 3 chunks belong to another sweep or cannot be read"
+    ):
+        run(copy, table={"mass": np.linspace(1.0, 3.0, 70)})
+    only_damaged = tmp_path_factory.mktemp("damaged")
+    (only_damaged / "chunk-00000000.npz").write_bytes(b"damaged")
+    with pytest.raises(ValueError, match=r"has no sweep.json, and its 1 chunks"):
+        run(only_damaged)
+
+
 def test_batches_of_none_and_of_one():
     for table, shape in (({"mass": []}, (0,)), (jk.sweep.grid(mass=[], x=[0.1, 0.2]), (0, 2))):
         none = run(table=table)
@@ -353,21 +426,26 @@ def test_batches_of_none_and_of_one():
 def test_what_is_given_twice_is_refused():
     pandas = pytest.importorskip("pandas")
     frame = pandas.DataFrame([[1.0, 2.0]], columns=["mass", "mass"])
-    with pytest.raises(ValueError, match="more than one column of the name mass"):
+    with pytest.raises(ValueError, match="more than one column named mass"):
         run(table=frame)
-    with pytest.raises(ValueError, match="more than one column of the name 1"):
+    with pytest.raises(ValueError, match="more than one column named 1"):
         run(table={"1": [1.0], 1: [2.0]})
     for table in ({"mass": [1.0, 2.0]}, jk.sweep.grid(mass=[1.0, 2.0])):
-        with pytest.raises(ValueError, match=r"given twice: mass \(a column of the table, and in a batch of Drop\)"):
+        with pytest.raises(ValueError, match=r"passed twice: mass \(a column of the table, and in a batch of Drop\)"):
             jk.sweep.sweep(dataclasses.replace(Drop(), mass=np.ones(2)), REST, TS, table=table)
-        with pytest.raises(ValueError, match=r"given twice: push \(a column of the table, and in `inputs`\)"):
+        with pytest.raises(ValueError, match=r"passed twice: push \(a column of the table, and in `inputs`\)"):
             jk.sweep.sweep(Drop(), REST, TS, {"push": 1.0}, table={**dict(mass=[1.0, 2.0]), "push": [0.0, 1.0]})
     table = {"mass": [1.0, 2.0]}
     for arguments, options, error, words in (
         ((Drop(), REST), {"foo": 1}, ValueError, "sweep has no option foo; there are rtol"),
-        ((Drop(), REST), {"devices": [1]}, TypeError, "`devices` are some of jax"),
-        ((Drop(), lambda system, row: {"height": 1.0}), {}, TypeError, "gives a jaxkane.State for each row, not dict"),
-        ((lambda row: row["mass"], REST), {}, TypeError, "has to give a System for each row"),
+        ((Drop(), REST), {"devices": [1]}, TypeError, "`devices` must contain at least one of jax"),
+        (
+            (Drop(), lambda system, row: {"height": 1.0}),
+            {},
+            TypeError,
+            "must return a jaxkane.State for each row, got dict",
+        ),
+        ((lambda row: row["mass"], REST), {}, TypeError, "must return a System for each row"),
     ):
         with pytest.raises(error, match=words):
             jk.sweep.sweep(*arguments, TS, table=table, **options)
@@ -379,5 +457,33 @@ def test_what_is_given_twice_is_refused():
         with pytest.raises(ValueError, match="The input 'push'"):
             jk.sweep.sweep(Drop(), REST, TS, {"push": push}, table=table)
     for chunk in (0, "32", 2.5):
-        with pytest.raises(ValueError, match=f"`chunk` is a number of members, at least one; got {chunk!r}"):
+        with pytest.raises(ValueError, match=f"`chunk` must be a positive number of members; got {chunk!r}"):
             run(chunk=chunk)
+
+
+@pytest.mark.parametrize(
+    ("reduce", "message"),
+    [
+        (
+            "x",
+            r"`reduce` must be a function of a Trajectory, e.g. lambda trajectory: trajectory\['roll'\]\[-1\]; got 'x'",
+        ),
+        (lambda ride: "far", "`reduce` must return numbers and arrays, also in dicts and tuples; got 'far'"),
+        (lambda ride: {"end": np.array("far")}, "`reduce` must return numbers and arrays"),
+        (lambda ride: None, r"got None. Does it end without a `return`\?"),
+        (lambda ride: 1.0 if ride["x"][-1] > 0.0 else 0.0, "sweep: `reduce` uses a traced value"),
+        (lambda ride: np.sin(ride["x"]), "sweep: `reduce` uses a traced value"),
+    ],
+)
+def test_what_is_no_reduction_is_named(reduce, message, tmp_path):
+    for folder in (None, tmp_path):
+        with pytest.raises(TypeError, match=message):
+            run(folder, reduce=reduce)
+
+
+def test_a_function_of_a_row_that_asks_for_a_value_is_named():
+    def start(system, row):
+        return REST if row["speed"] > 0.0 else jk.State(np.ones(1), np.ones(1))
+
+    with pytest.raises(TypeError, match="sweep: the function start uses a traced value"):
+        jk.sweep.sweep(Drop(), start, TS, table={"speed": [1.0, 2.0]}, step=0.1)

@@ -156,14 +156,14 @@ def test_after_an_interruption_the_rest_is_called_so_and_not_kept(rides, tmp_pat
 def test_a_folder_of_another_sweep_is_refused(rides, folder, change, message):
     before = contents(folder)
     arguments = {"system": PENDULUM, "state": REST, "ts": TS, "table": TABLE, "chunk": CHUNK} | change
-    with pytest.raises(ValueError, match=rf"holds another sweep. It differs in .*{message}"):
+    with pytest.raises(ValueError, match=rf"belongs to another sweep. It differs in .*{message}"):
         jk.sweep.sweep(**arguments, folder=folder)
     assert contents(folder) == before
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(ValueError, match=r"is not empty, and holds no sweep.json"):
+    with pytest.raises(ValueError, match=r"is not empty and does not contain sweep.json"):
         run(tmp_path)
 
 

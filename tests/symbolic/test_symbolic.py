@@ -269,16 +269,16 @@ def test_what_is_no_linear_model_is_refused():
     jk.symbolic.linearize(pendulum, {"theta1": 1}, steady=False)
     with pytest.raises(ValueError, match=r"not steady: configuration constraint 0 is violated by 1\.25"):
         jk.symbolic.linearize(Bob(), {"y": 1.5})
-    with pytest.raises(ValueError, match="divided by zero"):
+    with pytest.raises(ValueError, match="division by zero"):
         jk.symbolic.linearize(CATALOG["LightShaftAndBar"].example())
     with pytest.raises(ValueError, match="has no theta3; did you mean"):
         jk.symbolic.linearize(pendulum, {"theta3": 1})
-    with pytest.raises(ValueError, match="at` says theta2 = theta1, but theta1 has a value of its own"):
+    with pytest.raises(ValueError, match="at` defines theta2 = theta1, but theta1 has its own value"):
         jk.symbolic.linearize(pendulum, {"theta2": "theta1"})
     for strange in ("1 +", "f(", "theta1 > 1", "I*v", None, [1], float("nan"), float("inf"), "1/0"):
-        with pytest.raises(ValueError, match=r"DoublePendulum: `at` says theta2 = .* neither a finite number nor"):
+        with pytest.raises(ValueError, match=r"DoublePendulum: `at` has theta2 = .* neither a finite number nor"):
             jk.symbolic.linearize(pendulum, {"theta2": strange})
-    with pytest.raises(ValueError, match="no state can be mass"):
+    with pytest.raises(ValueError, match="not a possible state: mass"):
         jk.symbolic.linearize(pendulum, states=("mass",))
     with pytest.raises(ValueError, match=r"1 configuration constraints .* 0 are named"):
         jk.symbolic.linearize(Bob(), {"y": -1}, dependent=())

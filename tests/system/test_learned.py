@@ -11,7 +11,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane._kane.kanes_method import _motion_rates
-from jaxkane._scalarjit.function import is_fusable
+from jaxkane._scalarjit.jaxpr import is_fusable
 from jaxkane.fit import Free, LeastSquares, Trial, fit
 
 ts = np.linspace(0.0, 3.0, 61)
@@ -107,7 +107,7 @@ def test_a_law_is_learned_and_the_mass_stays_physical(pendulum):
 
 def test_what_is_no_learned_function_is_named():
     bare = type("Bare", (Pendulum,), {"__annotations__": {"law": Any}, "law": None})
-    with pytest.raises(TypeError, match=r"law holds a function.*declared by `law: Any = jk.learned\(\)`"):
+    with pytest.raises(TypeError, match=r"law is a function.*such as a neural network, as `law: Any = jk.learned\(\)`"):
         bare(jnp.tanh)
-    with pytest.raises(TypeError, match="holds a function with parameters"):
+    with pytest.raises(TypeError, match="needs a function with parameters"):
         Pendulum(3.0)

@@ -190,5 +190,5 @@ def test_filters_are_their_transfer_functions():
     found = (C @ np.linalg.solve(s * np.eye(n) - A, B) + D)[:, 0]
     np.testing.assert_allclose(found, exact, rtol=1e-12)
     assert abs(exact[3] - np.exp(-d * s)) < abs(s * d) ** 5 / 720
-    with pytest.raises(ValueError, match="low_pass has 1 states, got 2"):
+    with pytest.raises(ValueError, match="low_pass: the number of states must be 1, got 2"):
         sensors.low_pass(0.0, (0.0, 0.0), 1.0)

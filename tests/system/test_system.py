@@ -105,15 +105,15 @@ def test_values_by_name_and_their_arithmetic():
     ):
         np.testing.assert_array_equal(f(q), f(array))
     for compare in (lambda: q == "e1", lambda: q < "e1", lambda: q == None):  # noqa: E711
-        with pytest.raises(TypeError, match="meet numbers and arrays alone"):
+        with pytest.raises(TypeError, match="can only be combined with numbers and arrays"):
             compare()
     with pytest.raises(KeyError, match="did you mean 'e1'"):
         q["e11":]
-    with pytest.raises(AttributeError, match=r"no `\.sum`: jnp\.asarray\(q\) is an array"):
+    with pytest.raises(AttributeError, match=r"jnp\.asarray\(q\)\.sum"):
         q.sum()
-    with pytest.raises(AttributeError, match=r"read as q\['roll'\]"):
+    with pytest.raises(AttributeError, match=r"write q\['roll'\]"):
         _ = q.roll
-    with pytest.raises(TypeError, match="`in` asks for a name"):
+    with pytest.raises(TypeError, match="`in` requires a name"):
         _ = 1.0 in q
 
 
@@ -152,6 +152,31 @@ def test_inertia_about_another_point():
         jk.mass_matrix(AboutWhatSlides(wrong=True), 0.0, *at)
 
 
+class Wheel(jk.System):
+    """A body on a pin in a plane, with its one moment about the pin or about its mass centre, 0.3 m from it."""
+
+    moment: jk.Scalar = jk.parameter(0.2)
+    about_pin: bool = eqx.field(static=True, default=True)
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(3, q["angle"], u["rate"])
+        G = O.fixed(-0.3 * B.y)
+        return jk.Motion(
+            [jk.Body(1.5, (0.0, 0.0, self.moment), G, B, name="wheel", about=O if self.about_pin else None)]
+        )
+
+
+def test_one_moment_about_another_point():
+    """M is the moment about the pin."""
+    at = (0.0, [0.3], [0.5])
+    np.testing.assert_allclose(jk.mass_matrix(Wheel(), *at), [[0.2]], rtol=1e-14)
+    np.testing.assert_allclose(jk.mass_matrix(Wheel(moment=0.065, about_pin=False), *at), [[0.2]], rtol=1e-14)
+    with pytest.raises(ValueError, match=r"-0.035, 0, 0 kg m\^2; none may be .* given about the point 'O'"):
+        jk.mass_matrix(Wheel(moment=0.1), *at)
+
+
 @pytest.mark.slow
 def test_degrees_go_by_the_units_that_were_declared():
     class Cart(jk.System):
@@ -172,7 +197,7 @@ def test_degrees_go_by_the_units_that_were_declared():
         jk.plot.trajectories(ride, ["q1"], degrees=True)
     several = jk.sweep.sweep(Cart(), jk.State({"q0": np.array([0.1, 0.2])}, {}), [0.0, 0.5, 1.0], **coarse)
     assert dict(several.trajectory.units) == {"q0": "rad", "push": "N", "u0": "rad/s"}
-    with pytest.raises(ValueError, match=r"Wrong\.units names what is no coordinate, speed, input or state: q9"):
+    with pytest.raises(ValueError, match=r"Wrong\.units: not a coordinate, speed, input or state: q9"):
         jk.simulate(type("Wrong", (Cart,), {"units": {"q9": "m"}})(), jk.State([0.0, 0.0], [0.0, 0.0]), [0.0, 1.0])
     assert units_of(type("Renamed", (Cart,), {"coordinates": ("angle", "q1")})()) == {"push": "N"}
     plt.close("all")
@@ -242,9 +267,9 @@ def test_what_are_no_coordinates_is_refused_by_name(q):
 @pytest.mark.parametrize(
     ("system", "q", "inputs", "words"),
     [
-        (Slider, [0.1, 0.2], None, "Make one: Slider(...)"),
+        (Slider, [0.1, 0.2], None, "Create one with Slider(...)"),
         (Slider(), [0.1j, 0.2], None, "Slider: q must be 2 real numbers"),
-        (Slider(), [0.1, 0.2], 3.0, "Slider: the inputs are numbers by name"),
+        (Slider(), [0.1, 0.2], 3.0, "Slider: the inputs must be a dict {name: number}"),
         (Slider(), [0.1, 0.2], {"push": "x"}, "the input 'push' must be one number"),
         (Slider(), [0.1, 0.2], {"push": [1.0, 2.0]}, "the input 'push' must be one number"),
     ],
@@ -260,14 +285,14 @@ N, O = jk.inertial()
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: N.x.dot(3.0), "dot takes a Vector"),
-        (lambda: N.x.cross([1, 2, 3]), "cross takes a Vector"),
-        (lambda: N.x.to(O), "has components in a Frame"),
-        (lambda: O.fixed(3.0), "Point.fixed takes a Vector"),
-        (lambda: O.moving(N.x, 2.0), "Point.moving, as the velocity, takes a Vector"),
-        (lambda: jk.Body(1.0, (1, 1, 1), O, N, angular_velocity=3.0, name="wheel"), "'wheel' is a Vector"),
-        (lambda: jk.Body(1.0, (1, 1, 1), O, N, about=N.x, name="wheel"), "'wheel' is about a Point"),
-        (lambda: jk.Body(1.0, 2.0, O, N, name="wheel"), "wheel: the inertia is three principal moments"),
+        (lambda: N.x.dot(3.0), "dot needs a Vector"),
+        (lambda: N.x.cross([1, 2, 3]), "cross needs a Vector"),
+        (lambda: N.x.to(O), "components of a Vector need a Frame"),
+        (lambda: O.fixed(3.0), "Point.fixed needs a Vector"),
+        (lambda: O.moving(N.x, 2.0), "Point.moving, as the velocity, needs a Vector"),
+        (lambda: jk.Body(1.0, (1, 1, 1), O, N, angular_velocity=3.0, name="wheel"), "'wheel' must be a Vector"),
+        (lambda: jk.Body(1.0, (1, 1, 1), O, N, about=N.x, name="wheel"), "'wheel' must be about a Point"),
+        (lambda: jk.Body(1.0, 2.0, O, N, name="wheel"), "wheel: the inertia must be three principal moments"),
         (lambda: jk.Body(1.0, 0.0, O, about=O.fixed(N.x), name="wheel"), "'wheel' has an inertia, but no frame"),
     ],
 )
@@ -286,5 +311,5 @@ def test_what_is_no_vector_frame_or_point_is_refused_in_words(call, words):
     ],
 )
 def test_one_instant_refuses_a_batch_of_systems_by_its_name(ask):
-    with pytest.raises(ValueError, match=r"DoublePendulum: mass has more axes than it was declared with.*jax.vmap"):
+    with pytest.raises(ValueError, match=r"DoublePendulum: mass has more axes than declared.*jax.vmap"):
         ask(jk.catalog.DoublePendulum(mass=np.array([1.0, 2.0])))

@@ -1,4 +1,4 @@
-"""Animations: a motion becomes a scene, and a scene a page for browsers or a GIF that pillow draws."""
+"""Animations: a trajectory becomes a scene, and the scene a page for browsers or a GIF that pillow draws."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import json
 import os
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
+from .._common.files import atomic_write, write_file
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
 from .._system.system import System
@@ -40,38 +41,40 @@ def animate(
     title: str | None = None,
     height: int = 420,
 ) -> Animation:
-    """A moving picture of a simulation: shown by a notebook, or saved as a page or a GIF.
+    """An animation of a simulation: shown in a notebook, or saved as a page or a GIF.
 
-        jk.animate(bicycle, ride)                      # the last line of a notebook's cell
-        jk.animate(bicycle, ride).save("ride.html")    # a page that needs no network
-        jk.animate(bicycle, ride, speed=0.5).save("ride.gif")
+        jk.animate(bicycle, trajectory)                      # the last line of a notebook's cell
+        jk.animate(bicycle, trajectory).save("ride.html")    # a page that does not load anything
+        jk.animate(bicycle, trajectory, speed=0.5).save("ride.gif")
 
-    Bicycles are drawn as bicycles. Of any other system every body is drawn as the uniform solid that has its mass and
-    inertia, and points are joined by lines where nothing moves between them; or it is drawn as `figure` says. The page
-    is orbited with the mouse or a finger, zoomed with the wheel, and played, slowed and stepped with keys: "?" lists
-    them.
+    Bicycles have their own figure. For any other system, each body is drawn as the uniform solid with its mass and
+    inertia, and points with constant distances are joined by lines. A body without mass is drawn as its frame. Springs
+    of `jaxkane.loads` are zigzags, dampers and actuators are lines. Pass `figure` for another drawing. Orbit the view
+    with the mouse or a finger, zoom with the wheel, and use keys to play, slow down and step; "?" lists them.
 
     **Arguments:**
 
-    - `system`, `trajectory`: one motion of the system; of a batch one member. It is drawn as far as it came, at most 50
-        times a second: more is interpolated.
-    - `figure`: a function (system, motion, sketch) that draws with a `Sketch`, between the places of a `Motion`.
-    - `speed`: how fast it is played at first; 0.1 is slow motion.
-    - `up`: the axis of N that points up, "x", "-x", "y", "-y", "z" or "-z"; by default opposite to the weights.
-    - `follow`: whether the camera goes along with the mass centre; by default where the motion goes far.
-    - `azimuth`, `elevation`: from where it is seen [degrees], about the vertical and above the horizon.
-    - `ground`: whether a grid is drawn; for bicycles at the wheels' contacts, for others below the lowest place.
-    - `theme`: "light", "dark", or "auto": what the reader's system prefers.
-    - `title`: by default the system's name. `height`: of the notebook's frame [pixels].
+    - `system`: the system.
+    - `trajectory`: a `Trajectory` of this system; one member of a batch. It is drawn up to its end, at most 50 times a
+        second; more samples are interpolated.
+    - `figure`: a function (system, motion, sketch) that draws with a `Sketch`, between the points of a `Motion`.
+    - `speed`: the initial playback speed; 0.1 is slow motion.
+    - `up`: the axis of N that points up, "x", "-x", "y", "-y", "z" or "-z". Default: opposite to the weights.
+    - `follow`: whether the camera follows the mass centre. Default: True if the system travels far.
+    - `azimuth`, `elevation`: the viewing direction [degrees], about the vertical and above the horizon.
+    - `ground`: whether a grid is drawn; for bicycles at the wheels' contacts, for others below the lowest point.
+    - `theme`: "light", "dark", or "auto", the setting of the reader's system.
+    - `title`: the system's name by default.
+    - `height`: of the notebook's frame [pixels].
 
     **Returns:** an `Animation`.
 
-    **Raises:** `ValueError` for a batch, for the motion of another system, and where no body has a position.
+    **Raises:** `ValueError` for a batch, for a trajectory of another system, and if no body has a position.
     """
     if up is not None and up not in UPRIGHT:
-        raise ValueError(f"animate: `up` is one of {', '.join(UPRIGHT)}, got {up!r}.")
+        raise ValueError(f"animate: `up` must be one of {', '.join(UPRIGHT)}, got {up!r}.")
     if theme not in _THEMES:
-        raise ValueError(f"animate: `theme` is one of {', '.join(_THEMES)}, got {theme!r}.")
+        raise ValueError(f"animate: `theme` must be one of {', '.join(_THEMES)}, got {theme!r}.")
     positive_number(speed, "animate: `speed`")
     positive_number(height, "animate: `height`")
     figure = figure or figure_of(system)
@@ -95,6 +98,7 @@ def _scene(motion: Record, figure: Any, speed: float, up, follow, ground, title,
         place=motion.place[frames],
         points=motion.points[frames],
         frames=motion.frames[frames],
+        ends=motion.ends[frames],
     )
     build = Builder(sampled.orientation, sampled.place, turned[frames], scale or 1.0)
     if figure is None:
@@ -120,14 +124,14 @@ def _scene(motion: Record, figure: Any, speed: float, up, follow, ground, title,
     x, followed = scene.at(times)
     view = view_of(x, scene.owner != FIXED, followed, follow)
     lowest = float(x[..., 2].min())
-    flat = view.elevation == 0.0  # a grid seen from its edge is a line
+    flat = view.elevation == 0.0  # from the side a grid would be a line
     if ground if ground is not None else not flat:
         scene = dataclasses.replace(scene, ground=lowest - (0.0 if figure is not None else 0.03 * view.span))
     return dataclasses.replace(scene, view=view)
 
 
 def _frames(t: np.ndarray, rate: float) -> np.ndarray:
-    """The instants that are frames: those nearest to `rate` a second, or all where there are fewer."""
+    """The frames: the samples nearest to `rate` a second, or all samples if there are fewer."""
     n = int(min(max(np.ceil((t[-1] - t[0]) * rate) + 1, 2), _MOST_FRAMES))
     if n >= len(t):
         return np.arange(len(t))
@@ -137,16 +141,16 @@ def _frames(t: np.ndarray, rate: float) -> np.ndarray:
 
 
 class Animation:
-    """A moving picture: `save` writes it to a file, a notebook shows it as it is, `html()` is the page.
+    """An animation. `save` writes it to a file, a notebook shows it, `html()` returns the page.
 
-    `scene` holds what is drawn, as NumPy arrays.
+    `scene` contains the drawn data as NumPy arrays.
     """
 
     def __init__(self, scene: Scene, speed: float, theme: str, height: int):
         self.scene, self.speed, self.theme, self.height = scene, speed, theme, height
 
     def html(self) -> str:
-        """The page: one canvas and its script, without anything from elsewhere."""
+        """The page: one canvas and its script. It does not load anything."""
         return self._page
 
     @functools.cached_property
@@ -158,29 +162,35 @@ class Animation:
         return page
 
     def _repr_html_(self) -> str:
-        page = html.escape(self.html()).replace("\n", "&#10;")  # one line: a page of Markdown keeps it whole
+        page = html.escape(self.html()).replace("\n", "&#10;")  # one line: Markdown would otherwise split it
         return (
             f'<iframe srcdoc="{page}" title="{html.escape(self.scene.title, quote=True)}" '
             f'style="width: 100%; height: {self.height}px; border: 0" loading="lazy" allowfullscreen></iframe>'
         )
 
     def save(self, path: str | os.PathLike[str], **options: Any) -> Path:
-        """Writes the animation to NAME.html or NAME.gif.
+        """Write the animation to NAME.html or NAME.gif.
 
-        **Arguments:** for a GIF also `size` = (480, 300) [pixels], `fps` = 20, `seconds`: how much of the motion, and
-        `azimuth`, `elevation` [degrees] as those of `animate`.
+        **Arguments:**
+
+        - `path`: the file.
+        - `options`: for a GIF: `size` = (480, 300) [pixels], `fps` = 20, `seconds` (duration of the animated part),
+            `azimuth` and `elevation` [degrees] as in `animate`.
 
         **Returns:** the path.
 
-        **Raises:** `ValueError` for any other ending, and for numbers that no picture has.
+        **Raises:** `ValueError` for another suffix, and for impossible options.
         """
         path = Path(path)
         if path.suffix == ".html" and not options:
-            path.write_text(self.html(), encoding="utf-8")
+            write_file(path, self.html())
         elif path.suffix == ".gif":
-            _write_gif(path, self.scene, self.speed, dark=self.theme == "dark", **options)
+            gif = functools.partial(_write_gif, self.scene, self.speed, dark=self.theme == "dark", **options)
+            atomic_write(path, gif)
         else:
-            raise ValueError(f"Animation.save: the name ends with .html (without options) or .gif, got {path.name!r}.")
+            raise ValueError(
+                f"Animation.save: the name must end with .html (without options) or .gif, got {path.name!r}."
+            )
         return path
 
     def __repr__(self) -> str:
@@ -189,7 +199,7 @@ class Animation:
 
 
 def _compact(scene: Scene, speed: float) -> dict[str, Any]:
-    """The scene for the page: orientations in 16 bits, places in 32."""
+    """The scene for the page: orientations in 16 bits, positions in 32."""
 
     def encode(x: np.ndarray, dtype: str) -> str:
         return base64.b64encode(np.ascontiguousarray(x, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
@@ -211,13 +221,13 @@ def _compact(scene: Scene, speed: float) -> dict[str, Any]:
     }
 
 
-_FINE = 2  # drawn so many times larger, then reduced: smooth lines
+_FINE = 2  # draw larger by this factor and reduce: smooth lines
 
 
 def _write_gif(
-    path: str | os.PathLike[str],
     scene: Scene,
     speed: float,
+    file: BinaryIO,
     *,
     dark: bool = False,
     size: tuple[int, int] = (480, 300),
@@ -226,12 +236,12 @@ def _write_gif(
     azimuth: float | None = None,
     elevation: float | None = None,
 ) -> None:
-    """Writes the file; see `Animation.save`."""
+    """Write into the open file; see `Animation.save`."""
     from PIL import Image, ImageDraw
 
     view = scene.view.seen_from(azimuth, elevation)
     seconds = None if seconds is None else positive_number(seconds, "Animation.save: `seconds`")
-    # A GIF counts hundredths of a second, and browsers no fewer than two.
+    # A GIF has delays in hundredths of a second; browsers need at least two.
     hundredths = max(2, round(100.0 / positive_number(fps, "Animation.save: `fps`")))
     start = scene.t[0]
     length = scene.t[-1] - start if seconds is None else min(seconds, scene.t[-1] - start)
@@ -245,15 +255,16 @@ def _write_gif(
         to_page = functools.partial(project, target=target, view=view, span=span)
         painter.paint(ImageDraw.Draw(image, "RGBA"), i, x, to_page, _grid(target, span))
         images.append(image.resize(size, Image.Resampling.LANCZOS))
-    # One palette for all frames, so that nothing flickers: every colour, and its steps to the paper's.
+    # One palette for all frames, because changing palettes flicker: every colour, blended in steps with the background.
     palette = Image.new("P", (1, 1))
     palette.putpalette(painter.palette())
     frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=10 * hundredths, loop=0, optimize=True)
+    options = {"append_images": frames[1:], "duration": 10 * hundredths, "loop": 0, "optimize": True}
+    frames[0].save(file, "GIF", save_all=True, **options)
 
 
 class _Painter:
-    """Paints one instant: the ground, the tracks, then the shapes from the farthest to the nearest."""
+    """Draws one frame: the ground, the traces, then the shapes from the farthest to the nearest."""
 
     def __init__(self, scene: Scene, size: tuple[int, int], dark: bool):
         self.scene, self.dark = scene, dark
@@ -295,6 +306,8 @@ class _Painter:
             if shape.fill:
                 draw.polygon(at, fill=self.color(shape.color, shape.fill))
             draw.line([*at, at[0]] if shape.closed else at, color, width=width, joint="curve")
+        elif shape.kind == "spring":
+            draw.line(zigzag(at), color, width=width, joint="curve")
         elif shape.kind == "pairs":
             for pair in zip(at[::2], at[1::2]):
                 draw.line(pair, color, width=width)
@@ -318,8 +331,21 @@ class _Painter:
                 draw.line(self.pixels(to_page(ends)), self.color("grid"), width=_FINE // 2)
 
 
+_SPRING = [(0.0, 0.0), (0.2, 0.0), *((0.225 + 0.05 * k, 5.0 * (-1) ** k) for k in range(12)), (0.8, 0.0), (1.0, 0.0)]
+"""The corners of a zigzag: the fraction of its length, and the distance from its axis [pixels]. The script of the page
+has the same."""
+
+
+def zigzag(ends: list[tuple[float, float]]) -> list[Any]:
+    """The corners of a spring between two points of the enlarged page."""
+    start, axis = np.array(ends[0]), np.subtract(ends[1], ends[0])
+    across = _FINE * np.array([-axis[1], axis[0]]) / (np.linalg.norm(axis) or 1.0)
+    return [tuple(start + s * axis + a * across) for s, a in _SPRING]
+
+
 def _grid(target: np.ndarray, span: float) -> tuple[np.ndarray, float, int]:
-    """Middle (2,), step [m] and number of lines to each side of the grid on the ground; it stays where it is."""
+    """Centre (2,), step [m] and number of lines to each side of the grid on the ground. The grid does not move with the
+    view."""
     step = 10.0 ** np.floor(np.log10(0.3 * span))
     step *= max(k for k in (1, 2, 5) if k * step <= 0.3 * span)
     return np.round(target[:2] / step) * step, step, 8

@@ -1,4 +1,4 @@
-"""Figures: the sketch that users draw with, bicycles, uniform solids; recorded at every instant of a motion."""
+"""Figures: the sketch for users, bicycles and uniform solids, recorded at all times of a trajectory."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from .._integrate.trajectory import Trajectory, reached_times
 from .._scalarjit.cache_key import version_of
 from .._scalarjit.captured_values import CapturedValues
 from .._scalarjit.components import stack
-from .._scalarjit.function import ScalarFunction
+from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Body, Force, Motion, flatten_loads
 from .._system.system import System
 from ..catalog import WhippleBicycle
+from ..loads._between import ElementForce
 from ._scene import Builder
 
-# On a light page and on a dark one. What is no name of these is taken for a colour of the browser's.
+# Colours on a light and on a dark page. Any other name is passed to the browser as a CSS colour.
 COLORS = {
     "paper": ("#fbfcfe", "#10141d"),
     "grid": ("#d3d9e3", "#364159"),
@@ -40,9 +41,9 @@ CYCLE = ("gold", "blue", "green", "violet", "red")
 
 
 class Element(eqx.Module):
-    """Places (n, 3) in N, and how they are drawn: as a `kind` "line", "pairs", "dot", "center" or "trace".
+    """Points (n, 3) in N, and how they are drawn: as a `kind` "line", "spring", "pairs", "dot", "center" or "trace".
 
-    `body`: the number of the body that the places turn with, where its frame does not spin with it.
+    `body`: index of the body with which the points rotate, if its frame does not rotate with it.
     """
 
     places: Float[Array, "*times n 3"]
@@ -59,14 +60,15 @@ Location = Vector | Point | Body
 
 
 class Sketch:
-    """The figure of a mechanism, drawn once and then carried by its motion.
+    """The figure of a mechanism. It is drawn at one instant and then moves with the bodies.
 
         def figure(system, motion, sketch):
             sketch.line("gold", motion["O"], motion["A"])
             sketch.trace("blue", motion["link2"])
 
-    A place is a `Point`, a `Body` (its mass centre) or a `Vector` from the origin. A colour is "ink", "grey", "gold",
-    "blue", "green", "violet" or "red", each legible on light and dark pages, or any colour of CSS such as "#4fa3e3".
+    A location is a `Point`, a `Body` (its mass centre) or a `Vector` from the origin. A colour is "ink", "grey",
+    "gold", "blue", "green", "violet" or "red", which are legible on light and dark pages, or any colour of CSS such as
+    "#4fa3e3".
     """
 
     def __init__(self, motion: Motion):
@@ -91,7 +93,7 @@ class Sketch:
         fill: float = 0.0,
         turns_with: Body | None = None,
     ) -> None:
-        """A line through places; `width` in pixels, `fill` the opacity of what a closed one encloses."""
+        """A line through locations; `width` in pixels, `fill` is the opacity of the interior of a closed line."""
         at = jnp.stack([self._at(place) for place in places])
         self._add(at, "line", color, turns_with, width=width, closed=closed, fill=fill)
 
@@ -113,7 +115,7 @@ class Sketch:
         )
 
     def wheel(self, color: str, body: Body, radius: Any, *, axis: int = 2, spokes: int = 12) -> None:
-        """A spoked wheel about the mass centre of a body, and its `axis` 1, 2 or 3; it turns with the body."""
+        """A spoked wheel about the mass centre of a body and its `axis` 1, 2 or 3. It rotates with the body."""
         x, y, z = body.frame.x, body.frame.y, body.frame.z
         a, b = {1: (y, z), 2: (z, x), 3: (x, y)}[axis]
         self.circle(color, body, a, b, radius, width=3.5, fill=0.05, turns_with=body)
@@ -128,6 +130,10 @@ class Sketch:
         cos, sin = (jnp.asarray(f(angles), dtype=a_N.dtype) for f in (np.cos, np.sin))
         return self._at(center)[None, :] + jnp.asarray(radius, dtype=a_N.dtype) * (cos * a_N[None] + sin * b_N[None])
 
+    def spring(self, color: str, start: Location, end: Location, *, width: float = 1.5) -> None:
+        """A zigzag between two locations; `width` in pixels."""
+        self._add(jnp.stack([self._at(start), self._at(end)]), "spring", color, width=width)
+
     def dot(self, color: str, place: Location, radius: float = 4.0, label: str = "") -> None:
         """A dot; `radius` in pixels."""
         self._add(self._at(place)[None], "dot", color, width=radius, label=label)
@@ -137,7 +143,7 @@ class Sketch:
         self._add(self._at(place)[None], "center", color, width=radius, label=label)
 
     def trace(self, color: str, *places: Location) -> None:
-        """The paths that places leave behind."""
+        """The paths of locations."""
         for place in places:
             self._add(self._at(place)[None], "trace", color, width=1.2)
 
@@ -153,18 +159,20 @@ Figure = Callable[[System, Motion, Sketch], None]
 
 
 def rotation(frame: Frame, N: Frame) -> Float[Array, "3 3"]:
-    """Takes components in the frame to components in N, without a frame's name for either."""
+    """The rotation matrix from components in the frame to components in N, without names of frames."""
     return stack([unit.components_in(N) for unit in (frame.x, frame.y, frame.z)]).T
 
 
 class Record(eqx.Module):
-    """Bodies with a place, named points, frames and the elements of a figure, at n_t instants; components in N.
+    """Bodies with a position, named points, frames and the elements of a figure at n_t times; components in N.
 
-    - `orientation` (n_t, b, 3, 3): takes components in a body's frame to components in N; `place` (n_t, b, 3): mass
-        centres; `spin` (n_t, b, 3): angular velocity relative to the frame, in the frame.
-    - `mass` (b,), `inertia` (b, 3, 3), in the bodies' frames.
-    - `points` (n_t, p, 3), the origin among them; `frames` (n_t, f, 3, 3).
+    - `orientation` (n_t, b, 3, 3): rotation matrices from components in a body's frame to components in N.
+    - `place` (n_t, b, 3): mass centres.
+    - `spin` (n_t, b, 3): angular velocity relative to the frame, in the frame.
+    - `mass` (b,), `inertia` (b, 3, 3): in the bodies' frames.
+    - `points` (n_t, p, 3): including the origin. `frames` (n_t, f, 3, 3): as `orientation`.
     - `forces` (n_t, l, 3): on mass centres, for the direction of gravity.
+    - `ends` (n_t, s, 2, 3): of the springs, dampers and actuators between two points, which are `links`.
     """
 
     t: Any
@@ -176,16 +184,18 @@ class Record(eqx.Module):
     points: Any
     frames: Any
     forces: Any
+    ends: Any
     elements: list[Element]
     bodies: tuple[str, ...] = eqx.field(static=True)
     body_numbers: tuple[int, ...] = eqx.field(static=True)
     point_names: tuple[str, ...] = eqx.field(static=True)
+    links: tuple[str, ...] = eqx.field(static=True)
 
 
 def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Record:
-    """Everything at the times that the trajectory reached.
+    """Record the figure at the times that the trajectory reached.
 
-    **Raises:** `ValueError` for a batch, and for a trajectory of another system, or one that reached fewer than two of
+    **Raises:** `ValueError` for a batch, for a trajectory of another system, and for one that reached fewer than two of
     its times.
     """
     name = type(system).__name__
@@ -196,12 +206,13 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
     u = np.concatenate([u, u_dep], axis=1)
     motion = jax.tree.map(np.asarray, _record_along(numbers, rest, drawing, version_of(system), t, q, u))
     if not motion.bodies:
-        raise ValueError(f"animate({name}): no body has a position. Give points their places, see jaxkane.Point.at.")
+        raise ValueError(f"animate({name}): no body has a position. Define positions of points, see jaxkane.Point.at.")
     return eqx.tree_at(lambda r: (r.mass, r.inertia), motion, (motion.mass[0], motion.inertia[0]))
 
 
 class _Drawing(eqx.Module):
-    """A figure, by a weak reference: no program keeps alive what it holds; and a digest of all that its code reads."""
+    """A figure by a weak reference, so that a cached program does not keep it alive; and a digest of all that its code
+    reads."""
 
     figure: Any = eqx.field(static=True)
     version: bytes = eqx.field(static=True)
@@ -209,7 +220,7 @@ class _Drawing(eqx.Module):
 
 @functools.partial(jax.jit, static_argnums=(1, 2, 3))
 def _record_along(numbers, rest, drawing, version, t, q, u):
-    # A picture's program runs once or twice: it should compile quickly, which one function for one instant does.
+    # This program runs once or twice, so it should compile quickly: use one function for one instant.
     system = eqx.combine(numbers, rest)
     return jax.lax.map(lambda now: _record_at(system, drawing, *now), (t, q, u))
 
@@ -225,11 +236,10 @@ def _record_at(system: System, drawing: _Drawing | None, t, q, u) -> Any:
     points |= {name: point.position for name, point in motion.points.items() if point.has_position}
     values = dict.fromkeys((*system.inputs, *system.states), jnp.zeros((), dtype))
     centers = [body.center for body in bodies]
-    forces = [
-        load.vector
-        for load in flatten_loads(system.loads(t, q, u, motion, values))
-        if isinstance(load, Force) and load.point in centers
-    ]
+    loads = flatten_loads(system.loads(t, q, u, motion, values))
+    forces = [load.vector for load in loads if isinstance(load, Force) and load.point in centers]
+    links = [load for load in loads if isinstance(load, ElementForce)]
+    links = [link for link in links if link.point.has_position and link.other.has_position]
     sketch = Sketch(motion)
     if figure is not None:
         figure(system, motion, sketch)
@@ -253,10 +263,12 @@ def _record_at(system: System, drawing: _Drawing | None, t, q, u) -> Any:
         points=table([row(position) for position in points.values()], 3),
         frames=rotations(list(motion.frames.values())),
         forces=table([row(force) for force in forces], 3),
+        ends=table([jnp.stack([row(end.position) for end in (link.point, link.other)]) for link in links], 2, 3),
         elements=sketch.elements,
         bodies=tuple(b.name for b in bodies),
         body_numbers=tuple(placed),
         point_names=tuple(points),
+        links=tuple(link.kind for link in links),
     )
 
 
@@ -264,17 +276,17 @@ _AROUND = np.linspace(0.0, 2.0 * np.pi, 33)[:-1]
 
 
 def bicycle(system: Any, motion: Motion, s: Sketch) -> None:
-    """Spoked wheels, frame, fork, a rider's outline, the mass centre of frame and rider, tracks of the contacts."""
+    """Spoked wheels, frame, fork, a rider's outline, the mass centre of frame and rider, traces of the contacts."""
     rear_wheel, frame, fork, front_wheel = (motion[n] for n in ("rear wheel", "rear frame", "fork", "front wheel"))
     B, C = motion["B"], motion["C"]
     rear, front, S = rear_wheel.center.position, front_wheel.center.position, motion["S"].position
     w, rR = system.w, system.rR
 
-    def at(x, height):  # of the upright bicycle, measured from the rear contact
+    def at(x, height):  # measured from the rear contact of the upright bicycle
         return rear + B.vector(x * w, 0.0, rR - height)
 
     crank, seat = at(0.40, 0.9 * rR), at(0.22, rR + 0.55)
-    head = S - (0.30 + system.rF) * 0.9 * C.z  # the top of the steering head, above the crossing of the axle's height
+    head = S - (0.30 + system.rF) * 0.9 * C.z  # top of the steering head, above its point at the height of the axle
     low = head + 0.14 * C.z
     _wheel(s, rear_wheel, rR, getattr(system, "rear_tyre", None))
     _wheel(s, front_wheel, system.rF, getattr(system, "front_tyre", None))
@@ -292,7 +304,7 @@ def bicycle(system: Any, motion: Motion, s: Sketch) -> None:
         grips = [top + 0.02 * C.x + side * 0.27 * C.y for side in (-1.0, 1.0)]
     s.line("blue", head, top, width=3.0)
     s.line("blue", grips[0], top, grips[1], width=3.5)
-    if "U" in motion.frames:  # of a rider with a body of his own
+    if "U" in motion.frames:  # a rider with a separate body
         rider, U = system.rider, motion["U"]
         shoulders = motion["rider"].center.position + U.vector(0.5 * w - rider.x, 0.0, -rR - 1.02 - rider.z)
         s.mass_center("violet", motion["rider"], label="rider")
@@ -308,7 +320,7 @@ def bicycle(system: Any, motion: Motion, s: Sketch) -> None:
 
 
 def _wheel(s: Sketch, body: Body, radius: Any, tyre: Any) -> None:
-    """A spoked wheel, and the sides of its tyre where that is round."""
+    """A spoked wheel, and the sides of its tyre if it has a round cross section."""
     s.wheel("ink", body, radius)
     if getattr(tyre, "crown", None) is not None:
         A = body.frame
@@ -318,7 +330,7 @@ def _wheel(s: Sketch, body: Body, radius: Any, tyre: Any) -> None:
 
 
 def _upper_body(s: Sketch, motion: Motion, U: Frame, hips: Vector, shoulders: Vector, grips: list[Vector]) -> None:
-    """Trunk, head and arms; the arms by their joints where the motion knows them."""
+    """Trunk, head and arms; the arms by their joints if the motion contains these."""
     if "left_shoulder" in motion.points:
         left, right = (motion[f"{side}_shoulder"].position for side in ("left", "right"))
         shoulders = 0.5 * (left + right)
@@ -337,23 +349,39 @@ FIGURES: dict[type, Figure] = {WhippleBicycle: bicycle}
 
 
 def figure_of(system: object) -> Figure | None:
-    """The figure of a system's class, or of one that it inherits from."""
+    """The figure of a system's class, or of a base class."""
     return next((FIGURES[c] for c in type(system).__mro__ if c in FIGURES), None)
 
 
 def bodies_and_points(motion: Record, build: Builder) -> None:
-    """Every body as the uniform solid of its mass and inertia; points joined where nothing moves between them."""
+    """Each body as the uniform solid with its mass and inertia; points with constant distances are joined.
+
+    A body without mass is drawn as its frame. Springs are zigzags; dampers and actuators are lines.
+    """
     color = {k: CYCLE[k % len(CYCLE)] for k in range(len(motion.bodies))}
-    joined = _links(motion, build)
+    joined, drawn = _links(motion, build), []
+    for i in sorted(range(len(motion.links)), key=lambda i: motion.links[i] != "spring"):
+        same = [np.abs(motion.ends[:, i] - x).max() for x in drawn]
+        if min(same, default=np.inf) > build.tolerance:  # a damper beside a spring would hide it
+            drawn += [motion.ends[:, i], motion.ends[:, i, ::-1]]
+            build.moving(motion.ends[:, i])
+            build.shape("spring" if motion.links[i] == "spring" else "line", "grey", 2, width=1.5)
+    marks = {}
     for k in color:
-        _solid(build, k, color[k], motion.inertia[k] / motion.mass[k])
+        if motion.mass[k] > 0:
+            is_solid = _solid(build, k, color[k], motion.inertia[k] / motion.mass[k])
+            marks[k] = "center", 5.0 if is_solid else 9.0
+        else:
+            _axes(build, k)
+            marks[k] = "dot", 3.0
     for k, name in enumerate(motion.bodies):
         build.moving(motion.place[:, k : k + 1])
-        build.shape("center", color[k], 1, width=5.0, label=name)
+        kind, width = marks[k]
+        build.shape(kind, color[k], 1, width=width, label=name)
         _trace(build, motion.place[:, k : k + 1], color[k])
     for i, name in enumerate(motion.point_names):
         if i == 0 and not joined:
-            continue  # nothing hangs on the origin: it would only be a dot far away
+            continue  # an origin without a line would only be a dot far away
         x = motion.points[:, i : i + 1]
         build.moving(x)
         build.shape("dot", "grey", 1, width=3.0, label=name)
@@ -367,18 +395,24 @@ def _trace(build: Builder, x: np.ndarray, color: str) -> None:
         build.shape("trace", color, 1, width=1.2)
 
 
-def _solid(build: Builder, body: int, color: str, inertia: np.ndarray) -> None:
-    """A uniform box, cylinder, ball or rod with these moments (3, 3) per mass [m^2], or nothing for a particle."""
+def _axes(build: Builder, body: int) -> None:
+    """The axes of a body's frame, a tenth of the scene long."""
+    for color, axis in zip(("red", "green", "blue"), 0.1 * build.scale * np.eye(3), strict=True):
+        build.local(np.array([np.zeros(3), axis]), body)
+        build.shape("line", color, 2, width=2.0)
+
+
+def _solid(build: Builder, body: int, color: str, inertia: np.ndarray) -> bool:
+    """A uniform box, cylinder, ball or rod with these moments (3, 3) per mass [m^2]. False for a particle."""
     moments, axes = np.linalg.eigh(inertia)
     moments = np.maximum(moments, 0.0)
     largest = moments.max()
     if np.sqrt(largest) <= build.tolerance:
-        return
+        return False
     axial = [k for k in range(3) if abs(moments[k - 1] - moments[k - 2]) <= 1e-6 * largest]
-    to_body = lambda x: np.asarray(x) @ axes.T  # noqa: E731
 
     def add(x, **style):
-        build.local(to_body(x), body)
+        build.local(np.asarray(x) @ axes.T, body)
         build.shape(style.pop("kind", "line"), color, len(x), **style)
 
     if len(axial) == 3:
@@ -389,15 +423,18 @@ def _solid(build: Builder, body: int, color: str, inertia: np.ndarray) -> None:
         k = axial[0]
         radius = np.sqrt(2.0 * moments[k])
         half = 0.5 * np.sqrt(max(12.0 * (moments[k - 1] - radius**2 / 4.0), 0.0))
-        turn = lambda x: np.roll(x, k + 1, axis=1)  # the third axis of a ring becomes the axial one  # noqa: E731
+
+        def turn(x: np.ndarray) -> np.ndarray:  # the third axis of a ring becomes the axis of symmetry
+            return np.roll(x, k + 1, axis=1)
+
         if radius < 0.02 * half:
             add(turn(np.array([[0.0, 0.0, -half], [0.0, 0.0, half]])), width=4.0)
-            return
+            return True
         for z in (-half, half):
             add(turn(_ring(radius, z)), closed=True, fill=0.12)
         sides = np.stack([_ring(radius, -half)[::4], _ring(radius, half)[::4]], axis=1).reshape(-1, 3)
         add(turn(sides), kind="pairs", width=0.8)
-        # a diameter on each end shows how far it has turned
+        # a diameter on each end shows the rotation
         add(turn(np.array([[-radius, 0.0, half], [radius, 0.0, half], [radius, 0, -half], [-radius, 0, -half]])))
     else:
         box = np.sqrt(np.maximum(1.5 * (moments.sum() - 2.0 * moments), 0.0))  # half the edges
@@ -406,6 +443,7 @@ def _solid(build: Builder, body: int, color: str, inertia: np.ndarray) -> None:
             for side in (-1.0, 1.0):
                 face = np.roll(np.c_[square, np.full(4, side)], k + 1, axis=1)
                 add(face * box, closed=True, fill=0.08)
+    return True
 
 
 def _ring(radius: float, z: float) -> np.ndarray:
@@ -413,9 +451,9 @@ def _ring(radius: float, z: float) -> np.ndarray:
 
 
 def _links(motion: Record, build: Builder) -> bool:
-    """Lines between points and mass centres that stand still relative to each other in a frame that moves.
+    """Lines between points and mass centres that are fixed relative to each other in a moving frame.
 
-    Whether the origin, the first of the points, is among those that are joined.
+    **Returns:** whether the origin, which is the first point, is joined.
     """
     points = np.concatenate([motion.points, motion.place], axis=1)  # (T, n, 3)
     frames = np.concatenate([motion.orientation, motion.frames], axis=1)

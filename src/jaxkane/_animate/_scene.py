@@ -1,4 +1,4 @@
-"""A scene: rigid parts that move, mesh vertices that they own, and a camera. Knows no system and no page."""
+"""A scene: moving rigid parts, their mesh vertices, and a camera. Independent of systems and of the page."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from .._common.lookup import real_number
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """From where it is seen: towards `center` (3,) [m], or along with the motion; z is up on the page.
+    """The camera. It looks at `center` (3,) [m], or follows the mass centre; z is up on the page.
 
-    Angles in radians, about the vertical and above the horizon; `span` [m] is what the shorter side of the page shows.
+    - angles in radians, about the vertical and above the horizon.
+    - `span` [m]: the length that the shorter side of the page shows.
     """
 
     center: np.ndarray
@@ -27,9 +28,9 @@ class View:
     span_following: float
 
     def seen_from(self, azimuth: float | None, elevation: float | None) -> View:
-        """The view from other angles [degrees], where these are given.
+        """The view from other angles [degrees]; None keeps an angle.
 
-        **Raises:** `ValueError` for what is no finite number.
+        **Raises:** `ValueError` for an angle that is not finite.
         """
         angles = {"azimuth": azimuth, "elevation": elevation}
         angles = {key: real_number(x, f"`{key}`") for key, x in angles.items() if x is not None}
@@ -47,11 +48,12 @@ UPRIGHT = {
     "z": np.eye(3),
     "-z": np.diag([1.0, -1.0, -1.0]),
 }
-"""By the axis of N that is up: components in N -> on the page, where z is up."""
+"""For each axis of N that may be up: the matrix from components in N to those on the page, where z is up."""
 
 
 def upward_axis(forces: np.ndarray) -> str:
-    """The axis of N that is nearest to the opposite of gravity: of the constant forces (n_t, l, 3) on mass centres."""
+    """The axis of N that is nearest to the opposite of gravity, i.e. of the constant forces (n_t, l, 3) on mass
+    centres."""
     constant = np.ptp(forces, axis=0).max(axis=1, initial=0.0) <= 1e-9 * (np.abs(forces).max(initial=0.0) + 1e-300)
     down = forces[0, constant].sum(axis=0)
     if not np.any(down):
@@ -61,9 +63,9 @@ def upward_axis(forces: np.ndarray) -> str:
 
 
 def view_of(x: np.ndarray, moves: np.ndarray, center_of_mass: np.ndarray, follow: bool | None) -> View:
-    """A view of vertices (F, V, 3): from the front of what moves in a plane, else obliquely from above.
+    """A view of vertices (F, V, 3): from the front if all motion is in a plane, else obliquely from above.
 
-    `moves` (V,): which vertices belong to parts; the others stand still.
+    `moves` (V,): which vertices belong to moving parts.
     """
     low, high = x.min(axis=(0, 1)), x.max(axis=(0, 1))
     center = 0.5 * (low + high)
@@ -73,7 +75,7 @@ def view_of(x: np.ndarray, moves: np.ndarray, center_of_mass: np.ndarray, follow
     travel = float(np.linalg.norm(np.ptp(center_of_mass, axis=0)))
     if follow is None:
         follow = travel > 4.0 * size
-    depth = np.abs(x - x[:1]).max(axis=(0, 1))  # how far anything moves along each axis
+    depth = np.abs(x - x[:1]).max(axis=(0, 1))  # the range of motion along each axis
     flat = depth <= 1e-5 * max(reach, 1e-12)
     azimuth, elevation = np.deg2rad([-62.0, 18.0])
     if flat.sum() == 1:
@@ -82,9 +84,10 @@ def view_of(x: np.ndarray, moves: np.ndarray, center_of_mass: np.ndarray, follow
 
 
 def project(x: np.ndarray, target: np.ndarray, view: View, span: float) -> np.ndarray:
-    """To the right, upwards (in spans of the page's shorter side) and away from the eye (n, V, 3): a mild perspective.
+    """Coordinates to the right, upwards (in spans of the page's shorter side) and away from the eye (n, V, 3), with a
+    mild perspective.
 
-    The viewer's script does the same.
+    The script of the page does the same.
     """
     c, s = np.cos([view.azimuth, view.elevation]), np.sin([view.azimuth, view.elevation])
     right = np.array([-s[0], c[0], 0.0])
@@ -96,12 +99,12 @@ def project(x: np.ndarray, target: np.ndarray, view: View, span: float) -> np.nd
     return np.stack([(r @ right) * scale, (r @ above) * scale, depth], axis=-1)
 
 
-FIXED = -1  # the owner of what stands still
+FIXED = -1  # the owner of fixed vertices
 
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A run of `count` vertices from the `first`, and how they are drawn (see `Element`)."""
+    """A range of `count` vertices from the `first`, and how they are drawn (see `Element`)."""
 
     kind: str
     color: str
@@ -115,12 +118,13 @@ class Shape:
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """All that a page or a GIF needs, z upwards.
+    """The data for a page or a GIF; z is up.
 
-    - `t` (F,) [s]; `rotation` (F, R, 4): unit quaternions, scalar last, of the first R parts; `position` (F, P, 3) [m]
-        of all parts. The parts after R are points.
-    - `vertex` (V, 3) [m] in the part `owner` (V,), or in N where that is -1.
-    - `center_of_mass` (F, 3): the mass centre of the whole, which the camera may follow.
+    - `t` (F,) [s]: times.
+    - `rotation` (F, R, 4): unit quaternions, scalar last, of the first R parts. The other parts are points.
+    - `position` (F, P, 3) [m]: of all parts.
+    - `vertex` (V, 3) [m]: in the part `owner` (V,), or in N if that is -1.
+    - `center_of_mass` (F, 3): of the whole system, which the camera may follow.
     - `ground`: height of the ground [m], or None.
     """
 
@@ -153,17 +157,17 @@ class Scene:
         return x, center_of_mass
 
 
-_SAME = 1e-6  # relative to the size of the scene: what moves less stands still
+_SAME = 1e-6  # relative to the size of the scene: smaller motions are neglected
 
 
 class Builder:
-    """Gathers parts, vertices and shapes over F instants."""
+    """Collects parts, vertices and shapes over F times."""
 
     def __init__(self, orientation: np.ndarray, place: np.ndarray, turned: np.ndarray, scale: float):
-        self.n_t = len(place)
-        # Far from the origin, and in single precision above all, nothing stands perfectly still.
+        self.n_t, self.scale = len(place), scale
+        # Far from the origin, above all in single precision, fixed points move by rounding errors.
         self.tolerance = _SAME * scale + 16.0 * float(np.finfo(place.dtype).eps) * float(np.abs(place).max(initial=0.0))
-        # Bodies whose frames do not spin with them come twice: as their frame, and turned.
+        # A body whose frame does not rotate with it occurs twice: as its frame, and rotated.
         self.rotations = [*np.moveaxis(orientation, 1, 0), *np.moveaxis(turned, 1, 0)]
         self.origins = [*np.moveaxis(place, 1, 0)] * 2
         self.n_b = place.shape[1]
@@ -175,17 +179,17 @@ class Builder:
         self.shapes: list[Shape] = []
 
     def shape(self, kind: str, color: str, count: int, **style: Any) -> None:
-        """A shape of the `count` vertices that were added last."""
+        """A shape of the last `count` vertices."""
         self.shapes.append(Shape(kind, color, len(self.vertices) - count, count, **style))
 
     def local(self, vertices: np.ndarray, body: int) -> None:
-        """Vertices (n, 3) that are fixed in a body, and turn with it."""
+        """Vertices (n, 3) that are fixed in a body and rotate with it."""
         self._add_vertices(vertices, "part", self.turned[body])
 
     def moving(self, x: np.ndarray, body: int | None = None) -> None:
-        """Vertices (F, n, 3) in N, kept in the part in which they do not move.
+        """Add vertices (F, n, 3) in N; they are stored in the part in which they are fixed.
 
-        `body` says which part they are to turn with; they are given as if it did not spin.
+        `body`: the part with which they rotate. Pass the vertices as if it did not rotate relative to its frame.
         """
         if body is not None:
             self.local(self._components(self.rotations[body], self.origins[body], x).mean(axis=0), body)
@@ -205,7 +209,8 @@ class Builder:
                 self.moving(x[:, i : i + 1])
 
     def _turn_about_the_first(self, x: np.ndarray) -> bool:
-        """Whether all vertices are fixed in a frame that turns as one of the bodies, or not at all, about the first."""
+        """Whether all vertices are fixed in a frame about the first vertex, which rotates as one of the bodies or not
+        at all."""
         still = np.broadcast_to(np.eye(3), (self.n_t, 3, 3))
         for R in (still, *self.rotations[: self.n_b]):
             local = self._components(R, x[:, 0], x)
@@ -232,7 +237,7 @@ class Builder:
         self.owners.extend([(kind, number)] * len(vertices))
 
     def arrays(self, upright: np.ndarray) -> dict[str, np.ndarray]:
-        """Arrays of a `Scene`, turned by `upright` (3, 3), parts that own nothing left out."""
+        """Arrays of a `Scene`, rotated by `upright` (3, 3), without unused parts."""
         used = sorted({number for kind, number in self.owners if kind == "part"})
         parts = {k: i for i, k in enumerate(used)}
         number = {"part": parts.__getitem__, "path": lambda k: len(used) + k, "fixed": lambda k: FIXED}
@@ -251,14 +256,15 @@ class Builder:
 
 
 def _quaternions(R: np.ndarray) -> np.ndarray:
-    """Of rotation matrices (F, 3, 3), the signs such that neighbours are close."""
+    """Quaternions of rotation matrices (F, 3, 3), with signs such that consecutive ones are close."""
     e = Rotation.from_matrix(R).as_quat()
     turned = np.sum(e[1:] * e[:-1], axis=1) < 0
     return e * np.concatenate([[1], np.where(np.cumsum(turned) % 2, -1, 1)])[:, None]
 
 
 def turned_by(t: np.ndarray, spin: np.ndarray, orientation: np.ndarray) -> np.ndarray:
-    """Orientations (n_t, b, 3, 3) of bodies that spin in them at `spin` (n_t, b, 3), each about a fixed axis."""
+    """Orientations (n_t, b, 3, 3) of bodies that rotate relative to their frames at `spin` (n_t, b, 3), each about a
+    fixed axis."""
     steps = 0.5 * (spin[1:] + spin[:-1]) * np.diff(t)[:, None, None]
     angle = np.concatenate([np.zeros_like(spin[:1]), np.cumsum(steps, axis=0)])
     spun = Rotation.from_rotvec(angle.reshape(-1, 3)).as_matrix().reshape(orientation.shape)

@@ -1,1 +1,1 @@
-"""Names, digests and files. Knows nothing of JAX and nothing of mechanics."""
+"""Names, digests and files. Depends neither on JAX nor on mechanics."""

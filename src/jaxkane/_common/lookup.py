@@ -1,4 +1,4 @@
-"""Names and numbers that callers give: looked up, converted, refused. Knows no mechanics."""
+"""Look up, convert and check names and numbers that callers pass. Does not depend on mechanics."""
 
 from __future__ import annotations
 
@@ -9,40 +9,46 @@ from typing import Any
 
 import numpy as np
 
-_LISTED = 12  # names in a message, at most
+_LISTED = 12  # largest number of names in a message
 
 
 def hint(wrong: str | Iterable[str], known: Iterable[str], have: str = "there are") -> str:
-    """The end of a message about names that are not there: what was probably meant, or else what there is.
+    """The end of an error message about unknown names: similar names, or a list of the known names.
 
-    "did you mean 'steer'?", or "there are roll, steer."; `have` are the words before the list.
+    Examples are "did you mean 'steer'?" and "there are roll, steer.". `have` contains the words before the list.
     """
     wrong = [wrong] if isinstance(wrong, str) else list(wrong)
     known = list(dict.fromkeys(known))
     near = {name: difflib.get_close_matches(name, known, n=2) for name in map(str, wrong)}
     near = {name: matches for name, matches in near.items() if matches}
     if near:
-        one = lambda name: " or ".join(map(repr, near[name]))  # noqa: E731
-        return f"did you mean {', '.join(one(n) if len(wrong) == 1 else f'{one(n)} for {n!r}' for n in near)}?"
+        similar = {name: " or ".join(map(repr, matches)) for name, matches in near.items()}
+        each = [words if len(wrong) == 1 else f"{words} for {name!r}" for name, words in similar.items()]
+        return f"did you mean {', '.join(each)}?"
     more = f", ... ({len(known)} in all)" if len(known) > _LISTED else ""
     return f"{have} {', '.join(known[:_LISTED]) or 'none'}{more}."
 
 
 def as_names(given: str | Iterable[str]) -> tuple[str, ...]:
-    """Names; one alone may be given as a string."""
+    """A tuple of names. A single name may be given as a string."""
     names = (given,) if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
     if not all(isinstance(name, str) for name in names):
-        raise TypeError(f"Names are strings, one or several; got {given!r}.")
+        raise TypeError(f"Expected a name or a sequence of names; got {given!r}. Names must be strings.")
     return names
 
 
+def counted(n: int, noun: str) -> str:
+    """A number and a noun: "1 trial", "2 trials"."""
+    return f"{n} {noun}{'s' * (n != 1)}"
+
+
 def label_of(name: str) -> str:
-    """A name as matplotlib is to write it, for which what stands between two dollars is mathematics."""
+    """A name for matplotlib, which would render text between two dollar signs as mathematics."""
     return name.replace("$", r"\$")
 
 
 def refuse_unknown(names: Iterable[str], known: Iterable[str], message: str, have: str = "there are") -> None:
-    """`ValueError` for names that are not known; `message` stands before them: "Bicycle: q has no"."""
+    """Raise `ValueError` for unknown names. `message` precedes the names, e.g. "Bicycle: q has no"."""
     known = tuple(known)
     wrong = [str(name) for name in dict.fromkeys(names) if name not in known]
     if wrong:
@@ -50,14 +56,21 @@ def refuse_unknown(names: Iterable[str], known: Iterable[str], message: str, hav
 
 
 def not_there(name: Any, known: Iterable[str], where: str) -> KeyError:
-    """The error for a name that is not found; `where` as in "this trajectory"."""
+    """The `KeyError` for a name that is not found. `where` is a phrase such as "this trajectory"."""
     return KeyError(f"There is no {name!r} in {where}; {hint(str(name), known)}")
 
 
 def by_name(name: str, groups: Iterable[tuple[Sequence[str], Any]], more: Mapping[str, Any], where: str) -> Any:
-    """An entry of arrays whose last axis is named, or of a dict.
+    """An entry by name.
 
-    **Raises:** `KeyError` with what was probably meant.
+    **Arguments:**
+
+    - `name`: the name.
+    - `groups`: pairs of names and an array (..., n), whose last axis has these names.
+    - `more`: a dict that is searched last.
+    - `where`: a phrase for the error message, such as "this trajectory".
+
+    **Raises:** `KeyError` with similar names.
     """
     groups = tuple(groups)
     for names, values in groups:
@@ -68,36 +81,43 @@ def by_name(name: str, groups: Iterable[tuple[Sequence[str], Any]], more: Mappin
     raise not_there(name, [*(n for names, _ in groups for n in names), *more], where)
 
 
-_DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 def decimal_number(text: str) -> float:
-    """A finite number in decimal notation: what Python reads besides (1_000, infinity, the digits of other scripts) is
-    a slip of the pen in a file.
+    """A finite number in decimal notation.
 
-    **Raises:** `ValueError` for anything else.
+    Python also accepts 1_000, infinity and digits of other scripts. In a file, these are typing errors.
+
+    **Raises:** `ValueError` for any other text.
     """
-    number = float(text) if _DECIMAL.fullmatch(text) else float("inf")
+    number = float(text) if DECIMAL.fullmatch(text) else float("inf")
     if abs(number) == float("inf"):
         raise ValueError(f"{text!r} is not a finite decimal number.")
     return number
 
 
 def real_number(value: Any, what: str) -> float:
-    """One real number that was given, as a float; it may be infinite or NaN.
+    """Convert one real number to a float. It may be infinite or NaN.
 
-    **Raises:** `ValueError` for text, truth values, complex numbers, arrays and all else.
+    **Raises:** `TypeError` for a tracer. `ValueError` for all other values, such as text, booleans and arrays.
     """
-    array = np.asarray(value) if np.ndim(value) == 0 and not np.ma.is_masked(value) else None
+    try:
+        array = np.asarray(value) if np.ndim(value) == 0 and not np.ma.is_masked(value) else None
+    except TypeError:  # raised by JAX: a tracer has no value
+        raise TypeError(
+            f"{what} must be a concrete number, not one that is traced by jax.jit, jax.grad or jax.vmap; got "
+            f"{value!r}. Compute it outside of the transformed function."
+        ) from None
     if array is None or array.dtype.kind not in "iuf":
         raise ValueError(f"{what} must be a real number, got {value!r}.")
     return float(array)
 
 
 def positive_number(value: Any, what: str) -> float:
-    """One positive finite number that was given, as a float.
+    """Convert one positive finite number to a float.
 
-    **Raises:** `ValueError` for anything else.
+    **Raises:** `ValueError` for other numbers; otherwise as `real_number`.
     """
     number = real_number(value, what)
     if not 0.0 < number < float("inf"):

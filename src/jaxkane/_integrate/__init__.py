@@ -1,1 +1,1 @@
-"""Motion over time: inputs, steps, events, trajectories, and what is asked of them afterwards."""
+"""Simulation: inputs, steps, events, trajectories, and quantities computed from trajectories."""

@@ -1,44 +1,83 @@
-"""Events: the quantities of a description that end a motion where they pass zero, and the steps that end there."""
+"""Events: functions of a system that cross zero, and the search for the first crossing.
+
+An event ends the simulation, or changes the state (`jumps.py`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
+import inspect
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
-from .._scalarjit.function import ScalarFunction
-from .._system.system import State, System, unpacked
+from .._scalarjit.scalar_function import ScalarFunction
+from .._system.system import NamedVector, State, System, unpacked
 from .status import REASONS
 
 
-class Crossing(eqx.Module):
-    """A quantity that counts only where it passes zero in one direction. See `rising` and `falling`."""
+@dataclasses.dataclass(frozen=True)
+class Crossing:
+    """An event function with a direction of crossing. See `rising` and `falling`.
+
+    Fields:
+
+    - `value`: the event function. `direction`: 1 upwards, -1 downwards, 0 both.
+    - `stages`: what changes the state, in order. Empty if the event ends the simulation.
+    - `when`: a quantity that must be positive at the event, or None.
+    """
 
     value: Any
-    direction: int = eqx.field(static=True)
+    direction: int
+    stages: tuple[Any, ...] = ()
+    when: Any = None
 
 
-def rising(quantity: Component) -> Crossing:
-    """For `System.events`: the motion ends where the quantity passes zero upwards.
+def rising(quantity: Component, *, then: Any = None, when: Component | None = None) -> Crossing:
+    """For `System.events`: an event where the quantity crosses zero upwards. See `falling`."""
+    return Crossing(quantity, 1, _stages(then), when)
+
+
+def falling(quantity: Component, *, then: Any = None, when: Component | None = None) -> Crossing:
+    """For `System.events`: an event where the quantity crosses zero downwards.
 
         def events(self, t, q, u):
-            return {"top": jk.falling(u["climb"]), "door": jk.rising(q["x"] - self.length)}
+            bounce = {"climb": -self.restitution * u["climb"]}
+            return {
+                "floor": jk.falling(q["height"], then=bounce),
+                "top": jk.falling(u["climb"]),
+            }
 
-    A motion that starts on zero ends at once if the quantity leaves it upwards, and goes on if it does not.
+    Without `then` the simulation ends at the event. With `then` the state jumps and the simulation continues.
+    If the quantity is zero at the start, or after a jump, the event occurs at once if the quantity then decreases.
+
+    **Arguments:**
+
+    - `quantity`: a smooth signed number.
+    - `then`: the state after the event. A dict contains new values by name, of coordinates, independent speeds and
+        first-order states. All of them are computed from the state before the event. Names that are left out keep their
+        values. `then` may also be a `jaxkane.Impact`, a function (t, q, u) or (t, q, u, x) that returns one of both,
+        or a tuple of stages. Each stage is computed from the state that the previous stage left.
+    - `when`: a number that must be positive at the event. Otherwise the crossing has no effect.
     """
-    return Crossing(quantity, 1)
+    return Crossing(quantity, -1, _stages(then), when)
 
 
-def falling(quantity: Component) -> Crossing:
-    """For `System.events`: the motion ends where the quantity passes zero downwards. See `rising`."""
-    return Crossing(quantity, -1)
+def _stages(then: Any) -> tuple[Any, ...]:
+    if then is None:
+        return ()
+    if isinstance(then, (tuple, list)):
+        if not then:
+            raise ValueError("`then` is an empty tuple. Pass at least one stage, or omit `then` to end the simulation.")
+        return tuple(then)
+    return (then,)
 
 
 def first_crossing(
@@ -48,10 +87,14 @@ def first_crossing(
     slope1: Float[Array, " n"],
     direction: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """Where in [0, 1] cubics through two ends first pass zero; infinite where they do not.
+    """Where in [0, 1] cubics through two ends first cross zero; infinity if they do not.
 
-    **Arguments:** values `g0`, `g1` and slopes at 0 and 1; `direction`: 1 upwards, -1 downwards, 0 both. What is zero
-    at 0 passes it if it leaves in its direction; without a direction, nothing passes zero at 0.
+    **Arguments:**
+
+    - `g0`, `g1` (n,): values at 0 and 1.
+    - `slope0`, `slope1` (n,): slopes at 0 and 1.
+    - `direction` (n,): 1 upwards, -1 downwards, 0 both. A function that is zero at 0 crosses there if it then changes
+        in its direction; with the direction 0 it does not.
     """
     ends = zip(g0, slope0, g1, slope1, direction, strict=True)
     places = [_first_crossing(*(jnp.asarray(x, g0.dtype) for x in end)) for end in ends]
@@ -59,16 +102,20 @@ def first_crossing(
 
 
 def _first_crossing(g0: Array, slope0: Array, g1: Array, slope1: Array, direction: Array) -> Array:
-    """Of one cubic: scalars, so that all of it can be one function."""
+    """The first crossing of one cubic. Arguments are scalars, so that everything is one function."""
     a, b, c = 2 * (g0 - g1) + slope0 + slope1, 3 * (g1 - g0) - 2 * slope0 - slope1, slope0
-    p = lambda x: ((a * x + b) * x + c) * x + g0  # noqa: E731
-    p_dot = lambda x: (3 * a * x + 2 * b) * x + c  # noqa: E731
 
-    # Between its extrema a cubic passes zero once at most.
+    def p(x: Array) -> Array:
+        return ((a * x + b) * x + c) * x + g0
+
+    def p_dot(x: Array) -> Array:
+        return (3 * a * x + 2 * b) * x + c
+
+    # Between its extrema a cubic crosses zero at most once.
     low, high = _extrema(a, b, c)
     places = (jnp.zeros_like(a), low, high, jnp.ones_like(a))
     values = (g0, p(low), p(high), g1)
-    # Which way it must go: without a direction, away from the side that it is on.
+    # The sign of the slope at a crossing. With direction 0 the function must leave the side on which it is.
     side = jnp.where(g0 != 0, g0, jnp.where(values[1] != 0, values[1], jnp.where(values[2] != 0, values[2], g1)))
     way = jnp.where(direction == 0, -jnp.sign(side), direction)
     left, right, before, any_passes = places[0], places[1], values[0], jnp.zeros((), bool)
@@ -77,8 +124,8 @@ def _first_crossing(g0: Array, slope0: Array, g1: Array, slope1: Array, directio
         left, right = jnp.where(passes, places[i], left), jnp.where(passes, places[i + 1], right)
         before, any_passes = jnp.where(passes, values[i], before), any_passes | passes
 
-    # Newton's method, on the side of the inflection on which the root is: from where the cubic bends away from zero it
-    # passes over no root. The step that follows is measured anew, so a few digits are enough.
+    # Newton's method, on the root's side of the inflection. It starts where the cubic bends away from zero, so it
+    # cannot pass a root. A few digits are enough, because the repeated step is evaluated again.
     inflection = jnp.clip(_ratio(-b, 3 * a), left, right)
     is_behind = way * p(inflection) < 0
     left, right = jnp.where(is_behind, inflection, left), jnp.where(is_behind, right, inflection)
@@ -87,16 +134,19 @@ def _first_crossing(g0: Array, slope0: Array, g1: Array, slope1: Array, directio
         slope = p_dot(x)
         stays = (p(x) == 0) | (slope == 0)
         x = jnp.where(stays, x, x * x * (2 * a * x + b) - g0) / jnp.where(stays, 1.0, slope)
-        x = jnp.clip(x, 0.0, 1.0)  # rounding errors beside a double root send it anywhere
-    # Infinity by a division: XLA computes in each of its kernels anew what comes after the last one.
+        x = jnp.clip(x, 0.0, 1.0)  # near a double root, rounding errors can move x anywhere
+    # Infinity by a division: XLA fuses the last operations into each kernel and would compute them several times.
     return jnp.where(any_passes, jnp.clip(x, left, right), 1.0) / jnp.where(any_passes, 1.0, 0.0)
 
 
 def _extrema(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
-    """Where 3 a x^2 + 2 b x + c vanishes, within [0, 1] and in their order; 0 where it does not."""
+    """Zeros of 3 a x^2 + 2 b x + c within [0, 1], in increasing order; 0 for a zero that does not exist there."""
     discriminant = b**2 - 3 * a * c
     q = -(b + jnp.where(b < 0, -1.0, 1.0).astype(b.dtype) * jnp.sqrt(jnp.maximum(discriminant, 0.0)))
-    inside = lambda x: jnp.where((discriminant > 0) & (x > 0) & (x < 1), x, 0.0)  # noqa: E731
+
+    def inside(x: Array) -> Array:
+        return jnp.where((discriminant > 0) & (x > 0) & (x < 1), x, 0.0)
+
     x, y = inside(_ratio(q, 3 * a)), inside(_ratio(c, q))
     return jnp.minimum(x, y), jnp.maximum(x, y)
 
@@ -106,81 +156,250 @@ def _ratio(x: Array, y: Array) -> Array:
 
 
 class Events(NamedTuple):
-    """The events of a system: their names in the order of the alphabet, the directions in which they count (1, -1, or 0
-    for both), and whether any of them reads speeds."""
+    """The events of a system.
+
+    - `names`: in alphabetical order.
+    - `directions`: 1, -1, or 0 for both.
+    - `stages`: the number of stages of `then`; 0 for an event that ends the simulation.
+    - `conditions`: for each event its place among those with `when`, or None.
+    - `read_rates`: whether any event uses speeds or first-order states, whose rates the solver must evaluate.
+    - `read_time`: whether any event uses the time.
+    """
 
     names: tuple[str, ...]
     directions: tuple[int, ...]
-    read_speeds: bool
+    stages: tuple[int, ...]
+    conditions: tuple[int | None, ...]
+    read_rates: bool
+    read_time: bool
+
+    @property
+    def continue_(self) -> bool:
+        """Whether any event changes the state, so that the simulation continues."""
+        return any(self.stages)
 
 
 def events_of(system: System, t: Array, state: State) -> Events:
-    """What a description says may end its motion."""
-    u_all = jnp.zeros(len(system.speeds) + len(system.dependent_speeds), state.q.dtype)
+    """The events of a system. They are traced once to detect their directions and what they use."""
+    dtype = state.q.dtype
+    u_all = jnp.zeros(len(system.speeds) + len(system.dependent_speeds), dtype)
+    x, found = jnp.zeros(len(system.states), dtype), {}
 
-    def named(t: Array, q: Array, u_all: Array) -> dict[str, Any]:
-        return _events(system, t, tuple(q), tuple(u_all), q.dtype)
+    def values(t: Array, q: Array, u_all: Array, x: Array) -> Any:
+        found.update(crossings(system, t, tuple(q), tuple(u_all), tuple(x), dtype))
+        return [(event.value, event.when) for event in found.values()]
 
-    program, events = jax.make_jaxpr(named, return_shape=True)(t, state.q, u_all)
-    directions = tuple(e.direction if isinstance(e, Crossing) else 0 for e in events.values())
-    return Events(tuple(events), directions, any(depends_on(program, [2])))
+    program = jax.make_jaxpr(values)(t, state.q, u_all, x)
+    events = list(found.values())
+    conditional = [name for name, event in found.items() if event.when is not None]
+    return Events(
+        tuple(found),
+        tuple(event.direction for event in events),
+        tuple(len(event.stages) for event in events),
+        tuple(conditional.index(name) if name in conditional else None for name in found),
+        any(depends_on(program, [2, 3])),
+        any(depends_on(program, [0])),
+    )
 
 
-def _events(system: System, t: Component, q: Any, u_all: Any, dtype: Any) -> dict[str, Any]:
-    events = system.events(t, q, u_all)
+def crossings(system: System, t: Component, q: Any, u_all: Any, x: Any, dtype: DTypeLike) -> dict[str, Crossing]:
+    """The events by name, in alphabetical order, with floats as values.
+
+    **Arguments:**
+
+    - `t`: time [s]. `q`, `u_all`, `x`: coordinates, all speeds, first-order states.
+    - `dtype`: the type of the values.
+
+    **Raises:** `TypeError` or `ValueError` for events that are not a dict of numbers by name, or have reserved names.
+    """
+    x = NamedVector(x, system.states)
+    events = call_with_states(system.events, t, q, u_all, x)
     if not isinstance(events, Mapping):
-        raise TypeError(f"{type(system).__name__}.events returns quantities by name, a dict; got {events!r}.")
+        raise TypeError(f"{type(system).__name__}.events must return a dict of quantities by name; got {events!r}.")
+    unnamed = [name for name in events if not isinstance(name, str)]
+    if unnamed:
+        raise TypeError(f"{type(system).__name__}.events: the name of an event must be a string; got {unnamed[0]!r}.")
     reserved = [name for name in events if name.replace("_", " ") in REASONS]
     if reserved:
-        raise ValueError(f"{type(system).__name__}: an event is called {reserved[0]!r}, the reason of another end.")
-    return {name: _as_float(name, events[name], dtype) for name in sorted(events)}
+        raise ValueError(f"{type(system).__name__}: the event name {reserved[0]!r} is reserved. Use another name.")
+    return {name: _as_crossing(name, events[name], dtype) for name in sorted(events)}
 
 
-def _as_float(name: str, event: Any, dtype: Any) -> Any:
-    if isinstance(event, Crossing):
-        return Crossing(_as_float(name, event.value, dtype), event.direction)
-    value = jnp.asarray(event)
+def call_with_states(f: Callable[..., Any], t: Component, q: Any, u: Any, x: Any) -> Any:
+    """f(t, q, u), or f(t, q, u, x) if the function has a fourth argument for the first-order states."""
+    parameters = inspect.signature(f).parameters.values()
+    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    return f(t, q, u, x) if len(positional) > 3 else f(t, q, u)
+
+
+def _as_crossing(name: str, event: Any, dtype: DTypeLike) -> Crossing:
+    if not isinstance(event, Crossing):
+        return Crossing(_as_float(name, event, dtype), 0)
+    when = None if event.when is None else _as_float(name, event.when, dtype, is_condition=True)
+    return dataclasses.replace(event, value=_as_float(name, event.value, dtype), when=when)
+
+
+def _as_float(name: str, event: Any, dtype: DTypeLike, is_condition: bool = False) -> Any:
+    value, part = jnp.asarray(event), ": `when`" if is_condition else ""
+    if is_condition and value.dtype == bool:
+        raise TypeError(
+            f"The event {name!r}: `when` is a boolean. Pass a number that is positive where the event may occur, e.g. "
+            "when=q['x'] instead of when=q['x'] > 0."
+        )
     if value.dtype == bool:
         raise TypeError(
-            f"The event {name!r} is a truth value, which passes no zero: give the signed, smooth quantity that "
-            "vanishes, as q['h'] for q['h'] < 0; jaxkane.falling and jaxkane.rising say in which direction it counts."
+            f"The event {name!r} is a boolean. Return a smooth, signed quantity that is zero at the event, e.g. "
+            "q['h'] instead of q['h'] < 0. jaxkane.falling and jaxkane.rising select the direction of the crossing."
+        )
+    if value.shape:
+        raise TypeError(
+            f"The event {name!r}{part} has the shape {value.shape}. Return one number per name, e.g. one event for "
+            "each component."
         )
     return value.astype(dtype)
 
 
 class EventValues(NamedTuple):
-    """What may end a motion, at one time: all events (n,), their time derivatives (n,) along the motion, and a `bound`
-    that nothing may pass: det C_dep. Where that vanishes, the independent speeds do not determine the dependent."""
+    """The event functions at one time.
+
+    Fields:
+
+    - `values` (n,): the event functions. `rates` (n,): their time derivatives along the trajectory [1/s].
+    - `bound`: det C_dep, whose sign must not change. If it is zero, the independent speeds do not determine the
+      dependent speeds.
+    - `conditions` (m,): the quantities `when` of the events that have one.
+    """
 
     values: Array
     rates: Array
     bound: Array
+    conditions: Array
+
+    def packed(self) -> Array:
+        return jnp.concatenate([self.bound[None], self.values, self.rates, self.conditions])
+
+    @classmethod
+    def unpacked(cls, numbers: Array, n: int) -> EventValues:
+        """The inverse of `packed`, for `n` events."""
+        return cls(numbers[1 : n + 1], numbers[n + 1 : 2 * n + 1], numbers[0], numbers[2 * n + 1 :])
+
+    def at_start(self, events: Events, rounding: Array, before: Array | None = None) -> EventValues:
+        """The same where steps begin.
+
+        A function is set to zero if it would reach zero within a rounding error [s]. If its condition is not met, its
+        crossing is passed over: it is set to the side on which it will be. `before` (n,): its rates before a jump.
+        """
+        rates = jnp.abs(self.rates) if before is None else jnp.maximum(jnp.abs(self.rates), jnp.abs(before))
+        vanishes = jnp.abs(self.values) <= rates * rounding
+        values = jnp.where(vanishes, jnp.zeros_like(self.values), self.values)
+        return self._replace(values=values).passed(events, vanishes)
+
+    def passed(self, events: Events, near: Any) -> EventValues:
+        """The same, with the functions that are `near` zero (n,) set to their side after the crossing, where their
+        condition is not met. Otherwise the next step would find the same crossing again, and hide later ones."""
+        values = list(self.values)
+        for i, place in enumerate(events.conditions):
+            if place is not None:
+                direction = jnp.asarray(events.directions[i], self.values.dtype)
+                way = direction if events.directions[i] else jnp.sign(self.rates[i])
+                crosses = near[i] & (self.conditions[place] <= 0) & (way * self.rates[i] > 0)
+                values[i] = jnp.where(crosses, way * jnp.finfo(self.values.dtype).tiny, values[i])
+        return self._replace(values=jnp.stack(values)) if any(x is not None for x in events.conditions) else self
+
+    def occurred_once(self, events: Events, event: Array, before: Array | None) -> EventValues:
+        """The same after the jump of an event that did not change the rate of its own function.
+
+        A function of the time, for example, continues through zero. It is set to its side after the crossing.
+        """
+        values = list(self.values)
+        for i, direction in enumerate(events.directions):
+            if events.stages[i] and before is not None:
+                rate, tolerance = self.rates[i], jnp.finfo(self.values.dtype).eps ** 0.5
+                way = jnp.asarray(direction, rate.dtype) if direction else jnp.sign(rate)
+                is_same = jnp.abs(rate - before[i]) <= tolerance * jnp.abs(before[i])
+                passes = (event == i) & (values[i] == 0) & is_same & (way * rate > 0)
+                values[i] = jnp.where(passes, way * jnp.finfo(rate.dtype).tiny, values[i])
+        return self._replace(values=jnp.stack(values)) if values else self
+
+    def growth(self, end: EventValues, h: Array, share: float) -> Array:
+        """The largest ratio of the next step to this step, such that no event function oscillates within the next step.
+
+        The error estimate does not contain the event functions. Here the difference between their change and the
+        trapezoidal rule is limited to a share of their size. This difference is proportional to h^3.
+        """
+        growth = jnp.full_like(h, jnp.inf)
+        for i in range(self.values.shape[0]):
+            g0, s0, g1, s1 = self.values[i], self.rates[i], end.values[i], end.rates[i]
+            size = jnp.abs(g0) + jnp.abs(g1) + 0.5 * h * (jnp.abs(s0) + jnp.abs(s1))
+            bend = jnp.abs(g1 - g0 - 0.5 * h * (s0 + s1)) - 1e3 * jnp.finfo(h.dtype).eps * size
+            bends = (bend > 0) & (size < jnp.inf)  # a rate may be infinite, e.g. of a norm at zero
+            allowed = jnp.where(bends, share * size, 1.0) / jnp.where(bends, bend, 1.0)
+            # Not the cubic root, which is a slow call in native kernels: the fourth root is two square roots.
+            growth = jnp.where(bends, jnp.minimum(growth, jnp.maximum(jnp.sqrt(jnp.sqrt(allowed)), 0.5)), growth)
+        return growth
 
 
 @ScalarFunction
 def event_values(system: System, t: Component, y: Array, y_dot: Array | None) -> EventValues:
-    """Those of a packed state. `y_dot`: None where no event reads speeds."""
+    """The event functions at a packed state. `y_dot`: None if no event uses speeds or first-order states."""
     state, like = unpacked(system, y), y
     equations = KaneEquations(system, t, state.q, state.u)
     det = determinant(equations.C_dep) if equations.k else 1.0
+    x = () if state.x is None else tuple(state.x)
     u_all_dot: Any = (0.0,) * len(equations.u_all)
+    x_dot: Any = (0.0,) * len(x)
     if y_dot is not None:
-        u_dot = tuple(unpacked(system, y_dot).u)
-        u_all_dot = (*u_dot, *equations.dependent_accelerations(u_dot))
+        dot = unpacked(system, y_dot)
+        u_all_dot = (*dot.u, *equations.dependent_accelerations(tuple(dot.u)))
+        x_dot = () if dot.x is None else tuple(dot.x)
 
-    def read(t: Component, q: Any, u_all: Any) -> Array:
-        events = _events(system, t, q, u_all, like.dtype).values()
-        return as_vector([e.value if isinstance(e, Crossing) else e for e in events], like)
+    def read(t: Component, q: Any, u_all: Any, x: Any) -> tuple[Array, Array]:
+        events = crossings(system, t, q, u_all, x, like.dtype).values()
+        conditions = [event.when for event in events if event.when is not None]
+        return as_vector([event.value for event in events], like), as_vector(conditions, like)
 
-    point, direction = (equations.t, equations.q, equations.u_all), (1.0, equations.q_dot, u_all_dot)
-    as_like = lambda xs: jax.tree.map(lambda x: jnp.asarray(x, like.dtype), xs)  # noqa: E731
-    values, rates = jax.jvp(read, as_like(point), as_like(direction))
-    return EventValues(values, rates, as_vector([det], like)[0])
+    point, direction = (equations.t, equations.q, equations.u_all, x), (1.0, equations.q_dot, u_all_dot, x_dot)
+
+    def as_like(xs: Any) -> Any:
+        return jax.tree.map(lambda x: jnp.asarray(x, like.dtype), xs)
+
+    (values, conditions), (rates, _) = jax.jvp(read, as_like(point), as_like(direction))
+    return EventValues(values, rates, as_vector([det], like)[0], conditions)
+
+
+def first_event(events: Events, rounding: Array, start: EventValues, end: EventValues, h: Array) -> tuple[Array, Array]:
+    """Which event function first crosses zero in a step, as a float, and where in [0, 1]; infinity if none does.
+
+    **Arguments:**
+
+    - `events`: their directions. An event whose condition is not met at both ends of the step is passed over.
+    - `rounding`: a function that would reach zero within this time after the step is zero at its end [s].
+    - `start`, `end`: the event functions at both ends of the step. `h`: its length [s].
+    """
+    direction = jnp.asarray(events.directions, h.dtype)
+    # If a rate is not finite, e.g. of a norm at zero, the slope of the chord is used instead.
+    chord = end.values - start.values
+    slopes = [jnp.where(jnp.abs(rates) < jnp.inf, h * rates, chord) for rates in (start.rates, end.rates)]
+    x = first_crossing(start.values, slopes[0], end.values, slopes[1], direction)
+    coming = (jnp.sign(end.values) * jnp.sign(end.rates) < 0) & (direction * end.rates >= 0)
+    coming &= jnp.abs(end.values) <= jnp.abs(end.rates) * rounding
+    x = jnp.where(coming, jnp.minimum(x, 1.0), x)
+    event, place = jnp.full_like(h, -1.0), jnp.full_like(h, jnp.inf)
+    for i in reversed(range(len(events.directions))):
+        nearer = x[i] <= place
+        condition = events.conditions[i]
+        if condition is not None:
+            nearer &= (start.conditions[condition] > 0) | (end.conditions[condition] > 0)
+        event, place = jnp.where(nearer, float(i), event), jnp.where(nearer, x[i], place)
+    return event, place
 
 
 class EventPoint(NamedTuple):
-    """Beside an event: `t` [s] and the packed state `y`, after a `step`, and whether they move smoothly with what they
-    come from."""
+    """A point near an event.
+
+    Fields: time `t` [s] and packed state `y`; the last `step` of Newton iteration [s]; and whether time and state are
+    `smooth` functions of the arguments of the simulation.
+    """
 
     t: Array
     y: Array
@@ -188,16 +407,16 @@ class EventPoint(NamedTuple):
     smooth: Array
 
 
-@ScalarFunction.once
-def next_point(system: System, point: EventPoint, y_dot, read_rates, reach, which, happened) -> EventPoint:
-    """After a step of Newton's method towards the event `which`, a float; no step where none `happened`.
+@ScalarFunction.compile_cheaply
+def next_point(system: System, origin, point: EventPoint, y_dot, read_rates, reach, which, happened) -> EventPoint:
+    """The point after a step of Newton's method towards the event `which`, a float; the same if none `happened`.
 
         t - g / g_dot,   y - (g / g_dot) y_dot
 
-    It is smooth where the event is within `reach` [s]. The rates g_dot and y_dot are taken for numbers. `read_rates`:
-    y_dot, None where no event reads speeds.
+    It is smooth if the event is within `reach` [s]. The rates g_dot and y_dot are treated as constants.
+    `origin`: the start of the simulation [s]. `read_rates`: y_dot, None if no event uses speeds.
     """
-    quantities = event_values(system, point.t, point.y, read_rates)
+    quantities = event_values(system, origin + point.t, point.y, read_rates)
     g, g_dot = quantities.values[0], quantities.rates[0]
     for i in range(1, len(quantities.values)):
         g, g_dot = (jnp.where(which == i, x[i], x0) for x, x0 in ((quantities.values, g), (quantities.rates, g_dot)))

@@ -1,7 +1,8 @@
-"""The motion of a system as one program: whether it can begin, its steps, its end, and what follows from it."""
+"""The simulation of a system as one program: initial check, steps, termination and trajectory."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,32 +13,32 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._kane.api import _kinetic_energy
 from .._kane.checks import bodies_are_possible
-from .._kane.constraints import configuration_is_met, correction, has_configuration_constraints, projected
+from .._kane.constraint_residuals import configuration_is_met, correction, has_configuration_constraints, projected
 from .._kane.kanes_method import KaneEquations
-from .._kane.rhs import outputs_at, rates_are_native, values_of, vector_field
+from .._kane.right_hand_side import outputs_at, rates_are_native, values_of, vector_field
 from .._scalarjit.cache_key import captured_tracers, captures_any, jit
 from .._scalarjit.components import as_vector
-from .._scalarjit.function import Packed, ScalarFunction, tree_of
 from .._scalarjit.jaxpr import LARGEST_SUM
 from .._scalarjit.nan import (
     all_finite,
     constant,
     derivative_free_where_not_finite,
+    nan_beyond_second_derivative,
     nan_derivative_where,
     nan_where,
-    negligible,
     parts_of,
 )
+from .._scalarjit.scalar_function import Packed, ScalarFunction, tree_of
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
+from .discontinuities import Discontinuities, all_end_steps, discontinuities_of, rounding
 from .events import EventPoint, Events, EventValues, event_values, events_of, next_point
 from .inputs import (
-    Discontinuities,
     InputState,
     RateArguments,
     Samples,
-    discontinuities_of,
     for_fixed_steps,
     inputs_are_valid,
     inputs_at,
@@ -45,24 +46,255 @@ from .inputs import (
     restore_times,
     samples_of,
 )
+from .jumps import JumpTable, impulses_at, stages_of, state_after, without_derivative_at
+from .loop import Jump, JumpRecord, Jumps, Steps, diffrax_loop, fast_loop, is_supported
 from .settings import Settings, with_scan_kind, with_tolerances
+from .solvers import StepwiseInputs, UnrolledERK, is_explicit, last_stage_is_spare
 from .status import Status
-from .step_control import ClipToDiscontinuities, ControlSettings, StepSizeController, Times, evenly_spread, times_of
-from .steps import UnrolledERK, is_explicit, take_steps
+from .step_control import SHARE, StepSizeController, evenly_spread, first_step
 from .trajectory import InputDiscontinuities, Trajectory
+
+
+@jit
+def solve(
+    system: System,
+    state: State,
+    origin: Array,
+    taus: Array,
+    signals: Any,
+    settings: Settings,
+    discontinuities: Array | None = None,
+    closures: Any = (),
+) -> Trajectory:
+    """`simulate` without its checks: one compiled program.
+
+    **Arguments:**
+
+    - `system`; `state`: the system, and its state at the start.
+    - `origin`: the start of the simulation [s], on the clock of the system.
+    - `taus` (n_t,): times since the start [s] at which the state is saved; the first one is zero.
+    - `signals`: inputs, whose samples have times since the start; see `as_signals` and `since`.
+    - `settings`: the options of `simulate`.
+    - `discontinuities` (n,): more times since the start at which steps end [s].
+    - `closures`: values in closures of input functions. Derivatives with respect to them are NaN where the result is
+        NaN.
+
+    **Returns:** a `Trajectory` with the times `origin + taus`.
+    """
+    signals, fixed = restore_times(signals), settings.step is not None
+    signals = for_fixed_steps(signals) if fixed else signals
+    follows_from = parts_of((system, state, origin, taus, signals, discontinuities, closures))
+    others_are_valid = inputs_are_valid(signals)
+    if not settings.rising:
+        rises = _is_rising(origin, taus)
+        taus = jnp.where(rises, taus, jnp.arange(taus.shape[0], dtype=taus.dtype))
+        others_are_valid &= rises
+    if settings.check_bodies:
+        others_are_valid &= bodies_are_possible(system, origin, state.q)
+    # Values that are not finite must not reach the solver: the gradients of parameters that members share would be NaN.
+    valid, start, system = initial_check(system, packed(state), origin, others_are_valid)
+    if fixed and discontinuities is not None:
+        # Fixed steps do not end there. JAX would compute a derivative of 0 for these times, which is wrong.
+        start = nan_derivative_where(jnp.array(True), start, discontinuities)
+    signals, state = mask_invalid_inputs(signals, valid), unpacked(system, start)
+    readers = _reads_samples(system)
+    found = discontinuities_of(system, signals, readers, origin, state, fixed, settings.rtol, discontinuities)
+    # In reverse mode, packing replaces a separate sum for the cotangent of each parameter in each loop by one sum. In
+    # forward mode parameters are not packed, because members of a batch may share some of them.
+    stepped = system if settings.is_forward else Packed.of(system, start.dtype)
+    spare = fixed and last_stage_is_spare(settings.solver)
+    only_samples = isinstance(signals, dict) and len(samples_of(signals)) == len(signals)
+    has_pieces = found is not None and not (only_samples and discontinuities is None and not readers)
+    problem = Problem(
+        system=system,
+        start=start,
+        taus=taus,
+        valid=valid,
+        args=RateArguments(
+            stepped,
+            signals,
+            origin,
+            has_pieces=has_pieces,
+            one_piece=not fixed and all_end_steps(signals),
+            share=SHARE if fixed else 0.0,
+            past_end=spare,
+        ),
+        discontinuities=Discontinuities.within(found, taus[-1]),
+        events=events_of(system, origin, state),
+        settings=settings,
+    )
+    steps = problem.steps()
+    end = problem.end(steps)
+    end = problem.located(end, steps.rates, steps.state.reach) if problem.events.names else end
+    return _trajectory(problem, steps, end, follows_from)
+
+
+class End(NamedTuple):
+    """Where a simulation ends.
+
+    Fields: the `status`, as a float; the time `t` since the start [s] and the packed state `y`; whether both are
+    `smooth` functions of the arguments; and whether an event ended the simulation (`by_event`).
+    """
+
+    status: Array
+    t: Array
+    y: Array
+    smooth: Array
+    by_event: Array
+
+
+class Problem(NamedTuple):
+    """An initial value problem and the options of its solution.
+
+    Fields:
+
+    - `system`: the system, with ones for parameters that are not valid. `start`: the packed state at the start.
+    - `taus` (n_t,): the requested times since the start [s]. `valid`: whether the simulation may begin.
+    - `args`: the arguments of the right-hand side. `discontinuities`: where steps end, or None.
+    - `events`: the event functions. `settings`: the options of `simulate`.
+    """
+
+    system: System
+    start: Array
+    taus: Array
+    valid: Array
+    args: RateArguments
+    discontinuities: Discontinuities | None
+    events: Events
+    settings: Settings
+
+    @property
+    def constrained(self) -> bool:
+        state = unpacked(self.system, self.start)
+        return has_configuration_constraints(self.system, self.args.origin, state.q)
+
+    @property
+    def are_native(self) -> bool:
+        """Whether the right-hand side is one native kernel."""
+        t, state = self.args.origin, unpacked(self.system, self.start)
+        return rates_are_native(self.args.system, t, self.start, inputs_at(self.system, self.args.signals, t, state))
+
+    def rates(self) -> Callable[..., Any]:
+        settings = self.settings
+        return _rates(settings.stabilize if self.constrained else 0.0, settings.is_forward)
+
+    def steps(self) -> Steps:
+        """The states at the requested times, and where the steps end."""
+        settings, rates = self.settings, self.rates()
+        controller = self.controller(rates)
+
+        def trial_rates(t: Any, y: Any, args: Any) -> Any:
+            # If a step is rejected because its rates are not finite, the reverse-mode derivative must not become NaN.
+            return derivative_free_where_not_finite(rates, t, y, args)
+
+        solver = _solver_for(settings, self.are_native)
+        how = rates if settings.is_forward else trial_rates, solver, controller, self.start, self.args, self.taus
+        limits = settings.adjoint, settings.max_steps, self.valid
+        if is_supported(solver, controller, settings.adjoint, settings.progress):
+            jumps = Jumps(self.jump, settings.max_jumps) if self.events.continue_ else None
+            return fast_loop(*how, *limits, jumps)
+        if self.events.continue_:
+            raise ValueError(
+                f"{type(self.system).__name__}: an event changes the state (`then`). This needs the solver loop of "
+                "jaxkane. Omit `controller` and `progress`, use adjoint='reverse', 'forward' or 'both', and a solver "
+                "that is not implicit-explicit."
+            )
+        return diffrax_loop(*how, *limits, settings.progress)
+
+    def controller(self, rates: Callable[..., Any]) -> StepSizeController:
+        system, settings, events = self.system, self.settings, self.events
+
+        def quantities(t: Array, y: Array, args: RateArguments) -> EventValues:
+            return event_values(args.system, args.clock(t), y, rates(t, y, args) if events.read_rates else None)
+
+        def as_number(x: Any) -> Array:
+            return jnp.asarray(x, self.taus.dtype)
+
+        fixed, may_end, found = settings.step is not None, events.names or system.dependent_speeds, self.discontinuities
+        if found is not None and ((fixed and not found.jumps) or self.args.past_end):
+            found = found._replace(restart=False)  # no stage of a step is used on the other side of a jump
+        return StepSizeController(
+            rtol=as_number(settings.rtol),
+            atol=as_number(settings.atol),
+            step=evenly_spread(self.taus[-1], as_number(settings.step)) if fixed else None,
+            first=first_step(self.taus),
+            longest=as_number(jnp.inf if settings.max_step is None else settings.max_step),
+            duration=self.taus[-1],
+            discontinuities=found,
+            event_values=quantities if may_end else None,
+            events=events,
+            inner=settings.controller,
+        )
+
+    def end(self, steps: Steps) -> End:
+        """The end of the last step. With an event, this is near the event."""
+        nothing = steps.accepted < 1
+        return End(*_end(self.valid, self.taus[-1], self.start, steps.t, steps.y, steps.state.status, nothing))
+
+    def located(self, end: End, y_dot: Any, reach: Array) -> End:
+        """The same, at the time of the event if an event ended the simulation."""
+        # Members without an event are evaluated at the start, where all rates are finite.
+        t, y = jnp.where(end.by_event, constant(end.t), 0.0), jnp.where(end.by_event, end.y, self.start)
+        point = self.event_point(t, y, y_dot, end.status - Status.EVENT, reach, end.by_event)
+        t, y = (jnp.where(end.by_event, new, old) for new, old in ((point.t, end.t), (point.y, end.y)))
+        return end._replace(t=t, y=y, smooth=end.smooth | (end.by_event & point.smooth))
+
+    def event_point(self, t: Array, y: Array, y_dot: Any, event: Array, reach: Array, happened: Array) -> EventPoint:
+        """The time and the state at an event, from a time and a state near it.
+
+        A step ends so near to the event that the first step of Newton's method is exact. The second step has the
+        derivatives of the implicit function theorem. They are exact up to the second order, because the state is
+        corrected with the rates halfway to the event.
+        """
+        rates, args = self.rates(), dataclasses.replace(self.args, within=None)
+        if y_dot is None:
+            y_dot = rates(*constant((t, y, args)))
+        y_dot = jnp.where(happened, y_dot, jnp.zeros_like(y_dot))
+
+        def stepped(point: EventPoint) -> EventPoint:
+            read = y_dot if self.events.read_rates else None
+            return next_point(args.system, args.origin, point, y_dot, read, reach, event, happened)
+
+        near = stepped(EventPoint(t, y, jnp.zeros_like(t), jnp.array(True)))
+        bend = near.step * (rates(t + 0.5 * near.step, y + 0.5 * near.step * y_dot, args) - y_dot)
+        return stepped(near._replace(y=near.y + bend))
+
+    def jump(self, t: Array, y: Array, event: Array, reach: Array) -> Jump:
+        """The jump of an event, from a time and a packed state near it."""
+        point = self.event_point(t, y, None, event, reach, jnp.array(True))
+        after = state_after(self.args.system, self.args.clock(point.t), point.y, event, stages_of(self.events))
+        is_possible = jnp.all(jnp.isfinite(after))
+        if self.constrained:
+            q = unpacked(self.system, jnp.where(is_possible, after, point.y)).q
+            is_possible &= configuration_is_met(self.system, self.args.clock(point.t), q)
+        return Jump(point.t, point.y, after, point.smooth.astype(y.dtype), constant(is_possible))
+
+
+@ScalarFunction.compile_cheaply
+def _end(
+    valid: Array, duration: Array, start: Array, t: Array, y: Array, status: Array, nothing_accepted: Array
+) -> tuple[Array, ...]:
+    # One `ScalarFunction`: XLA would compute it again in every kernel that uses one of its results.
+    unfinished = (status == Status.COMPLETED) & (t < duration)
+    status = jnp.where(unfinished, float(Status.MAX_STEPS), status)
+    status = jnp.where((status == Status.STEP_TOO_SMALL) & nothing_accepted, float(Status.NO_SOLUTION), status)
+    status = jnp.where(valid, status, float(Status.INVALID))
+    completed, by_event = status == Status.COMPLETED, status >= Status.EVENT
+    t = jnp.where(completed, duration, jnp.where(valid, t, 0.0))
+    return status, t, jnp.where(valid, y, start), completed, by_event
 
 
 def _is_small(x: Any) -> bool:
     return eqx.is_inexact_array(x) and 0 < x.size <= LARGEST_SUM
 
 
-def _is_rising(ts: Array) -> Array:
-    # A window of a fit may stand still at its last time.
-    return jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0]) & jnp.isfinite(ts[0]) & jnp.isfinite(ts[-1])
+def _is_rising(origin: Array, taus: Array) -> Array:
+    # The last times of a window of a fit may be equal, because windows are padded with the last time.
+    return jnp.all(taus[1:] >= taus[:-1]) & (taus[-1] > 0) & jnp.isfinite(origin) & jnp.isfinite(taus[-1])
 
 
 def is_valid(system: System, y: Array, t: Array, signals: Any) -> Array:
-    """Whether a motion can begin at `t`, with a packed state."""
+    """Whether a simulation can start at `t`, with a packed state."""
     others = _large_are_valid(system, y) & inputs_are_valid(signals)
     return _small_are_valid(*constant((system, y, t)), others)
 
@@ -72,7 +304,7 @@ def _large_are_valid(system: System, y: Array) -> Array:
     return functools.reduce(jnp.logical_and, allowed, all_finite(eqx.filter((system, y), _is_small, inverse=True)))
 
 
-@ScalarFunction.once
+@ScalarFunction.compile_cheaply
 def _small_are_valid(system: System, y: Array, t: Array, others_are_valid: Array) -> Array:
     conditions = [others_are_valid, configuration_is_met(system, t, unpacked(system, y).q)]
     conditions += [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, y)) if _is_small(x)]
@@ -81,45 +313,36 @@ def _small_are_valid(system: System, y: Array, t: Array, others_are_valid: Array
 
 
 def _limited(system: System) -> list[tuple[Array, ParameterInfo]]:
-    """Values of the parameters that cannot be any number, and what they can be."""
+    """Values of the parameters with a limited range, and their ranges."""
     return [(value, info) for _, value, info in parameters_in(system) if info.is_limited]
 
 
-class Beginning(NamedTuple):
-    """The `times` of a motion; whether it can begin; its packed state at the `start`, ones where it cannot; and its
-    `system`, with ones for parameters that are not finite, or that no description can have: behind a mask these would
-    still spoil the reverse gradient of what is shared. What all members of a batch share remains shared there, of which
-    a kernel computes its part once.
+def initial_check(system: System, y: Array, t: Array, others_are_valid: Array) -> tuple[Array, Array, System]:
+    """Whether a simulation may begin; its packed state, ones if it may not; and the system with valid parameters.
+
+    Invalid parameters are replaced by 1. Masking the result is not enough: NaN would still reach the reverse-mode
+    gradients of parameters that a batch shares. Small arrays are checked in one program, large ones one by one.
     """
-
-    times: Times
-    valid: Array
-    start: Array
-    system: System
-
-
-def beginning(system: System, y: Array, ts: Array, others_are_valid: Array) -> Beginning:
-    """From a packed state, at the first of the times (n_t,) at which a motion is kept. Small arrays all in one program,
-    large ones each by itself."""
     others = _large_are_valid(system, y) & others_are_valid
-    small = _beginning(system, y, ts[0], ts[1], ts[-1], others)
-    large = _harmless(system, y, small.valid, lambda x: eqx.is_inexact_array(x) and not _is_small(x))
+    valid, start, small = _initial_check(system, y, t, others)
+    large = _harmless(system, y, valid, lambda x: eqx.is_inexact_array(x) and not _is_small(x))
     rest = eqx.filter((y, system), eqx.is_inexact_array, inverse=True)
-    return Beginning(small.times, small.valid, *eqx.combine((small.start, small.system), large, rest))
+    return (valid, *eqx.combine((start, small), large, rest))
 
 
-@ScalarFunction.once
-def _beginning(system: System, y: Array, first: Array, second: Array, last: Array, others: Array) -> Beginning:
-    valid = _small_are_valid.__wrapped__(system, y, first, others)
+@ScalarFunction.compile_cheaply
+def _initial_check(system: System, y: Array, t: Array, others: Array) -> tuple[Array, Any, Any]:
+    valid = _small_are_valid.__wrapped__(system, y, t, others)
     start, harmless = _harmless(system, y, valid, _is_small)
-    # To JAX the state moves with the parameters, so that the derivative of the first rates is the program of the loop.
+    # The initial state formally depends on the parameters. The first evaluation of the rates then uses the same
+    # derivative program as the loop, so it is compiled once.
     numbers = [jnp.sum(x) for x in jax.tree.leaves(harmless) if x.dtype == y.dtype]
     start = jax.tree.map(lambda x: jnp.where(valid, x, x + 0.0 * sum(numbers)), start)
-    return Beginning(times_of(first, second, last), valid, start, harmless)
+    return valid, start, harmless
 
 
 def _harmless(system: System, y: Array, valid: Array, is_chosen: Callable[[Any], bool]) -> tuple[Any, Any]:
-    """The state and the system of a `Beginning`: those of their arrays that are chosen, None for the others."""
+    """The chosen arrays of a state and a system, with invalid values replaced by 1; None for the other arrays."""
     limits = {id(x): info for x, info in _limited(system)}
 
     def where(condition: Array, x: Array) -> Array | None:
@@ -128,106 +351,14 @@ def _harmless(system: System, y: Array, valid: Array, is_chosen: Callable[[Any],
     return where(valid, y), jax.tree.map(lambda x: where(limits.get(id(x), ANY).allows(x), x), system)
 
 
-class InitialValueProblem(NamedTuple):
-    """`system`, `signals`: harmless ones where no motion can begin; `start`: the packed state; `rates`: (t, y, args) ->
-    y_dot, whether these `are_native`, and the `args` that the steps pass to them."""
-
-    system: System
-    signals: Any
-    start: Array
-    ts: Array
-    times: Times
-    discontinuities: Discontinuities | None
-    valid: Array
-    rates: Callable[..., Any]
-    are_native: bool
-    args: RateArguments
-    events: Events
-    settings: Settings
-
-
-class Ending(NamedTuple):
-    """The `status`, as a float; the last time and packed state; whether these move `smooth`ly with what they come from;
-    whether the motion ended `by_event`; and its last time, state and rates, `near` which the event is: those of the
-    start, with rates of zero, where there was none; no rates (None) where the steps leave none."""
-
-    status: Array
-    t_end: Array
-    end: Array
-    smooth: Array
-    by_event: Array
-    near: tuple[Array, Array, Array | None]
-
-
-class Solution(NamedTuple):
-    """Packed states `motion` (n_t, n), and which of them were `reached` (n_t,); the `ending`; numbers of steps."""
-
-    motion: Array
-    reached: Array
-    ending: Ending
-    stats: dict[str, Array]
-
-
-@jit
-def solve(
-    system: System,
-    state: State,
-    ts: Array,
-    signals: Any,
-    settings: Settings,
-    disturbance: Any = None,
-    closures: Any = (),
-) -> Trajectory:
-    """`simulate` without its checks: one compiled program.
-
-    `closures`: what functions among the signals read by closures, so that derivatives by it are NaN where they are not.
-
-    `disturbance`: of t, inputs and state, gives the inputs as disturbed, and a `State` of what is added to its rates.
-    """
-    signals = restore_times(signals)
-    if settings.step is not None:
-        signals = for_fixed_steps(signals, settings.solver)
-    origin = parts_of((system, state, ts, signals, disturbance, closures))
-    rises = None if settings.rising else _is_rising(ts)
-    ts = ts if rises is None else jnp.where(rises, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
-    others_are_valid = inputs_are_valid(signals) & (True if rises is None else rises)
-    if settings.check_bodies:
-        others_are_valid &= bodies_are_possible(system, ts[0], state.q)
-    # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
-    times, valid, start, system = beginning(system, packed(state), ts, others_are_valid)
-    # In reverse mode the cotangent of each number would be a sum of its own, in each of the loops. In forward mode they
-    # stay apart, since in a batch some of them may be shared.
-    stepped = system if settings.is_forward else Packed.of(system, start.dtype)
-    signals, state = mask_invalid_inputs(signals, valid), unpacked(system, start)
-    constrained = has_configuration_constraints(system, times.start, state.q)
-    problem = InitialValueProblem(
-        system=system,
-        signals=signals,
-        start=start,
-        ts=ts,
-        times=times,
-        discontinuities=discontinuities_of(
-            system, signals, _reads_samples(system), times.start, state, settings.step is not None, settings.rtol
-        ),
-        valid=valid,
-        rates=_rates(settings.stabilize if constrained else 0.0, settings.is_forward),
-        are_native=rates_are_native(stepped, times.start, start, inputs_at(system, signals, times.start, state)),
-        args=RateArguments(stepped, signals, disturbance),
-        events=events_of(system, times.start, state),
-        settings=settings,
-    )
-    solution = _integrated(problem)
-    if problem.events.names:
-        solution = _to_event(problem, solution)
-    return _trajectory(problem, _filled(problem, solution, constrained and settings.project), origin)
-
-
 def one_step(
     system: System, y: Array, t0: Array, t1: Array, signals: Any, settings: Settings, disturbance: Any = None
 ) -> Array:
-    """The packed state after one step of the solver from `t0` to `t1`: the motion of `solve` without its checks, events
-    and outputs. NaN where an implicit solver finds no solution. `signals` for steps of one length."""
-    args = RateArguments(system, signals, disturbance)
+    """The packed state after one step of the solver from `t0` to `t1`, without checks, events and outputs.
+
+    NaN if an implicit solver finds no solution. The samples among the `signals` have the clock of `t0` and `t1`.
+    """
+    args = RateArguments(system, signals, jnp.zeros_like(t0), disturbance)
     constrained = has_configuration_constraints(system, t0, unpacked(system, y).q)
     rates = _rates(settings.stabilize if constrained else 0.0)
     inputs = inputs_at(system, signals, t0, unpacked(system, y))
@@ -240,13 +371,13 @@ def one_step(
 
 def _solver_for(settings: Settings, rates_are_native: bool) -> Any:
     solver: Any = settings.solver
-    if is_explicit(solver):
-        return UnrolledERK(solver) if rates_are_native else solver
-    return with_tolerances(solver, settings.rtol, settings.atol)
+    if is_explicit(solver) and rates_are_native:
+        return UnrolledERK(solver)
+    return StepwiseInputs(with_tolerances(solver, settings.rtol, settings.atol))
 
 
 def ends_between(system: System, t0: Array, y0: Array, t1: Array, y1: Array, signals: Any) -> Array:
-    """The status by what ends a motion between two packed states, one step apart: an event, or singular speeds."""
+    """The status if an event or singular speeds end a simulation between two packed states, one step apart."""
     t0, y0, t1, y1 = jax.lax.stop_gradient((t0, y0, t1, y1))
     status, events = jnp.int32(Status.COMPLETED), events_of(system, t0, unpacked(system, y0))
     if not events.names and not system.dependent_speeds:
@@ -254,19 +385,18 @@ def ends_between(system: System, t0: Array, y0: Array, t1: Array, y1: Array, sig
 
     def at(t: Array, y: Array) -> EventValues:
         rates = vector_field(system, t, y, inputs_at(system, signals, t, unpacked(system, y)))
-        return event_values(system, t, y, rates if events.read_speeds else None)
+        return event_values(system, t, y, rates if events.read_rates else None)
 
     before, after = at(t0, y0), at(t1, y1)
     for i, direction in enumerate(events.directions):
         a, b = before.values[i], after.values[i]
-        passes = jnp.where(direction * (b - a) >= 0, a * b < 0, False)
+        passes = (direction * (b - a) >= 0) & (jnp.sign(a) * jnp.sign(b) < 0)
         status = jnp.where(passes & (status == Status.COMPLETED), jnp.int32(Status.EVENT + i), status)
-    return jnp.where(before.bound * after.bound > 0, status, jnp.int32(Status.SINGULAR_SPEEDS))
+    return jnp.where(jnp.sign(before.bound) * jnp.sign(after.bound) > 0, status, jnp.int32(Status.SINGULAR_SPEEDS))
 
 
 def _reads_samples(system: System) -> dict[str, Callable[..., Any]]:
-    """The right-hand side (t, state) of a system that has samples among its parameters, or whose code reads some from
-    outside, by the system's name."""
+    """By the system's name, the right-hand side (t, state) of a system that uses samples as parameters or closures."""
 
     def rates(t: Array, state: InputState) -> Array:
         return vector_field(system, t, packed(State(state.q, state.u, state.x)), {})
@@ -275,187 +405,84 @@ def _reads_samples(system: System) -> dict[str, Callable[..., Any]]:
 
 
 def refuse_captured(system: System) -> None:
-    """**Raises:** `TypeError` where a description reads a number of a trace that is under way from outside: the rules
-    by which events, constraints and steps are differentiated know what they are given alone."""
+    """**Raises:** `TypeError` if a system uses a traced number from a closure or global variable. The derivatives of
+    events, constraints and steps would not contain it: they are computed with respect to arguments only."""
     if captured_tracers(system):
         raise TypeError(
-            f"{type(system).__name__}: its description reads, by a closure or a global, a number that is being traced "
-            "(by jax.grad, jax.jvp, jax.jit or jax.vmap). Make it a parameter of the system, or an input."
+            f"{type(system).__name__} uses, in a closure or a global variable, a number that is traced by jax.grad, "
+            "jax.jvp, jax.jit or jax.vmap. Make it a parameter of the system, or an input."
         )
 
 
 def _rates(stabilize: float, forward: bool = False) -> Callable[..., Any]:
-    """(t, y, args) -> y_dot. `stabilize` [1/s]: how fast constraints are led back; `forward`: see `vector_field`."""
+    """(t, y, args) -> y_dot. `stabilize` [1/s]: decay rate of constraint residuals; `forward`: see `vector_field`."""
 
     def rates(t: Array, y: Array, args: RateArguments) -> Array:
-        packed_system, signals, disturbance = args
-        system = tree_of(packed_system)
+        system, clock = tree_of(args.system), args.clock(t)
         state = unpacked(system, y)
-        inputs, extra = inputs_at(system, signals, t, state), None
-        if disturbance is not None:
-            inputs, extra = disturbance(t, inputs, state)
-        y_dot = vector_field(packed_system, t, y, inputs, forward)
+        inputs, extra = args.inputs(system, t, state), None
+        if args.disturbance is not None:
+            inputs, extra = args.disturbance(clock, inputs, state)
+        y_dot = vector_field(args.system, clock, y, inputs, forward)
         if extra is not None:
             y_dot += packed(extra)
         if stabilize:
-            back = stabilize * correction(system, t, state.q)
+            back = stabilize * correction(system, clock, state.q)
             y_dot += jnp.concatenate([back, jnp.zeros_like(y_dot[back.size :])])
         return y_dot
 
     return rates
 
 
-def _integrated(problem: InitialValueProblem) -> Solution:
-    """The motion at the times that its steps reach."""
-    settings, times = problem.settings, problem.times
+def _trajectory(problem: Problem, steps: Steps, end: End, follows_from: list[Array]) -> Trajectory:
+    """The trajectory of these steps, NaN after the last one. `follows_from`: the values on which it depends."""
+    system, taus, args, found = problem.system, problem.taus, problem.args, problem.discontinuities
+    ts, blur = args.origin + taus, rounding(taus[-1], taus[-1])
+    # The last step ends shortly before or after the event. Samples between both times get the state at the event.
+    before = taus <= end.t + blur
+    # A jump at the last time leaves the state after it.
+    late = (end.by_event | (end.status == Status.COMPLETED)) & ~steps.reached & before
+    reached = problem.valid & jnp.where(end.by_event, before, steps.reached | late)
+    motion = jnp.where(late[:, None], end.y[None], steps.motion)
+    if steps.jumps is not None:
+        record = steps.jumps
+        happened = jnp.arange(record.t.shape[0]) < record.count
 
-    def trial_rates(t: Any, y: Any, args: Any) -> Any:
-        # A step that is rejected since its rates are not finite must not spoil a derivative in reverse mode.
-        return derivative_free_where_not_finite(problem.rates, t, y, args)
+        def away_from_jumps(times: Array, states: Array) -> Array:
+            apart = jnp.abs(times[:, None] - constant(record.t)[None])
+            near = happened[None] & (apart <= 16 * rounding(times, taus[-1])[:, None])
+            return without_derivative_at(near, states, record.t)
 
-    steps = take_steps(
-        problem.rates if settings.is_forward else trial_rates,
-        _solver_for(settings, problem.are_native),
-        _controller_of(problem),
-        problem.valid,
-        problem.start,
-        problem.args,
-        problem.ts,
-        settings.adjoint,
-        diffrax.TqdmProgressMeter() if settings.progress else diffrax.NoProgressMeter(),
-    )
-    progress = steps.progress
-    numbers = (progress.steps, progress.accepted, progress.steps - progress.accepted)
-    return Solution(
-        motion=steps.motion,
-        reached=(jnp.arange(len(problem.ts)) < steps.count) & problem.valid,
-        ending=_ending(
-            times, progress.status, problem.valid, steps.t_end, steps.end, constant(steps.rates), problem.start
-        ),
-        stats={name: x.astype(int) for name, x in zip(("steps", "accepted", "rejected"), numbers, strict=True)},
-    )
+        motion = away_from_jumps(taus, motion)
+        end = end._replace(y=jnp.where(end.by_event, end.y, away_from_jumps(end.t[None], end.y[None])[0]))
+        rough = jnp.min(jnp.where(happened & (record.smooth == 0), constant(record.t), jnp.inf), initial=jnp.inf)
+        motion = nan_derivative_where(taus >= rough, motion, follows_from)
+        motion = nan_beyond_second_derivative(record.count > 0, motion, follows_from)
+        end = end._replace(smooth=end.smooth & (rough == jnp.inf))
+    # States that were not reached are replaced by the first: masking the outputs would leave NaN in derivatives.
+    motion = jnp.where(reached[:, None], motion, problem.start[None])
+    if problem.settings.project and problem.constrained:
+        n_q = len(system.coordinates)
 
+        def onto_constraints(t: Array, y: Array) -> Array:
+            return jnp.concatenate([projected(system, t, y[:n_q]), y[n_q:]])
 
-def _controller_of(problem: InitialValueProblem) -> StepSizeController:
-    """What ends the steps: the last time, events, and dependent speeds that are about to be singular."""
-    system, settings, times, events = problem.system, problem.settings, problem.times, problem.events
-
-    def quantities(t: Array, y: Array, args: RateArguments) -> EventValues:
-        return event_values(args.system, t, y, problem.rates(t, y, args) if events.read_speeds else None)
-
-    as_number = lambda x: jnp.asarray(x, times.end.dtype)  # noqa: E731
-    fixed, kinks = settings.step is not None, problem.discontinuities
-    control = ControlSettings(
-        rtol=None if fixed else as_number(settings.rtol),
-        atol=None if fixed else as_number(settings.atol),
-        step=evenly_spread(times, as_number(settings.step)) if fixed else None,
-        times=times,
-        order=None if fixed else settings.solver.error_order(diffrax.ODETerm(problem.rates)),
-        max_steps=settings.max_steps,
-        directions=events.directions,
-    )
-    may_end = quantities if events.names or system.dependent_speeds else None
-    return StepSizeController(
-        control, may_end, None if kinks is None or fixed else ClipToDiscontinuities.of(kinks, times)
-    )
-
-
-# One function of scalars each: XLA would compute it anew in every program that reads any of it.
-
-
-@ScalarFunction.once
-def _ending(
-    times: Times, status: Array, valid: Array, t_last: Array, last: Array, rates: Array | None, start: Array
-) -> Ending:
-    status = jnp.where(valid, status, float(Status.INVALID))
-    completed, by_event = status == Status.COMPLETED, status >= Status.EVENT
-    t_end, end = jnp.where(completed, times.end, jnp.where(valid, t_last, times.start)), jnp.where(valid, last, start)
-    rates = None if rates is None else jnp.where(by_event, rates, jnp.zeros_like(rates))
-    near = jnp.where(by_event, t_end, times.start), jnp.where(by_event, end, start), rates
-    return Ending(status, t_end, end, completed, by_event, near)
-
-
-@ScalarFunction.once
-def _by_event(point: EventPoint, ending: Ending) -> Ending:
-    t, y = (jnp.where(ending.by_event, new, old) for new, old in ((point.t, ending.t_end), (point.y, ending.end)))
-    return ending._replace(t_end=t, end=y, smooth=ending.smooth | (ending.by_event & point.smooth))
-
-
-def _located(problem: InitialValueProblem, ending: Ending) -> EventPoint:
-    """Where the event is that ended the motion, with derivatives up to the second order; the start if none did.
-
-    The last step ends so near to it that the first step of Newton's method is exact. The second step has the
-    derivatives by the implicit function theorem, for which the rates are those halfway. Their own first derivative is
-    negligible unless the motion is very much longer than what is fastest in it. XLA alone would compile it for seconds,
-    and leaves it out.
-    """
-    system, events = problem.args.system, problem.events
-    t, y, y_dot = ending.near
-    t = constant(t)
-    if y_dot is None:
-        y_dot = problem.rates(*constant((t, y, problem.args)))
-
-    def stepped(point: EventPoint) -> EventPoint:
-        which = (ending.status - Status.EVENT, ending.by_event)
-        read_rates = y_dot if events.read_speeds else None
-        return next_point(system, point, y_dot, read_rates, problem.times.event_reach, *which)
-
-    def bend(step: Array, y: Array, args: Any) -> Array:
-        return step * (problem.rates(t + 0.5 * step, y + 0.5 * step * y_dot, args) - y_dot)
-
-    near = stepped(EventPoint(t, y, jnp.zeros_like(t), jnp.array(True)))
-    if problem.are_native:
-        return stepped(near._replace(y=near.y + bend(near.step, y, problem.args)))
-    bent = negligible(bend, near.step, y, problem.args, transposes=not problem.settings.is_forward)
-    return stepped(near._replace(y=near.y + bent))
-
-
-def _to_event(problem: InitialValueProblem, solution: Solution) -> Solution:
-    """The same, whose end is the instant of the event, where one happened."""
-    times, ending = problem.times, solution.ending
-    end = _by_event(_located(problem, ending), ending)
-    # The last step ends a little beside the event: samples from there to here are those of the event itself.
-    before = problem.ts <= end.t_end + times.rounding
-    late = ending.by_event & ~solution.reached & before
-    return solution._replace(
-        motion=jnp.where(late[:, None], end.end[None], solution.motion),
-        reached=jnp.where(ending.by_event, before, solution.reached),
-        ending=end,
-    )
-
-
-def _filled(problem: InitialValueProblem, solution: Solution, project: bool) -> Solution:
-    """The same with the first state at the times that were not reached, since a value that is not finite has
-    derivatives that a mask behind it cannot take away. `project`: onto the configuration constraints."""
-    motion = jnp.where(solution.reached[:, None], solution.motion, problem.start[None])
-    ending = solution.ending
-    if project:
-        n_q = len(problem.system.coordinates)
-
-        def onto(t: Array, y: Array) -> Array:
-            return jnp.concatenate([projected(problem.system, t, y[:n_q]), y[n_q:]])
-
-        motion = jax.vmap(onto)(problem.ts, motion)
-        ending = ending._replace(end=onto(ending.t_end, ending.end))
-    return solution._replace(motion=motion, ending=ending)
-
-
-def _trajectory(problem: InitialValueProblem, solution: Solution, origin: list[Array]) -> Trajectory:
-    """What follows from the motion, and NaN where there is none. `origin`: what all of it comes from."""
-    system, ts, kinks = problem.system, problem.ts, problem.discontinuities
-    states = unpacked(system, solution.motion)
-    u_dep = jax.vmap(lambda t, y: _dependent_speeds_of(system, t, y))(ts, solution.motion)
-    all_inputs = jax.vmap(lambda t, y: inputs_at(system, problem.signals, t, y, all_of_them=True))
-    inputs, discontinuities = all_inputs(ts, states), None
-    if kinks is not None:
-        beside = (-problem.times.rounding, problem.times.rounding) if kinks.jumps else ()
-        discontinuities = InputDiscontinuities(kinks.times, tuple(all_inputs(ts + x, states) for x in beside))
+        motion = jax.vmap(onto_constraints)(ts, motion)
+        end = end._replace(y=onto_constraints(args.origin + end.t, end.y))
+    states = unpacked(system, motion)
+    u_dep = jax.vmap(lambda t, y: _dependent_speeds_of(system, t, y))(ts, motion)
+    all_inputs = jax.vmap(lambda tau, y: args.inputs(system, tau, y, all_of_them=True))
+    inputs, discontinuities = all_inputs(taus, states), None
+    if found is not None:
+        sides = (-blur, blur) if found.jumps else ()
+        discontinuities = InputDiscontinuities(found.times, tuple(all_inputs(taus + x, states) for x in sides))
     outputs = jax.vmap(lambda t, y, w: outputs_at(system, t, y.q, y.u, values_of(system, y.x, w)))(ts, states, inputs)
-    values = nan_where(~solution.reached, (solution.motion, u_dep, inputs, outputs), origin)
-    motion, u_dep, inputs, outputs = values
-    ending = solution.ending
-    t_end, end = nan_derivative_where(~ending.smooth, (ending.t_end, ending.end), origin)
-    states, end = unpacked(system, motion), unpacked(system, nan_where(~problem.valid, end, origin))
+    motion, u_dep, inputs, outputs = nan_where(~reached, (motion, u_dep, inputs, outputs), follows_from)
+    t_end, y_end = nan_derivative_where(~end.smooth, (end.t, end.y), follows_from)
+    if problem.events.names:
+        located = end.by_event if steps.jumps is None else end.by_event | (steps.jumps.count > 0)
+        t_end, y_end = nan_beyond_second_derivative(located, (t_end, y_end), follows_from)
+    states, last = unpacked(system, motion), unpacked(system, nan_where(~problem.valid, y_end, follows_from))
     return Trajectory(
         t=ts,
         q=states.q,
@@ -464,16 +491,41 @@ def _trajectory(problem: InitialValueProblem, solution: Solution, origin: list[A
         x=states.u[:, :0] if states.x is None else states.x,
         inputs=inputs,
         outputs=outputs,
-        status=ending.status.astype(jnp.int32),
-        t_end=t_end,
-        stats=solution.stats,
+        status=end.status.astype(jnp.int32),
+        t_end=args.origin + t_end,
+        stats={"steps": steps.taken, "accepted": steps.accepted, "rejected": steps.taken - steps.accepted},
         names=names_of(system),
         events=problem.events.names,
         adjoint=type(problem.settings.adjoint).__name__,
         units=tuple(units_of(system).items()),
-        end=end,
+        end=last,
         discontinuities=discontinuities,
+        jumps=None if steps.jumps is None else _jump_table(problem, steps.jumps, follows_from),
     )
+
+
+def _jump_table(problem: Problem, record: JumpRecord, follows_from: list[Array]) -> JumpTable:
+    system, args = problem.system, problem.args
+    unused = jnp.arange(record.t.shape[0]) >= record.count
+    before, after = (jnp.where(unused[:, None], problem.start, y) for y in (record.before, record.after))
+    times, which = args.clock(record.t), stages_of(problem.events)
+
+    def energy(states: Array) -> Array:
+        q, u = unpacked(system, states).q, unpacked(system, states).u
+        return jax.vmap(lambda t, q, u: _kinetic_energy(system, t, q, u, {}))(times, q, u)
+
+    lost = energy(before) - energy(after)
+    impulses = jax.vmap(lambda t, y, event: impulses_at(system, t, y, event, which))(times, before, record.events)
+    sides = [
+        jax.vmap(lambda tau, y: args.inputs(system, tau, unpacked(system, y), all_of_them=True))(record.t, y)
+        for y in (before, after)
+    ]
+    values = times, before, after, lost, impulses, tuple(sides)
+    values = nan_beyond_second_derivative(record.count > 0, values, follows_from)
+    t, before, after, lost, impulses, inputs = nan_where(unused, values, follows_from)
+    events = jnp.where(unused, -1, record.events.astype(jnp.int32))
+    states = unpacked(system, before), unpacked(system, after)
+    return JumpTable(t, events, *states, lost, impulses, inputs, record.count, problem.events.names)
 
 
 @ScalarFunction

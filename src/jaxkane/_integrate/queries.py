@@ -1,4 +1,4 @@
-"""Positions, velocities, orientations, forces of constraint and outputs, at one time or along a trajectory."""
+"""Positions, velocities, orientations, constraint forces and outputs, at one time or along a trajectory."""
 
 from __future__ import annotations
 
@@ -9,36 +9,38 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._kane.equations import InputValues, _dependent_accelerations, checked_arrays, finite_or_explained
+from .._kane.api import InputValues, _dependent_accelerations, checked_arrays, finite_or_explained
 from .._kane.kanes_method import KaneEquations, motion_rates
 from .._kane.reactions import forces_now, multipliers_now
-from .._kane.rhs import outputs_at, rates
+from .._kane.right_hand_side import outputs_at, rates
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import as_vector
-from .._scalarjit.function import ScalarFunction
 from .._scalarjit.nan import nan_where
+from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Point
 from .._system.system import System
 from .trajectory import Trajectory, refuse_other_system
 
 
 def along(f: Callable[..., Any], system: System, t: Any, q: Any, u: Any, inputs: InputValues) -> Any:
-    """`f(system, t, q, u, inputs)` at one time, or at all times of a `Trajectory` in the place of `t`.
+    """`f(system, t, q, u, inputs)` at one time, or at all times of a `Trajectory` that is passed as `t`.
 
-    NaN, with its derivatives, where a trajectory has ended. There `f` never sees the NaN of the trajectory, which would
-    spoil the derivatives of all other times.
+    After the end of a trajectory the result and its derivatives are NaN. `f` is evaluated at the first time instead: a
+    NaN in its arguments would reach the derivatives at all other times.
 
-    **Raises:** `ValueError` for the trajectory of another system, and at one time where equations without a solution
-    make the result NaN; `TypeError` for a trajectory beside `q`, `u` or `inputs`.
+    **Raises:** `ValueError` for a trajectory of another system, and at one time if equations without a solution make
+    the result NaN. `TypeError` for a trajectory together with `q`, `u` or `inputs`.
     """
     if not isinstance(t, Trajectory):
         arrays = checked_arrays(system, t, q, u, inputs)
         return finite_or_explained(f(*arrays), arrays)
     if not (q is None and u is None and inputs is None):
-        raise TypeError("A Trajectory holds coordinates, speeds and inputs already: give the system and it alone.")
+        raise TypeError(
+            "A Trajectory already contains coordinates, speeds and inputs. Pass only the system and the trajectory."
+        )
     refuse_other_system(type(system).__name__, system, t)
     if t.t.shape[-1] == 0:
-        raise ValueError(f"{type(system).__name__}: a trajectory of no times.")
+        raise ValueError(f"{type(system).__name__}: the trajectory contains no times.")
     return _over_times(system, f, t)
 
 
@@ -60,15 +62,20 @@ def _over_times(system: System, f: Callable[..., Any], t: Trajectory) -> Any:
 def positions(
     system: System, t: Any, q: Any = None, u: Any = None, inputs: InputValues = None
 ) -> dict[str, Float[Array, "*n_t 3"]]:
-    """Where the bodies' mass centres and the named points are [m]: `positions(system, ride)["A"]`, components in N.
+    """Positions of the bodies' mass centres and the named points [m]: `positions(system, trajectory)["A"]`, components
+    in N.
 
-    The names are those of `Body(..., name=...)` and of `Motion(points=...)`; a point without a position is left out.
+    The names are those of `Body(..., name=...)` and of `Motion(points=...)`. Points without a position are omitted.
 
-    **Arguments:** a `Trajectory`, of which all times are taken, also of a batch; or `t` [s], `q` (n_q,) and `u` (n_u,),
-    as for `accelerations`.
+    **Arguments:**
 
-    **Returns:** by name (3,), or (*batch, n_t, 3) along a trajectory, NaN after its end; differentiable in the system
-    and in the trajectory.
+    - `system`: the system.
+    - `t`: time [s]; or a `Trajectory`, also of a batch, for all of its times.
+    - `q` (n_q,), `u` (n_u,): coordinates and speeds, as for `accelerations`.
+    - `inputs`: numbers by name.
+
+    **Returns:** by name (3,), or (*batch, n_t, 3) along a trajectory, NaN after its end. Differentiable with respect to
+    the system and the trajectory.
     """
     return along(_positions, system, t, q, u, inputs)
 
@@ -76,17 +83,18 @@ def positions(
 def velocities(
     system: System, t: Any, q: Any = None, u: Any = None, inputs: InputValues = None
 ) -> dict[str, Float[Array, "*n_t 3"]]:
-    """How fast the bodies' mass centres and the named points move [m/s], components in N. As `positions`."""
+    """Velocities of the bodies' mass centres and the named points [m/s], components in N. Arguments as `positions`."""
     return along(_velocities, system, t, q, u, inputs)
 
 
 def orientations(
     system: System, t: Any, q: Any = None, u: Any = None, inputs: InputValues = None
 ) -> dict[str, Float[Array, "*n_t 3 3"]]:
-    """Rotation matrices (3, 3) of the bodies' frames and of the named ones, which take components in N to theirs.
+    """Rotation matrices (3, 3) of the bodies' frames and of the named frames, from components in N to components in the
+    frame.
 
-    Their rows are the frame's unit vectors in N. The names are those of the bodies and of `Motion(frames=...)`; all
-    else as `positions`.
+    Their rows are the frame's unit vectors in N. The names are those of the bodies and of `Motion(frames=...)`.
+    Arguments as `positions`.
     """
     return along(_orientations, system, t, q, u, inputs)
 
@@ -94,9 +102,11 @@ def orientations(
 def speed_rates(
     system: System, t: Any, q: Any = None, u: Any = None, inputs: InputValues = None
 ) -> dict[str, Float[Array, "*n_t"]]:
-    """The time derivatives of all speeds by name, independent and dependent: `speed_rates(system, ride)["roll_rate"]`.
+    """The time derivatives of all speeds by name, independent and dependent: `speed_rates(system,
+    trajectory)["roll_rate"]`.
 
-    Those of `accelerations` and `dependent_accelerations`. Arguments as `positions`, and `inputs` as `accelerations`.
+    The values are those of `accelerations` and `dependent_accelerations`. Arguments as `positions`, and `inputs` as
+    `accelerations`.
     """
     return along(_speed_rates, system, t, q, u, inputs)
 
@@ -104,10 +114,10 @@ def speed_rates(
 def outputs(
     system: System, t: Any, q: Any = None, u: Any = None, inputs: InputValues = None
 ) -> dict[str, Float[Array, "*n_t"]]:
-    """What the sensors of a system say, by name: `System.outputs`, those of nested dicts joined by a dot.
+    """The outputs of a system's sensors by name: `System.outputs`. The names of nested dicts are joined by a dot.
 
-    A trajectory holds them already: `ride["imu.ay"]`. Arguments as `positions`; `inputs` as `accelerations`, in which
-    states of the first order are given too.
+    A trajectory already contains them: `trajectory["imu.ay"]`. Arguments as `positions`. `inputs` as `accelerations`;
+    it also contains the states of the first order.
     """
     return along(_outputs, system, t, q, u, inputs)
 
@@ -125,28 +135,34 @@ def state_rates(
 def constraint_forces(
     system: System, t: Any, q: Any = None, u: Any = None, inputs: InputValues = None
 ) -> dict[str, Float[Array, "*n_t 3"]]:
-    """The forces and moments that constraints carry, by name: `constraint_forces(system, t, q, u)["A"]`.
+    """Constraint forces and moments by name: `constraint_forces(system, t, q, u)["A"]`.
 
     The names are those of `Motion(points=..., frames=...)` and of the auxiliary speeds.
 
-    - A point from which bodies are built (a joint): the force [N] on all that is built from it, by what it is built on.
-        Forces from `loads` and forces of other constraint residuals are not in it. A body whose mass centre is the
+    - A point from which bodies are built (a joint): the force [N] on everything that is built from it, exerted by its
+        support. Forces from `loads` and from other constraint residuals are excluded. A body whose mass centre is the
         point belongs to what is built from it.
     - A point whose velocity is a residual, or from which no body is built (a contact, the end of a closed loop): the
-        force [N] of the constraints on the mechanism there.
-        It is read at the Point from which the residual was formed, and at those this was built from: a second Point
-        made at the same place is another point, at which no residual pulls: zero. Where the ends A and B of two bars
-        meet, by the residual `A.velocity - B.velocity`, A tells the force on its bar, B the opposite on its own.
-    - A frame: the moment [N m] on all that turns with it, about the points from which that is built; torques from
-        `loads` are not in it. In the directions of the frame's speeds it is zero.
+        force [N] of the constraints on the mechanism there. Use the Point from which the residual was formed, or the
+        points from which that Point was built. Another Point at the same position has no residual; its force is zero.
+        Example: the ends A and B of two bars meet by the residual `A.velocity - B.velocity`. A then gives the force on
+        its bar, B the opposite force on the other bar.
+        This force has the directions of the residuals only. A disc whose centre is built from the point G of the ground
+        below it has no residual along the normal. Its normal force acts at G: name G too, and add both forces.
+    - A frame: the moment [N m] on everything that rotates with it, about the points from which that is built. Torques
+        from `loads` are excluded. The moment is zero in the directions of the frame's speeds.
     - An auxiliary speed: the force [N] or moment [N m] along it on the mechanism, a number.
 
-    **Arguments:** as `accelerations`: `t` [s], `q` (n_q,), `u` (n_u,), `inputs` numbers by name. Or a `Trajectory` in
-    the place of `t`, for all of its times: `constraint_forces(system, trajectory)`.
+    **Arguments:**
+
+    - `system`: the system.
+    - `t`: time [s]; or a `Trajectory`, for all of its times: `constraint_forces(system, trajectory)`.
+    - `q` (n_q,), `u` (n_u,): coordinates and speeds, as for `accelerations`.
+    - `inputs`: numbers by name.
 
     **Returns:** a dict: components in N, (3,) at one time and (n_t, 3) along a trajectory.
 
-    **Raises:** `ValueError` as `accelerations`, and for the trajectory of another system; `TypeError` for a trajectory
+    **Raises:** `ValueError` as `accelerations`, and for a trajectory of another system; `TypeError` for a trajectory
     together with `q`, `u` or `inputs`.
     """
     return along(forces_now, system, t, q, u, inputs)
@@ -159,9 +175,9 @@ def constraint_multipliers(
 
         R_dep + C_dep^T lambda = 0
 
-    In the order of the residuals: those of `Motion.constraints`, then the rates of the configuration constraints, where
-    these were added. A residual that was given as a Vector counts as three, along the axes of the frame it is kept in.
-    Arguments as `constraint_forces`.
+    Their order is that of the residuals: those of `Motion.constraints`, then the rates of the configuration
+    constraints, if these were added. A residual that is a Vector counts as three, along the axes of the frame in which
+    it is stored. Arguments as `constraint_forces`.
     """
     return along(multipliers_now, system, t, q, u, inputs)
 
@@ -200,7 +216,7 @@ def _orientations(system, t, q, u, inputs):
 
 @jit
 def _state_rates(system, t, q, u, inputs):
-    zeros = dict.fromkeys(system.states, jnp.zeros((), q.dtype))  # for states that are left out
+    zeros = dict.fromkeys(system.states, jnp.zeros((), q.dtype))  # for omitted states
     x_dot = rates(system, t, q, u, zeros | inputs).x
     return {} if x_dot is None else dict(zip(system.states, x_dot, strict=True))
 

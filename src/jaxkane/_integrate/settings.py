@@ -1,4 +1,4 @@
-"""How to integrate: the options of `simulate`, checked, and the mode in which a motion will be differentiated."""
+"""The options of `simulate`, their checks, and the mode in which a simulation will be differentiated."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array
+from jax.typing import DTypeLike
 
 from .._scalarjit.compat import (
     MISSING,
@@ -34,85 +34,106 @@ ADJOINTS = {
 }
 
 
-_ADJOINT = f"`adjoint` is one of {', '.join(ADJOINTS)}, or a diffrax adjoint; got {{!r}}."
+_ADJOINT = f"`adjoint` must be one of {', '.join(ADJOINTS)}, or an adjoint of diffrax; got {{!r}}."
 
 
 class Settings(eqx.Module):
     """The options of `simulate`, with their defaults filled in.
 
-    Tolerances and the step are numbers, or arrays where they may change without another compilation.
+    Attributes:
+
+    - `rtol`, `atol`, `step`, `max_step`: numbers, or arrays if they may change without recompilation.
+    - `max_steps`: None for an unlimited number.
+    - `rising`: whether the times were already checked to increase.
+    - `check_bodies`: whether a simulation of bodies with an impossible inertia is invalid.
+    - All others: see `simulate`.
     """
 
     rtol: Any
     atol: Any
     solver: diffrax.AbstractSolver
     step: Any
+    max_step: Any
+    controller: diffrax.AbstractStepSizeController | None
     adjoint: diffrax.AbstractAdjoint
-    max_steps: int | None = eqx.field(static=True)  # None: as many as it takes
+    max_steps: int | None = eqx.field(static=True)
+    max_jumps: int = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
     project: bool = eqx.field(static=True)
     stabilize: float = eqx.field(static=True)
-    rising: bool = eqx.field(static=True, default=False)  # the times are known to rise
-    check_bodies: bool = eqx.field(static=True, default=False)  # a motion of bodies that cannot be is invalid
+    rising: bool = eqx.field(static=True, default=False)
+    check_bodies: bool = eqx.field(static=True, default=False)
 
     @property
     def is_forward(self) -> bool:
-        """Whether derivatives are those in forward mode alone."""
+        """Whether only forward mode is supported."""
         return isinstance(self.adjoint, ADJOINTS["forward"])
 
 
 def settings_for(
-    ts: Array,
+    dtype: DTypeLike,
     *,
     rtol: float | None = None,
     atol: float | None = None,
     solver: diffrax.AbstractSolver | None = None,
     step: float | None = None,
+    max_step: float | None = None,
+    controller: diffrax.AbstractStepSizeController | None = None,
     project: bool = False,
     stabilize: float = 0.0,
     adjoint: str | diffrax.AbstractAdjoint = "auto",
     max_steps: int | None = 16384,
+    max_jumps: int = 64,
     progress: bool = False,
     rising: bool = False,
     check_bodies: bool = False,
 ) -> Settings:
-    """The options of `simulate`, with defaults that follow the type of the times; `rising`: whether these are known to
-    rise, as where `checked_times` saw their values; `check_bodies`: whether bodies that cannot be make a motion
-    invalid, as those of members of a batch do.
+    """The options of `simulate`. The default tolerances depend on `dtype`, the type of the state or an array of it.
 
-    **Raises:** `ValueError` or `TypeError` for options that are no such, and for those that contradict one another.
+    **Raises:** `ValueError` or `TypeError` for invalid or contradictory options.
     """
-    _check_types(solver, adjoint, project=project, progress=progress)
+    _check_types(solver, adjoint, controller, project=project, progress=progress)
     method: Any = diffrax.Tsit5() if solver is None else solver
-    if step is not None and not (rtol is None and atol is None):
+    if step is not None and not (rtol is None and atol is None and max_step is None and controller is None):
         raise ValueError(
-            "`step` fixes the steps of integration, `rtol` and `atol` let them follow the error: give one."
+            "Pass either `step` (fixed step size) or `rtol`, `atol`, `max_step`, `controller` (adaptive), not both."
         )
-    if step is None and not isinstance(method, diffrax.AbstractAdaptiveSolver):
+    if step is None and controller is None and not isinstance(method, diffrax.AbstractAdaptiveSolver):
         raise ValueError(
-            f"{type(method).__name__} estimates no error, which the steps would follow: give them, as in step=1e-3."
+            f"{type(method).__name__} has no error estimate, so the step size cannot be adapted. Pass a fixed step, "
+            "e.g. step=1e-3."
         )
-    default = 1e-8 if ts.dtype == jnp.float64 else 1e-5
+    default = 1e-8 if getattr(dtype, "dtype", dtype) == jnp.float64 else 1e-5
     if step is not None:
         method = _for_one_length(method, default)
-    if not isinstance(adjoint, str) and type(adjoint) not in ADJOINTS.values():
+    if controller is not None and not (rtol is None and atol is None):
+        raise ValueError("Pass either `controller` or `rtol` and `atol`: the controller has its own tolerances.")
+    if isinstance(controller, diffrax.ConstantStepSize | diffrax.StepTo):
+        raise ValueError(f"controller={type(controller).__name__}(...) has fixed steps. Pass `step`, e.g. step=1e-3.")
+    if isinstance(adjoint, diffrax.ImplicitAdjoint):
         raise ValueError(
-            f"adjoint={type(adjoint).__name__}() does not differentiate the steps, with their events and inputs. "
-            'Use "reverse", or "forward" for few parameters.'
+            "adjoint=ImplicitAdjoint() differentiates a steady state, not a simulation. Use adjoint='reverse', or "
+            "'forward' for few parameters."
         )
-    for label, number in (("rtol", rtol), ("atol", atol), ("step", step)):
+    for label, number in (("rtol", rtol), ("atol", atol), ("step", step), ("max_step", max_step)):
         if number is not None and not isinstance(number, Tracer):
             _check_number(label, number, lambda x: x > 0, "positive and finite")
-    _check_number("stabilize", stabilize, lambda x: x >= 0, "a rate [1/s], not negative and finite")
+    _check_number("stabilize", stabilize, lambda x: x >= 0, "a finite, nonnegative rate [1/s]")
     if max_steps is not None:
-        _check_number("max_steps", max_steps, lambda x: x >= 1 and x == int(x), "a whole number of 1 at least")
+        _check_number("max_steps", max_steps, lambda x: x >= 1 and x == int(x), "a positive whole number")
+    _check_number("max_jumps", max_jumps, lambda x: x >= 1 and x == int(x), "a positive whole number")
+    tolerances = {"rtol": rtol, "atol": atol}
+    given = {name: getattr(controller, name, default) if x is None else x for name, x in tolerances.items()}
     return Settings(
-        rtol=default if rtol is None else float(rtol),
-        atol=default if atol is None else float(atol),
+        rtol=float(given["rtol"]),
+        atol=float(given["atol"]),
         solver=method,
         step=step,
-        adjoint=ADJOINTS[adjoint]() if isinstance(adjoint, str) else adjoint,
-        max_steps=max_steps,
+        max_step=max_step,
+        controller=controller,
+        adjoint=ADJOINTS[adjoint]() if isinstance(adjoint, str) else _whole_adjoint(adjoint, **given),
+        max_steps=None if max_steps is None else int(max_steps),
+        max_jumps=int(max_jumps),
         progress=progress,
         project=project,
         stabilize=float(stabilize),
@@ -121,64 +142,84 @@ def settings_for(
     )
 
 
+def _whole_adjoint(adjoint: Any, rtol: Any, atol: Any) -> Any:
+    """The adjoint. `BacksolveAdjoint` without options gets a solver and a controller for its backward pass."""
+    if not isinstance(adjoint, diffrax.BacksolveAdjoint) or adjoint.kwargs:
+        return adjoint
+    control = diffrax.PIDController(rtol=rtol, atol=atol)
+    return diffrax.BacksolveAdjoint(solver=diffrax.Tsit5(), stepsize_controller=control)
+
+
 def _for_one_length(solver: Any, tolerance: float) -> Any:
-    """An implicit solver for steps of one length. As diffrax makes it, it leaves what converges slowly to a shorter
-    step: here Newton's method solves its equations."""
+    """An implicit solver for fixed steps, whose equations are solved by Newton's method. The default method of diffrax
+    stops if it converges slowly, and relies on a shorter step."""
     newton = {"root_finder": optx.Newton(rtol=tolerance, atol=tolerance), "root_find_max_steps": 50}
-    changes = lambda method: {name: x for name, x in newton.items() if hasattr(method, name)}  # noqa: E731
-    return _changed(solver, lambda method: changes(method) if _takes_tolerances(method) else {})
+
+    def changes(method: Any) -> dict[str, Any]:
+        return {name: x for name, x in newton.items() if hasattr(method, name)} if _takes_tolerances(method) else {}
+
+    return _changed(solver, changes)
 
 
 def with_tolerances(solver: Any, rtol: Any, atol: Any) -> Any:
-    """An implicit solver whose equations are solved with the tolerances of the steps; any other as it is."""
+    """An implicit solver whose equations are solved with the tolerances of the steps. Other solvers do not change."""
     of_steps = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
-    changes = lambda method: {"root_finder": dataclasses.replace(method.root_finder, **of_steps)}  # noqa: E731
-    return _changed(solver, lambda method: changes(method) if _takes_tolerances(method) else {})
+
+    def changes(method: Any) -> dict[str, Any]:
+        if not _takes_tolerances(method):
+            return {}
+        return {"root_finder": dataclasses.replace(method.root_finder, **of_steps)}
+
+    return _changed(solver, changes)
 
 
 def with_scan_kind(solver: Any, kind: str) -> Any:
-    """A solver whose loop over its stages has derivatives in forward mode; as it is where it has no such loop."""
+    """A solver whose loop over its stages has derivatives in forward mode. A solver without such a loop does not
+    change."""
     return _changed(solver, lambda method: {"scan_kind": kind} if getattr(method, "scan_kind", kind) is None else {})
 
 
 def _takes_tolerances(method: Any) -> bool:
-    """Whether it takes the tolerances of its equations from those of the steps."""
+    """Whether a solver takes the tolerances of its equations from those of the steps."""
     of_steps = type(diffrax.with_stepsize_controller_tols(diffrax.VeryChord)().rtol)
     return isinstance(getattr(getattr(method, "root_finder", None), "rtol", None), of_steps)
 
 
 def _changed(solver: Any, changes: Callable[[Any], dict[str, Any]]) -> Any:
-    """The solver whose method, the one that takes the half steps of a `HalfSolver` too, has other fields."""
-    if isinstance(solver, diffrax.HalfSolver):
+    """The solver with other fields. For a wrapped solver, such as in `HalfSolver`, the fields of the inner one
+    change."""
+    if isinstance(getattr(solver, "solver", None), diffrax.AbstractSolver):
         return dataclasses.replace(solver, solver=_changed(solver.solver, changes))
     fields = changes(solver)
     return dataclasses.replace(solver, **fields) if fields else solver
 
 
-def _check_types(solver: Any, adjoint: Any, **flags: Any) -> None:
+def _check_types(solver: Any, adjoint: Any, controller: Any, **flags: Any) -> None:
     if isinstance(adjoint, str):
         if adjoint not in ADJOINTS:
             raise ValueError(_ADJOINT.format(adjoint))
         adjoint = None
     elif adjoint is None:
         raise TypeError(_ADJOINT.format(adjoint))
-    for label, value, kind in (
-        ("solver", solver, diffrax.AbstractSolver),
-        ("adjoint", adjoint, diffrax.AbstractAdjoint),
+    for label, value, kind, example in (
+        ("solver", solver, diffrax.AbstractSolver, "diffrax.Tsit5()"),
+        ("adjoint", adjoint, diffrax.AbstractAdjoint, ""),
+        ("controller", controller, diffrax.AbstractStepSizeController, "diffrax.PIDController(rtol=1e-6, atol=1e-6)"),
     ):
         if isinstance(value, type) and issubclass(value, kind):
-            raise TypeError(f"`{label}` is an instance, not a class: {label}=diffrax.{value.__name__}().")
+            raise TypeError(f"`{label}` must be an instance, not a class: {label}=diffrax.{value.__name__}().")
         if value is not None and not isinstance(value, kind):
-            is_solver = f"`solver` is one of diffrax, as diffrax.Tsit5() is; got {value!r}."
-            raise TypeError(is_solver if label == "solver" else _ADJOINT.format(value))
-    if solver is not None and solver.term_structure is not diffrax.AbstractTerm:
+            expected = f"`{label}` must be a {label} of diffrax, e.g. {example}; got {value!r}."
+            raise TypeError(expected if example else _ADJOINT.format(value))
+    terms = diffrax.AbstractTerm if solver is None else solver.term_structure
+    if terms is not diffrax.AbstractTerm and not isinstance(solver, diffrax.AbstractImplicitSolver):
         raise TypeError(
-            f"{type(solver).__name__} takes equations in several parts, such as stiff and other ones. These are in one "
-            "part. A solver for stiff equations is diffrax.Kvaerno5()."
+            f"{type(solver).__name__} needs several terms, but Kane's equations are one term. Use a solver of one "
+            "term, e.g. diffrax.Tsit5(), or diffrax.Kvaerno5() for stiff equations."
         )
     for label, value in flags.items():
         if not isinstance(value, (bool, np.bool_)):
-            raise TypeError(f"`{label}` is True or False, got {value!r}.")
+            raise TypeError(f"`{label}` must be True or False, got {value!r}.")
 
 
 def _check_number(label: str, value: Any, is_allowed: Callable[[float], bool], allowed: str) -> None:
@@ -190,84 +231,117 @@ def _check_number(label: str, value: Any, is_allowed: Callable[[float], bool], a
         raise ValueError(f"`{label}` must be {allowed}; got {value!r}.")
 
 
-def with_array_tolerances(settings: Settings, dtype: Any) -> Settings:
-    """The same, whose tolerances and step are arguments of a program, and no part of it."""
+def with_array_tolerances(settings: Settings, dtype: DTypeLike) -> Settings:
+    """The same with arrays as tolerances and step, so that other values do not cause a recompilation."""
 
     def array(x: Any) -> Any:
-        # A number goes by way of NumPy, which compiles nothing for it.
+        # Convert a number by NumPy, which compiles nothing.
         return x.astype(dtype) if isinstance(x, jax.Array) else jax.device_put(np.asarray(x, dtype))
 
-    values = {name: getattr(settings, name) for name in ("rtol", "atol", "step")}
+    values = {name: getattr(settings, name) for name in ("rtol", "atol", "step", "max_step")}
     return dataclasses.replace(settings, **{name: x if x is None else array(x) for name, x in values.items()})
 
 
 def resolve_adjoint(settings: Settings, adjoint: Any, arguments: Any) -> tuple[Settings, Any]:
-    """The settings for a derivative in forward mode that is under way, where `adjoint` is "auto"; and the arguments of
-    a motion, guarded where that is for reverse mode."""
+    """The settings, and the arguments of a simulation, guarded against forward mode if they are for reverse mode.
+
+    With `adjoint="auto"`, forward mode is chosen inside of `jax.jvp` or `jax.jacfwd`.
+    """
     if adjoint == "auto" and any(map(is_moved_forward, jax.tree.leaves(arguments))):
         settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
     if isinstance(settings.adjoint, ADJOINTS["reverse"]) and not nothing_is_traced():
-        arguments = _for_reverse_mode(arguments)
+        if any(map(is_moved_forward_below, jax.tree.leaves(arguments))):
+            _refuse_forward()
+        arguments = _guarded(_for_reverse, arguments)
     return settings, arguments
 
 
+def guard_result(settings: Settings, trajectory: Any) -> Any:
+    """A trajectory, guarded against reverse mode if it is for forward mode.
+
+    The result is guarded, not the arguments: reverse mode starts at the result, and the loop would raise first.
+    """
+    return _guarded(_for_forward, trajectory) if settings.is_forward and not nothing_is_traced() else trajectory
+
+
+def _guarded(guard: Callable[[Any], Any], values: Any) -> Any:
+    return values if MISSING else jax.tree.map(lambda x: guard(x) if eqx.is_inexact_array(x) else x, values)
+
+
 def without_derivatives(settings: Settings) -> Settings:
-    """The settings for a motion that nobody can differentiate, which is compiled without what its derivative in reverse
-    mode would need: the same numbers."""
+    """The settings outside of all transformations, without derivatives: a smaller program, the same numbers."""
     if nothing_is_traced() and isinstance(settings.adjoint, ADJOINTS["reverse"]):
         return dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
     return settings
 
 
-def _for_reverse_mode(values: Any) -> Any:
-    """`values`, whose derivative in forward mode is an error that says what to do; in reverse mode it is untouched.
-
-    A program that was traced before, as by `jax.jit`, meets forward mode when JAX comes to compile its derivative.
-    """
-    if any(map(is_moved_forward_below, jax.tree.leaves(values))):
-        _refuse()
-    if MISSING:
-        return values
-    return jax.tree.map(lambda x: _guarded(x) if eqx.is_inexact_array(x) else x, values)
-
-
-@jax.custom_jvp
-def _guarded(x: Any) -> Any:
-    return x
-
-
-@_guarded.defjvp
-def _(primals: Any, tangents: Any) -> Any:
-    return primals[0], _reverse_only.bind(tangents[0], primals[0])[0]
-
-
-def _refuse(*_: Any) -> Any:
+def _refuse_forward(*_: Any) -> Any:
     raise TypeError(
-        "A derivative in forward mode (jax.jvp, jax.jacfwd, jax.linearize, jax.hessian) of a motion that was simulated "
-        'for reverse mode. Say simulate(..., adjoint="forward"): where a function was compiled or linearized before, '
-        'as in jax.jacfwd(jax.jit(f)), "auto" cannot see what is to come. A second derivative is jacfwd(jacfwd(f)).'
+        "A simulation for reverse mode is differentiated in forward mode (jax.jvp, jax.jacfwd, jax.linearize, "
+        'jax.hessian). Pass simulate(..., adjoint="forward"). If the function was compiled or linearized before, as '
+        'in jax.jacfwd(jax.jit(f)), "auto" cannot detect the mode. For a second derivative use jacfwd(jacfwd(f)).'
     )
 
 
-def _jvp(primals: Any, tangents: Any) -> Any:
-    (x_dot, x), (x_ddot, _) = primals, tangents
-    return _reverse_only.bind(x_dot, x), [x_ddot] if is_no_tangent(x_ddot) else _reverse_only.bind(x_ddot, x)
+def _refuse_reverse(*_: Any) -> Any:
+    raise TypeError(
+        "A simulation for forward mode, or a derivative of a simulation, is differentiated in reverse mode (jax.grad, "
+        'jax.jacrev, jax.vjp). For a first derivative use jax.grad(f) with adjoint="reverse" or "auto". For a second '
+        'derivative use jacfwd(jacfwd(f)) with adjoint="forward" or "auto".'
+    )
 
 
-def _batch(values: Any, dims: Any) -> Any:
+def _guard(name: str, evaluate: Any, transpose: Any, batch: Any) -> Any:
+    """The identity. Its tangents pass through an operation of JAX with these rules, which raise in the wrong mode.
+
+    An operation is necessary because a program may be traced before, e.g. by `jax.jit`. The mode is then known only
+    when JAX differentiates the traced program.
+    """
+
+    def jvp(primals: Any, tangents: Any) -> Any:
+        (x_dot, x), (x_ddot, _) = primals, tangents
+        return on_tangents.bind(x_dot, x), [x_ddot] if is_no_tangent(x_ddot) else on_tangents.bind(x_ddot, x)
+
+    # Linear in the first argument (the tangent). The second argument is the point.
+    on_tangents: Any = None if MISSING else new_primitive(
+        name,
+        evaluate=evaluate,
+        shapes=lambda x_dot, x: [x_dot],
+        jvp=jvp,
+        transpose=transpose,
+        batch=lambda values, dims: (on_tangents.bind(*batch(values, dims)), [dims[0]]),
+        traced=evaluate,
+        lower_on_cpu=as_lowering(evaluate),
+    )  # fmt: skip
+
+    @jax.custom_jvp
+    def guarded(x: Any) -> Any:
+        return x
+
+    @guarded.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        return primals[0], on_tangents.bind(tangents[0], primals[0])[0]
+
+    return guarded
+
+
+def _refuse_many_directions(values: Any, dims: Any) -> Any:
     if dims[0] is not None and dims[1] is None:  # many directions at one point: jax.jacfwd
-        _refuse()
-    return _reverse_only.bind(*values), [dims[0]]
+        _refuse_forward()
+    return values
 
 
-# Linear in the first of its arguments, the tangent; the second is the point.
-_reverse_only: Any = None if MISSING else new_primitive(
+@jax.custom_jvp
+def _cotangent(ct: Any) -> Any:
+    return ct
+
+
+_cotangent.defjvp(lambda primals, tangents: _refuse_reverse())
+
+_for_reverse = _guard(
     "reverse_mode_only",
-    evaluate=_refuse,
-    shapes=lambda x_dot, x: [x_dot],
-    jvp=_jvp,
-    transpose=lambda cotangents, x_dot, x: [cotangents[0], None],
-    batch=_batch,
-    traced=_refuse,
-    lower_on_cpu=as_lowering(_refuse),
-)  # fmt: skip
+    _refuse_forward,
+    lambda cotangents, x_dot, x: [ct if is_no_tangent(ct) else _cotangent(ct) for ct in cotangents] + [None],
+    _refuse_many_directions,
+)
+_for_forward = _guard("forward_mode_only", lambda x_dot, x: [x_dot], _refuse_reverse, lambda values, dims: values)

@@ -1,27 +1,32 @@
-"""`simulate`: its arguments, checked, and the motion that `solve` makes of them."""
+"""`simulate`: it checks its arguments and passes them to `solve`."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any, Literal
 
 import diffrax
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from .._kane.arguments import by_names, check_is_system, is_concrete, refuse_incomplete
 from .._kane.checks import check_system
-from .._kane.constraints import check_state
-from .._kane.equations import diagnosis
-from .._kane.rhs import values_of
+from .._kane.constraint_residuals import check_state
+from .._kane.diagnosis import diagnosis
+from .._kane.right_hand_side import reads_time, values_of
 from .._scalarjit.cache_key import captured_tracers
-from .._scalarjit.compat import Tracer
+from .._scalarjit.compat import Tracer, on_device
 from .._scalarjit.components import Inputs
 from .._system.system import State, System
-from .inputs import as_signals, inputs_at, real_array, share_times
+from .events import events_of
+from .inputs import as_signals, inputs_at, is_coarse, is_samples, share_times, since, time_array, times_since
 from .integrate import refuse_captured, solve
-from .settings import resolve_adjoint, settings_for, with_array_tolerances, without_derivatives
+from .settings import guard_result, resolve_adjoint, settings_for, with_array_tolerances, without_derivatives
 from .status import Status
 from .trajectory import Trajectory
 
@@ -36,90 +41,182 @@ def simulate(
     atol: float | None = None,
     solver: diffrax.AbstractSolver | None = None,
     step: float | None = None,
+    max_step: float | None = None,
+    controller: diffrax.AbstractStepSizeController | None = None,
+    discontinuities: Any = None,
     project: bool = False,
     stabilize: float = 0.0,
     adjoint: Literal["auto", "reverse", "forward", "both"] | diffrax.AbstractAdjoint = "auto",
     max_steps: int = 16384,
+    max_jumps: int = 64,
     progress: bool = False,
 ) -> Trajectory:
-    """The motion from a state, at given times.
+    """Simulate a system from an initial state.
 
         M u_dot = f,  q_dot = q_dot(t, q, u)
 
     **Arguments:**
 
-    - `system`; `state`: coordinates and independent speeds at `ts[0]`, as `assemble` gives them.
-    - `ts` (n_t,): increasing times [s] at which the motion is kept; it starts at `ts[0]`.
-    - `inputs`: by name a number, samples (n_t,) at `ts`, or a function (t, state) -> number in which `state["roll"]`
-        is any coordinate or speed; or one function (t, state) -> dict, a controller. Those left out are zero.
+    - `system`: a `System`.
+    - `state`: coordinates and independent speeds at `ts[0]`, as `assemble` returns them.
+    - `ts` (n_t,): increasing times [s] at which the state is saved. The simulation starts at `ts[0]`.
+    - `inputs`: a dict with a number, samples (n_t,) at `ts`, or a function (t, state) -> number for each input; or one
+        function (t, state) -> dict, a controller. `state["roll"]` is any coordinate or speed. Omitted inputs are zero.
     - `rtol`, `atol`: error tolerances of a step; by default 1e-8 in float64 and 1e-5 in float32.
-    - `solver`: any diffrax solver, by default `Tsit5`. `step`: a fixed step [s] instead of error control.
-    - `project`: move the coordinates that are kept to the nearest that meet the configuration constraints. The
-        integration itself does not see it; dependent speeds are those of the projected coordinates.
-    - `stabilize`: a rate [1/s] at which the residuals h of the configuration constraints are led back to zero while
-        integrating, h_dot = -stabilize * h; some 10 for seconds of motion. 0.0 lets them drift, by the solver's error.
-    - `adjoint`: how the motion will be differentiated. "reverse": `jax.grad`, `jax.vjp`; "forward": `jax.jvp`,
-        `jax.jacfwd`, and nested for Hessians, cheaper for fewer than about fifty parameters; "both" is slower; or a
-        diffrax adjoint. "auto" (default) is reverse, or forward where a `jax.jvp` or `jax.jacfwd` is under way. The
-        trajectory says which it was.
-    - `max_steps`: of the solver. `progress`: show a progress bar.
+    - `solver`: a solver of diffrax, by default `Tsit5`.
+    - `step`: a fixed step size [s], instead of error control. It is reduced so that the duration is a multiple of it.
+    - `max_step`: the longest step with error control [s]. Pass it if an event function may be constant at first and
+        then change its sign twice within one step. Such an event could be missed.
+    - `controller`: a step size controller of diffrax, such as `diffrax.PIDController(pcoeff=0.3, icoeff=0.4, ...)`,
+        instead of `rtol` and `atol`. Steps still end at discontinuities and events.
+    - `discontinuities` (n,): times [s] at which inputs or loads are discontinuous. Steps end there. The times of
+        `Samples` are included automatically. Fixed steps end there only if these times are multiples of the step.
+    - `project`: project the saved coordinates onto the configuration constraints. The integration itself does not
+        change. The dependent speeds are computed at the projected coordinates.
+    - `stabilize`: Baumgarte stabilization: the rate [1/s] at which the residuals h of the configuration constraints
+        decay, h_dot = -stabilize * h. About 10 suits some seconds. With 0.0 the residuals drift by the solver's error.
+    - `adjoint`: how the simulation will be differentiated, or an adjoint of diffrax. "reverse": `jax.grad`, `jax.vjp`.
+        "forward": `jax.jvp`, `jax.jacfwd`, nested for Hessians; cheaper for fewer than about fifty parameters. "both"
+        supports either and is slower. "auto" (default): forward inside `jax.jvp` or `jax.jacfwd`, otherwise reverse.
+        `Trajectory.adjoint` contains the choice.
+    - `max_steps`: the largest number of steps.
+    - `max_jumps`: the largest number of jumps: events with `then`, see `falling`.
+    - `progress`: show a progress bar.
 
-    **Returns:** a `Trajectory`. A motion that cannot go on ends early, with its reason in `status`.
+    **Returns:** a `Trajectory`. If the simulation cannot continue, it ends early, and `status` states the reason.
 
-    **Raises:** `ValueError` for wrong shapes or times, an unknown input, coordinates that violate a constraint, a
-    description that contradicts itself, or equations without a finite solution at the first state. `TypeError` for a
-    derivative in forward mode through a motion for reverse mode, as in `jax.jacfwd(jax.jit(f))` with "auto".
+    **Raises:**
+
+    - `ValueError`: wrong shapes or times; values that are not finite; an unknown input; coordinates that violate a
+        constraint; an inconsistent system; equations without a finite solution at the initial state; times
+        that the type of the state cannot resolve.
+    - `TypeError`: a derivative in forward mode of a simulation for reverse mode, as in `jax.jacfwd(jax.jit(f))` with
+        "auto".
     """
     refuse_captured(system)
     state = checked_state(system, state)
-    ts = checked_times(ts, state.q.dtype)
+    refuse_not_finite(system, state)
+    dtype = state.q.dtype
+    ts = checked_times(ts, dtype)
     signals = as_signals(inputs, system.inputs, ts, type(system).__name__)
-    t = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
-    check_state(system, t, state.q)
-    check_system(system, t, state.q)
+    refuse_coarse_times(system, ts, dtype, signals)
+    origin, taus = clock_of(ts, dtype)
+    check_state(system, origin, state.q)
+    check_system(system, origin, state.q)
     settings = settings_for(
-        ts,
+        dtype,
         rtol=rtol,
         atol=atol,
         solver=solver,
         step=step,
+        max_step=max_step,
+        controller=controller,
         project=project,
         stabilize=stabilize,
         adjoint=adjoint,
         max_steps=max_steps,
+        max_jumps=max_jumps,
         progress=progress,
         rising=not isinstance(ts, Tracer),
         check_bodies=not is_concrete(system),
     )
-    arguments = (system, state, ts, share_times(signals)), captured_tracers(signals)
+    given = checked_discontinuities(discontinuities, first_of(ts), dtype)
+    arguments = (system, state, origin, taus, share_times(since(first_of(ts), signals, dtype)), given)
+    arguments = arguments, captured_tracers(signals)
     settings, (arguments, closures) = resolve_adjoint(settings, adjoint, arguments)
     name_of_adjoint = type(settings.adjoint).__name__
-    settings = with_array_tolerances(without_derivatives(settings), ts.dtype)
-    trajectory = solve(*arguments, settings, closures=closures)
-    trajectory = dataclasses.replace(trajectory, adjoint=name_of_adjoint)
+    settings = with_array_tolerances(without_derivatives(settings), dtype)
+    *arguments, given = arguments
+    trajectory = guard_result(settings, solve(*arguments, settings, given, closures=closures))
+    trajectory = dataclasses.replace(trajectory, adjoint=name_of_adjoint, **on_clock(ts, trajectory))
     if is_concrete(trajectory.status) and int(trajectory.status) == Status.NO_SOLUTION:
-        values = values_of(system, state.x, inputs_at(system, signals, ts[0], state))
+        values = values_of(system, state.x, inputs_at(system, signals, origin, state))
         raise ValueError(
-            diagnosis(system, ts[0], state.q, state.u, values)
+            diagnosis(system, origin, state.q, state.u, values)
             or f"{type(system).__name__}: the solver cannot take a first step: accelerations, rates or events are not "
-            "finite beside the first state, or an implicit step has no solution."
+            "finite near the initial state, or an implicit step has no solution. Start elsewhere, or check the loads "
+            "and events there."
         )
     return trajectory
 
 
-def checked_times(ts: Any, dtype: Any) -> Array:
-    """Times as an array of a state's type. **Raises:** `ValueError` unless finite, increasing, and two at least."""
-    ts = real_array(ts, "`ts`", dtype)
+def checked_times(ts: Any, dtype: DTypeLike) -> Any:
+    """Times as an array of a type; in float64 of NumPy if this type would blur them.
+
+    **Raises:** `ValueError` unless there are at least two times, finite and increasing.
+    """
+    ts = time_array(ts, "`ts`", dtype)
     if ts.ndim != 1 or ts.shape[0] < 2:
-        raise ValueError(f"`ts` must be at least two times in an array of shape (n_t,), got the shape {ts.shape}.")
+        raise ValueError(f"`ts` must be an array (n_t,) of at least two times; got the shape {ts.shape}.")
     if not isinstance(ts, Tracer):
         steps: Any = np.diff(np.asarray(ts))
         if not np.all(np.isfinite(steps)):
-            raise ValueError("`ts` holds times that are not finite.")
+            raise ValueError("`ts` contains times that are not finite. Remove or correct them.")
         if not np.all(steps > 0):
             i = int(np.argmax(steps <= 0))
             raise ValueError(f"`ts` must increase: ts[{i}] = {float(ts[i]):.6g} is followed by {float(ts[i + 1]):.6g}.")
     return ts
+
+
+def clock_of(ts: Any, dtype: DTypeLike) -> tuple[Array, Array]:
+    """The start of a simulation [s], and times (n_t,) since then.
+
+    The start is zero for times that the type of the state cannot resolve: code that reads the time is refused there.
+    """
+    if isinstance(ts, Tracer):
+        return ts[0], times_since(ts[0], ts, dtype)
+    start = first_of(ts)
+    return on_device(start if isinstance(ts, jax.Array) else 0.0, dtype), times_since(start, ts, dtype)
+
+
+def first_of(ts: Any) -> Any:
+    """The first of times that may be traced. NumPy compiles nothing for that."""
+    return ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
+
+
+def checked_discontinuities(times: Any, start: Any, dtype: DTypeLike) -> Array | None:
+    """Times since the start of the simulation [s]. **Raises:** `ValueError` for times that are not finite."""
+    if times is None:
+        return None
+    times = time_array(times, "`discontinuities`", dtype)
+    if times.ndim != 1:
+        raise ValueError(f"`discontinuities` must be an array (n,) of times; got the shape {times.shape}.")
+    if not isinstance(times, Tracer) and not np.all(np.isfinite(np.asarray(times))):
+        raise ValueError("`discontinuities` contains times that are not finite. Remove or correct them.")
+    return times_since(start, times, dtype)
+
+
+def refuse_coarse_times(system: System, ts: Any, dtype: DTypeLike, signals: Any) -> None:
+    """**Raises:** `ValueError` for code that uses a time which the type of the state cannot resolve.
+
+    The integration and samples are not affected, because they use the time since the start.
+    """
+    if isinstance(ts, Tracer) or not is_coarse(np.asarray(ts, np.float64), dtype):
+        return
+    readers = [name for name, f in ({} if callable(signals) else signals).items() if callable(f) and not is_samples(f)]
+    if callable(signals):
+        readers = ["the function of the inputs"]
+    else:
+        zeros = (jnp.zeros(len(names), dtype) for names in (system.coordinates, system.speeds))
+        events = events_of(system, jnp.zeros((), dtype), State(*zeros))
+        uses_time = {"": reads_time(system, dtype), ".events": events.read_time}
+        readers += [type(system).__name__ + part for part, is_used in uses_time.items() if is_used]
+    if readers:
+        raise ValueError(
+            f"`ts` starts at {float(ts[0]):.10g} s with steps down to {float(np.min(np.diff(np.asarray(ts)))):.3g} s, "
+            f"which {jnp.dtype(dtype).name} cannot resolve, and {', '.join(readers)} may depend on the time. Let `ts` "
+            "start near zero, or enable float64: jaxkane.configure()."
+        )
+
+
+def on_clock(ts: Any, trajectory: Trajectory) -> dict[str, Any]:
+    """Times of a trajectory on the clock of `ts`: in float64 of NumPy if its own type could not resolve them."""
+    if isinstance(ts, jax.Array):
+        return {"t": ts}
+    own: dict[str, Any] = {"t": ts, "t_end": ts[0] + np.asarray(trajectory.t_end, np.float64)}
+    if trajectory.jumps is not None:
+        own["jumps"] = dataclasses.replace(trajectory.jumps, t=ts[0] + np.asarray(trajectory.jumps.t, np.float64))
+    return own
 
 
 def checked_state(system: System, state: Any) -> State:
@@ -128,7 +225,7 @@ def checked_state(system: System, state: Any) -> State:
     name = type(system).__name__
     if not isinstance(state, State):
         raise TypeError(
-            f"{name}: the state must be a jaxkane.State(q, u), as assemble gives it; got {type(state).__name__}."
+            f"{name}: the state must be a jaxkane.State(q, u), as returned by assemble; got {type(state).__name__}."
         )
     state = as_state(system, state)
     parts = [("q", state.q, system.coordinates), ("u", state.u, system.speeds), ("x", state.x, system.states)]
@@ -142,15 +239,15 @@ def checked_state(system: System, state: Any) -> State:
 
 
 def as_state(system: System, state: State) -> State:
-    """A state in arrays, of one in dicts by name. What is left out is zero.
+    """A state with arrays, from a state with arrays or dicts by name. Omitted values are zero.
 
-    **Raises:** `ValueError` for an unknown name, a dependent coordinate left out, a dependent speed that is named.
+    **Raises:** `ValueError` for an unknown name, an omitted dependent coordinate, or a dependent speed.
     """
     refuse_incomplete(system, state.q, state.u)
     title = type(system).__name__
     x: Any = {} if state.x is None and system.states else state.x
     if not system.states and x is not None and np.size(x):
-        raise ValueError(f"{title} has no states of the first order, but state.x is {x!r}.")
+        raise ValueError(f"{title} has no first-order states, but state.x is {x!r}. Omit x.")
     parts: list[Any] = [("q", state.q, system.coordinates), ("u", state.u, system.speeds)]
     parts += [("x", x, system.states)] if system.states else []
     arrays: list[Any] = []
@@ -159,6 +256,29 @@ def as_state(system: System, state: State) -> State:
             values = by_names(values, names, f"{title}: state.{label}")
             values = values.astype(arrays[0].dtype) if arrays else values
         if not hasattr(values, "shape"):
-            raise TypeError(f"{title}: state.{label} is an array of numbers, or a dict by name; got {values!r}.")
+            raise TypeError(f"{title}: state.{label} must be an array of numbers, or a dict by name; got {values!r}.")
         arrays.append(values)
-    return State(*arrays)
+    return State(*_of_one_type(arrays))
+
+
+def _of_one_type(arrays: list[Any]) -> list[Any]:
+    """Float arrays in the widest of their dtypes, because a loop cannot carry float32 coordinates and float64
+    speeds."""
+    types = {x.dtype for x in arrays if hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jnp.floating)}
+    if len(types) < 2:
+        return arrays
+    widest = functools.reduce(np.promote_types, types)
+    return [x.astype(widest) for x in arrays]
+
+
+def refuse_not_finite(system: System, state: State) -> None:
+    """**Raises:** `ValueError` for a state that is not finite, by name. In a batch, the member's status reports this
+    instead."""
+    groups = (("q", state.q, system.coordinates), ("u", state.u, system.speeds), ("x", state.x, system.states))
+    for label, values, names in groups:
+        if values is not None and is_concrete(values) and not np.all(np.isfinite(np.asarray(values))):
+            i = int(np.argmin(np.isfinite(np.asarray(values))))
+            raise ValueError(
+                f"{type(system).__name__}: state.{label}: {names[i]} = {float(values[i])} is not finite. Pass finite "
+                "initial values."
+            )

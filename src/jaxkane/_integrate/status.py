@@ -1,4 +1,4 @@
-"""How a motion ended: the status codes, their words and their advice."""
+"""How a simulation ended: the status codes, their words and advice."""
 
 from __future__ import annotations
 
@@ -6,24 +6,30 @@ import enum
 
 
 class Status(enum.IntEnum):
-    """How a simulation ended. Codes from `EVENT` on are events of the system, in the order of the alphabet."""
+    """How a simulation ended. Codes from `EVENT` on are the system's events in alphabetical order."""
 
     COMPLETED = 0
-    """Reached the last time."""
+    """The last time was reached."""
     SINGULAR_SPEEDS = 1
-    """The dependent speeds are no longer determined by the independent ones: det C_dep passed zero."""
+    """The independent speeds no longer determine the dependent ones: det C_dep crossed zero."""
     STEP_TOO_SMALL = 2
-    """The solver could not go on: the step fell below its minimum, as it does when something becomes infinite."""
+    """The step size fell below its minimum, e.g. because a value grows without bound."""
     MAX_STEPS = 3
     """The solver took `max_steps` steps before the last time."""
     INVALID = 4
-    """A parameter or an initial value was not finite, a positive parameter was not positive, a body had a mass or an
-    inertia that no body has, or the coordinates violated a configuration constraint: nothing was solved."""
+    """A parameter or an initial value was not finite, a positive parameter was not positive, a body had an impossible
+    mass or inertia, or the coordinates violated a configuration constraint. Nothing was solved."""
     INTERRUPTED = 5
-    """A sweep was stopped before it came to this member."""
+    """A sweep was interrupted before this member was computed."""
     NO_SOLUTION = 6
-    """The equations have no finite solution at the first state: a speed that no mass moves with, angles that lock,
-    constraints that cannot be solved for the dependent speeds. One simulation alone raises an error that says which."""
+    """The equations have no finite solution at the initial state: a speed does not move any mass, angles are in gimbal
+    lock, or the constraints have no solution for the dependent speeds. `simulate` raises an exception instead."""
+    MAX_JUMPS = 7
+    """More than `max_jumps` jumps occurred before the last time."""
+    REPEATED_JUMP = 8
+    """A jump left its own event on zero and crossing again, so it would be repeated without end."""
+    IMPOSSIBLE_JUMP = 9
+    """The state after a jump is not finite, or it violates a configuration constraint."""
     EVENT = 10
 
 
@@ -36,13 +42,16 @@ def reason(code: int, events: tuple[str, ...]) -> str:
 REASONS = frozenset(reason(code, ()) for code in Status if code < Status.EVENT)
 _ADVICE: dict[int, str] = {
     Status.SINGULAR_SPEEDS: "Choose other dependent speeds: see jaxkane.best_dependent_speeds(system, t, q).",
-    Status.STEP_TOO_SMALL: "Something becomes infinite or jumps: look at the last times that were reached.",
-    Status.MAX_STEPS: "Raise max_steps (a sample of an input takes a step); or look for what is stiff or jumps.",
+    Status.STEP_TOO_SMALL: "A value grows without bound or is discontinuous. Plot the last samples before `t_end`.",
+    Status.MAX_JUMPS: "Increase max_jumps. If jumps accumulate at one time, end the simulation there by another event.",
+    Status.IMPOSSIBLE_JUMP: "Check `then` of the event at `t_end`. New coordinates must satisfy the constraints.",
+    Status.REPEATED_JUMP: "Let `then` move the event function away from zero, or change the direction of its rate.",
+    Status.MAX_STEPS: "Increase max_steps (an input sample needs a step), or check for stiff or discontinuous loads.",
 }
 
 
 def advice(code: int, events: tuple[str, ...]) -> str:
-    """What helps against an early end; empty where nothing is to be done."""
+    """Advice for a simulation that ended early; empty if there is none."""
     if reason(code, events).startswith("gimbal lock"):
-        return "Angles lock there: describe the orientation with Euler parameters, or with another sequence of angles."
+        return "The angles are in gimbal lock. Use Euler parameters or another sequence of angles for the orientation."
     return _ADVICE.get(code, "")

@@ -1,4 +1,4 @@
-"""What a simulation gives: motion over time by name, and how it ended. Knows names and numbers; knows no solver."""
+"""The result of a simulation: values over time by name, and how the simulation ended. Independent of the solver."""
 
 from __future__ import annotations
 
@@ -11,35 +11,47 @@ from jaxtyping import Array, Float, Int
 from .._common.lookup import by_name
 from .._kane.arguments import check_is_system
 from .._scalarjit.compat import Tracer
-from .._system.system import State, System, names_of
+from .._system.prints import wrapped
+from .._system.system import State, System, named_numbers, names_of
+from .jumps import JumpTable
 from .status import Status, advice, reason
 
 
 class InputDiscontinuities(eqx.Module):
-    """Where inputs that are samples have kinks and jumps: at `times` (n,) [s], infinite for kinks that steps pass over
-    since they are smaller than the tolerance. Where there are jumps, `inputs` (n_t,)
-    by name just before and just after each time of the trajectory."""
+    """Where the inputs of a trajectory are discontinuous.
+
+    Attributes:
+
+    - `times` (n,): since the first time of the trajectory [s]; infinite for times that steps skip, because the
+        discontinuity there is smaller than the tolerance.
+    - `inputs`: by name (n_t,), just before and just after each time of the trajectory; empty if all inputs are
+        continuous.
+    """
 
     times: Float[Array, "*batch n"]
     inputs: tuple[dict[str, Float[Array, "*batch n_t"]], ...]
 
 
 class Trajectory(eqx.Module):
-    """Motion over time, by name: `ride["roll"]`, `ride["yaw_rate"]`, `ride["steer_torque"]`, `ride["imu.ay"]`.
+    """Values over time, by name: `trajectory["roll"]`, `trajectory["yaw_rate"]`, `trajectory["steer_torque"]`.
 
-    Values after the end of a simulation that stopped early are NaN. A batch has leading axes.
+    Values after the end of a simulation that ended early are NaN. A batch has leading axes.
 
     Attributes:
 
-    - `t` (n_t,) [s]; `q` (n_t, n_q); `u` (n_t, n_u) independent speeds; `u_dep` (n_t, k) dependent speeds;
-        `x` (n_t, n_x) states of the first order.
-    - `inputs`, `outputs`: values (n_t,) of every input, and of every output of the system, by name.
-    - `status`: a `Status` code; `reason` says it in words.
-    - `t_end` [s] and `end`, the state there: where the simulation ended. They have derivatives where it ended at the
-        last time or by an event, whose time moves with what it follows from; otherwise their derivatives are NaN.
-    - `stats`: numbers of steps taken, accepted and rejected. `adjoint`: how it is differentiated.
+    - `t` (n_t,) [s]: times.
+    - `q` (n_t, n_q), `u` (n_t, n_u), `u_dep` (n_t, k): coordinates, independent speeds and dependent speeds.
+    - `x` (n_t, n_x): states of the first order.
+    - `inputs`, `outputs`: values (n_t,) of all inputs and outputs of the system, by name.
+    - `status`: a `Status` code; `reason` states it in words.
+    - `t_end` [s], `end`: the time and the state at which the simulation ended. They are differentiable if the
+        simulation ended at the last time or by an event; the time of an event depends on the parameters. Otherwise
+        their derivatives are NaN.
+    - `stats`: numbers of steps taken, accepted and rejected.
+    - `adjoint`: how the simulation is differentiated.
     - `units`: pairs of a name and its unit, as the system declares them.
-    - `discontinuities`: where inputs have kinks and jumps, and their values on both sides, for `audit`; else None.
+    - `discontinuities`: where inputs are discontinuous, and their values on both sides, for `audit`; else None.
+    - `jumps`: the jumps of the state, a `JumpTable`; None if no event of the system has `then`.
     """
 
     t: Float[Array, "*batch n_t"]
@@ -58,6 +70,7 @@ class Trajectory(eqx.Module):
     units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     end: State | None = None
     discontinuities: InputDiscontinuities | None = None
+    jumps: JumpTable | None = None
 
     def __getitem__(self, name: str) -> Float[Array, "*batch n_t"]:
         groups = zip(self.names, (self.q, self.u, self.u_dep, self.x), strict=True)
@@ -81,7 +94,7 @@ class Trajectory(eqx.Module):
         return words[0] if codes.ndim == 0 else words
 
     def state(self, i: int = -1) -> State:
-        """The state at the i-th time, to go on from."""
+        """The state at the i-th time, e.g. to continue the simulation."""
         return State(self.q[..., i, :], self.u[..., i, :], self.x[..., i, :] if self.names[3] else None)
 
     def __repr__(self) -> str:
@@ -89,14 +102,18 @@ class Trajectory(eqx.Module):
             return f"Trajectory(shape={self.t.shape})"
         steps = int(self.stats["steps"])
         text = f"Trajectory({self.t.shape[-1]} times to {float(self.t_end):.6g} s in {steps} steps: {self.reason})"
-        return f"{text}. {advice(int(self.status), self.events)}".removesuffix(". ")
+        text = f"{text}. {advice(int(self.status), self.events)}".removesuffix(". ")
+        if self.end is None:
+            return text
+        names = (self.names[0], self.names[1], self.names[3])
+        rows = (self.end.q, self.end.u, np.zeros(0) if self.end.x is None else self.end.x)
+        return f"{text}\n{wrapped(f'At {float(self.t_end):.6g} s: {named_numbers(names, rows, {}, self.units)}')}"
 
 
 def refuse_other_system(label: str, system: System, trajectory: Any) -> None:
-    """Every function of a system and a trajectory, or a steady motion, asks this first; `label` is the one that was
-    called, for the message.
+    """Check that a trajectory or a steady motion belongs to a system. `label` is the calling function, for the message.
 
-    **Raises:** `ValueError` where the names differ, by which a motion is read; `TypeError` for what is no system.
+    **Raises:** `ValueError` if the names differ, by which values are read; `TypeError` if `system` is not a `System`.
     """
     check_is_system(system)
     kinds = ("coordinates", "speeds", "dependent speeds", "states")
@@ -104,31 +121,34 @@ def refuse_other_system(label: str, system: System, trajectory: Any) -> None:
     for kind, of_trajectory, own in (*groups, ("inputs", sorted(trajectory.inputs), sorted(system.inputs))):
         if tuple(of_trajectory) != tuple(own):
             raise ValueError(
-                f"{label}: the motion has the {kind}: {', '.join(of_trajectory) or 'none'}, the system has: "
-                f"{', '.join(own) or 'none'}: it is the motion of another system."
+                f"{label}: the trajectory belongs to another system. Its {kind}: {', '.join(of_trajectory) or 'none'}; "
+                f"those of the system: {', '.join(own) or 'none'}."
             )
 
 
 def reached_times(function: str, system: System, trajectory: Any) -> np.ndarray:
-    """Which times (n_t,) a motion reached, at least two; `function` is the one that was called, for messages.
+    """Whether each time (n_t,) was reached, at least two. `function` is the calling function, for messages.
 
-    **Raises:** `TypeError` for what is no `Trajectory`; `ValueError` for a batch, for the motion of another system, for
-    one that reached fewer than two of its times, and for coordinates that are not finite at times between.
+    **Raises:** `TypeError` if it is not a `Trajectory`. `ValueError` for a batch, for a trajectory of another system,
+    for one that reached fewer than two of its times, and for coordinates that are not finite before the end.
     """
     label = f"{function}({type(system).__name__})"
     if not isinstance(trajectory, Trajectory):
-        raise TypeError(f"{label}: the second argument is a Trajectory, as from simulate, got {trajectory!r}.")
+        raise TypeError(f"{label}: the second argument must be a Trajectory, e.g. from simulate; got {trajectory!r}.")
     if trajectory.t.ndim != 1:
         raise ValueError(
-            f"{label}: takes one motion; of a batch of shape {trajectory.t.shape[:-1]} give one member: "
-            "jax.tree.map(lambda x: x[0], rides)."
+            f"{label}: the trajectory is a batch of shape {trajectory.t.shape[:-1]}. Pass one member: "
+            "jax.tree.map(lambda x: x[0], trajectories)."
         )
     refuse_other_system(label, system, trajectory)
     reached = np.all(np.isfinite(np.asarray(trajectory.q)), axis=1)
     until = len(reached) if trajectory.ok else len(reached) - int(np.argmax(reached[::-1]))
     if reached.any() and not reached[:until].all():
         when = float(trajectory.t[int(np.argmin(reached))])
-        raise ValueError(f"{label}: q is not finite at t = {when:.6g} s, and the motion goes on from there.")
+        raise ValueError(f"{label}: q is not finite at t = {when:.6g} s, but the trajectory continues after that time.")
     if reached.sum() < 2:
-        raise ValueError(f"{label}: the simulation reached only {reached.sum()} of its times: {trajectory.reason}.")
+        raise ValueError(
+            f"{label}: the simulation reached only {reached.sum()} of its times, but at least two are needed. "
+            f"Reason: {trajectory.reason}."
+        )
     return reached

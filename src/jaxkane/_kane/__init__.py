@@ -1,1 +1,1 @@
-"""Kane's equations: the method, its public functions, assembly, checks. Knows no mechanism and no integrator."""
+"""Kane's equations: the method, its public functions, assembly, checks. Independent of mechanisms and integrators."""

@@ -1,4 +1,4 @@
-"""Values as callers give them, in their order or by name, checked. Knows the names of a system; knows no mechanics."""
+"""Check values that callers pass in order or by name. Depends on the names of a system, but not on mechanics."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from .._common.lookup import not_there, refuse_unknown
 from .._scalarjit.compat import Tracer
-from .._scalarjit.components import Component, component
+from .._scalarjit.components import Component, Numbers, component
 from .._system.system import System
 
 Row = tuple[Component, ...]
 
 
-def as_row(values: Any, names: Sequence[str], label: str) -> Row:
-    """A sequence, or an array of shape (len(names),), as a row of components."""
+def as_row(values: PyTree, names: Sequence[str], label: str) -> Row:
+    """Convert a sequence, or an array of shape (len(names),), to a row of components."""
     if hasattr(values, "shape"):
         array = as_array(values, names, label)
         return tuple(array[i] for i in range(len(names)))
@@ -34,8 +34,8 @@ def as_row(values: Any, names: Sequence[str], label: str) -> Row:
     return row
 
 
-def as_array(values: Any, names: Sequence[str], label: str) -> Array:
-    """Numbers, in their order or by name, as a float array of shape (len(names),). Those not named are zero."""
+def as_array(values: PyTree, names: Sequence[str], label: str) -> Array:
+    """Convert numbers, in order or by name, to a float array of shape (len(names),). Omitted names are zero."""
     array = by_names(values, names, label) if isinstance(values, Mapping) else _numbers(values, names, label)
     if not _is_real(array):
         raise TypeError(f"{label} must be {len(names)} real numbers ({', '.join(names)}), got {values!r}.")
@@ -48,23 +48,28 @@ def as_array(values: Any, names: Sequence[str], label: str) -> Array:
 
 
 def _is_real(array: Any) -> bool:
-    if getattr(array.dtype, "kind", "") == "m" or np.ma.is_masked(array):  # a duration counts in a unit of its own
+    if getattr(array.dtype, "kind", "") == "m" or np.ma.is_masked(array):  # np.timedelta64 has its own unit
         return False
     return jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
 
 
 def is_concrete(*trees: Any) -> bool:
-    """Whether all arrays in these are numbers rather than traced."""
+    """Whether no array in these trees is traced."""
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
 
 
+def without_derivatives(tree: PyTree) -> PyTree:
+    """Replace arrays that are differentiated without `jit`, e.g. by `jax.grad`, by their values. Others stay traced."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x, tree)
+
+
 def is_one_number(value: Any) -> bool:
-    """Whether this is one real number, known or traced."""
+    """Whether the value is one real number, concrete or traced."""
     return is_numeric(value) and not isinstance(value, (list, tuple)) and np.shape(value) == ()
 
 
 def is_numeric(value: Any) -> bool:
-    """Whether this is a real number, or an array or a sequence of such, which may be traced."""
+    """Whether the value is a real number, or an array or a sequence of real numbers, concrete or traced."""
     leaves = jax.tree.leaves(value, is_leaf=lambda x: x is None)
     if not any(isinstance(x, Tracer) for x in leaves):
         leaves = [value]
@@ -75,21 +80,21 @@ def is_numeric(value: Any) -> bool:
 
 
 def check_is_system(system: Any) -> None:
-    """**Raises:** `TypeError` for what is no instance of a system."""
+    """**Raises:** `TypeError` if the argument is not an instance of `System`."""
     if not isinstance(system, System):
-        hint = f" Make one: {system.__name__}(...)." if isinstance(system, type) else ""
-        raise TypeError(f"The first argument is an instance of a System, got {system!r}.{hint}")
+        hint = f" Create one with {system.__name__}(...)." if isinstance(system, type) else ""
+        raise TypeError(f"The first argument must be an instance of a System, got {system!r}.{hint}")
 
 
-def check_time(name: str, t: Any) -> None:
-    """Refuse what is no time; `name` is that of the system."""
+def check_time(name: str, t: Component) -> None:
+    """Raise an exception if `t` is not one finite number. `name` is the name of the system."""
     if not is_one_number(t):
-        raise TypeError(f"{name}: the time `t` is one number [s], got {t!r}.")
+        raise TypeError(f"{name}: the time `t` must be one number [s], got {t!r}.")
     if not isinstance(t, Tracer) and not np.isfinite(np.asarray(t)):
         raise ValueError(f"{name}: the time t = {t} is not finite.")
 
 
-def _numbers(values: Any, names: Sequence[str], label: str) -> Array:
+def _numbers(values: PyTree, names: Sequence[str], label: str) -> Array:
     try:
         return jnp.asarray(values)
     except (TypeError, ValueError) as error:
@@ -97,9 +102,9 @@ def _numbers(values: Any, names: Sequence[str], label: str) -> Array:
 
 
 def by_names(values: Mapping[str, Any], names: Sequence[str], label: str) -> Array:
-    """Numbers by name as an array (*batch, len(names)); those not named are zero."""
+    """Convert numbers by name to an array (*batch, len(names)). Omitted names are zero."""
     refuse_unknown(values, names, f"{label} has no", "it has")
-    # What is known is put together by NumPy: operation by operation, JAX would compile a program for each.
+    # Use NumPy for concrete numbers: JAX would compile one program for each operation.
     is_traced = any(isinstance(x, Tracer) for value in values.values() for x in jax.tree.leaves(value))
     xp: Any = jnp if is_traced else np
     dtype = jnp.result_type(float)
@@ -110,10 +115,10 @@ def by_names(values: Mapping[str, Any], names: Sequence[str], label: str) -> Arr
     return jnp.asarray(xp.stack(xp.broadcast_arrays(*columns), axis=-1) if columns else np.zeros(0, dtype), dtype=dtype)
 
 
-def refuse_incomplete(system: System, q: Any, u: Any) -> None:
-    """Refuse dicts of coordinates and speeds that leave out a dependent coordinate, or name a dependent speed.
+def refuse_incomplete(system: System, q: Numbers, u: Numbers) -> None:
+    """Raise an exception if a dict omits a dependent coordinate or contains a dependent speed.
 
-    Where nothing is solved for, a dependent coordinate left out is no zero: it is not known.
+    Only `assemble` solves for omitted dependent coordinates. Elsewhere, zero would be a wrong value for them.
     """
     name = type(system).__name__
     speeds = (*system.speeds, *system.dependent_speeds)
@@ -123,24 +128,24 @@ def refuse_incomplete(system: System, q: Any, u: Any) -> None:
     missing = [c for c in system.dependent_coordinates if c not in q] if isinstance(q, Mapping) else []
     if missing:
         raise ValueError(
-            f"{name}: {', '.join(missing)} is left out of q, and follows from the other coordinates: find the state "
-            "with jaxkane.assemble(system, q, u), and give its state.q; or name the value here."
+            f"{name}: q omits {', '.join(missing)}, which the other coordinates determine. Find the state with "
+            "jaxkane.assemble(system, q, u) and pass its state.q, or pass the value in q."
         )
     dependent = [s for s in system.dependent_speeds if s in u] if isinstance(u, Mapping) else []
     if dependent:
         raise ValueError(
-            f"{name}: {', '.join(dependent)} is a dependent speed, which follows from the others: leave it out of u. "
-            "(jaxkane.assemble compares it with what the velocity residuals say.)"
+            f"{name}: u contains {', '.join(dependent)}, but dependent speeds are computed from the others. Omit it. "
+            "jaxkane.assemble accepts it and compares it with the velocity residuals."
         )
 
 
 def inputs_of(system: System) -> str:
-    """What `loads` reads by name, in words."""
+    """A phrase for the names that `loads` can read, for error messages."""
     return f"the inputs{' and states' if system.states else ''} of {type(system).__name__}"
 
 
 class Inputs(dict[str, Component]):
-    """Inputs and states by name, as `loads` reads them. One that is not there is refused with the names that are."""
+    """Inputs and states by name, as passed to `loads`. An unknown name raises an error that lists the known names."""
 
     def __init__(self, values: Mapping[str, Component], of: str):
         super().__init__(values)
@@ -151,19 +156,19 @@ class Inputs(dict[str, Component]):
 
 
 def checked_inputs(system: System, inputs: Mapping[str, Component] | None) -> dict[str, Component]:
-    """All inputs of a system by name; those left out are exactly zero."""
+    """All inputs of a system by name. Omitted inputs are exact zeros."""
     return _checked(system, inputs, system.inputs, "input")
 
 
 def checked_values(system: System, values: Mapping[str, Component] | None) -> dict[str, Component]:
-    """All inputs and states of a system by name, as `loads` reads them; those left out are exactly zero."""
+    """All inputs and states of a system by name, as passed to `loads`. Omitted ones are exact zeros."""
     return _checked(system, values, (*system.inputs, *system.states), "input or state" if system.states else "input")
 
 
-def _checked(system: System, values: Any, names: Sequence[str], kind: str) -> dict[str, Component]:
+def _checked(system: System, values: PyTree, names: Sequence[str], kind: str) -> dict[str, Component]:
     title = type(system).__name__
     if not isinstance(values, (Mapping, type(None))):
-        raise TypeError(f"{title}: the inputs are numbers by name, {{name: number}}, got {values!r}.")
+        raise TypeError(f"{title}: the inputs must be a dict {{name: number}}, got {values!r}.")
     if not values:
         return dict.fromkeys(names, 0.0)
     refuse_unknown(values, names, f"{title} has no {kind} named", "it has")

@@ -1,4 +1,4 @@
-"""Kane's dynamical equations in momentum form. Knows bodies, speeds and JAX; knows no mechanism and no integrator.
+"""Kane's dynamical equations in momentum form. Depends on bodies, speeds and JAX only.
 
 With p_i = m_i v_i, H_i = I_i . omega_i and d/dt in the inertial frame (Kamman, Unit 5, "Kane's Equations"):
 
@@ -9,30 +9,33 @@ With p_i = m_i v_i, H_i = I_i . omega_i and d/dt in the inertial frame (Kamman, 
     F*_r = -sum_i V_ir . dp_i/dt + W_ir . dH_i/dt                   inertia, at u_dot = 0
     M u_dot = f = F_r + F*_r
 
-`jax.jvp` of the description gives partial velocities, C and the time derivatives. Only the directions that
-are needed are pushed: the residuals along every speed, the bodies along the n independent columns of [1; J].
+`jax.jvp` of positions and velocities gives partial velocities, C and the time derivatives. Only the required directions
+are computed: the residuals along every speed, and the bodies along the n columns of [1; J].
 
-For a few speeds this is written out, as scalars. For many, sums over bodies for every pair of speeds would be of order
-n^2 b. Then f and the columns of M are found without partial velocities, each in order b: vectors that stand on bodies
-are projected onto all speeds at once by the transpose of the map u -> (v, omega), which `jax.vjp` gives. The native
-kernel of u_dot needs no M: unknowns are eliminated along that map (`_scalarjit.elimination`).
+There are two formulations with equal results:
+
+- By partial velocities, for few speeds. All sums are written out as scalars. For b bodies, this takes time of order
+  n^2 b.
+- By transposition, for many speeds. The transpose of the map u -> (v, omega), by `jax.vjp`, projects the vectors of all
+  bodies onto all speeds at once. f and each column of M take time of order b. The native kernel of u_dot does not form
+  M. It eliminates the unknowns along this map (`_scalarjit.elimination`).
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from .._scalarjit.cache_key import version_of
-from .._scalarjit.compat import Tracer
+from .._scalarjit.cache_key import jit
 from .._scalarjit.components import (
     Component,
+    Numbers,
     Rows,
     add,
     add3,
@@ -42,7 +45,6 @@ from .._scalarjit.components import (
     dot,
     is_exact,
     is_written_out,
-    is_zero,
     matvec,
     mul,
     scale3,
@@ -53,58 +55,15 @@ from .._scalarjit.components import (
     total,
 )
 from .._scalarjit.elimination import LinearSolution, ScalarSolve
-from .._scalarjit.function import ScalarFunction
-from .._system.kinematics import Frame
-from .._system.motion import Body, Load, Motion, flatten_loads, flatten_residuals
-from .._system.parameters import in_batches
+from .._scalarjit.scalar_function import ScalarFunction
+from .._system.motion import Load, Motion
 from .._system.system import System
-from .arguments import Inputs, Row, as_row, checked_values, inputs_of
-
-
-def jvp(f: Callable[..., Any], primals: Sequence[Component], tangents: Sequence[Component]) -> tuple[Any, Any]:
-    """`jax.jvp` of a function of components: exact inputs and outputs stay exact, and have exact zero derivatives."""
-    moving = [i for i, dx in enumerate(tangents) if not is_zero(dx)]
-    constants: list[Component | None] = []
-    treedef = None
-
-    def arrays_only(*xs):
-        nonlocal treedef
-        arguments = list(primals)
-        for i, x in zip(moving, xs, strict=True):
-            arguments[i] = x
-        leaves, treedef = jax.tree.flatten(f(*arguments))
-        constants[:] = [x if is_exact(x) else None for x in leaves]
-        return [x for x in leaves if not is_exact(x)]
-
-    arrays = [x for x in (*primals, *tangents) if not is_exact(x)]
-    xs = [jnp.asarray(primals[i], dtype=jnp.result_type(*arrays)) for i in moving]
-    dxs = [jnp.asarray(tangents[i], dtype=x.dtype) for i, x in zip(moving, xs, strict=True)]
-    if moving:
-        values, derivatives = jax.jvp(arrays_only, xs, dxs)
-    else:
-        values = arrays_only()
-        derivatives = [0.0] * len(values)
-    values, derivatives = iter(values), iter(derivatives)
-    f_x = [next(values) if c is None else c for c in constants]
-    f_dx = [next(derivatives) if c is None else 0.0 for c in constants]
-    return jax.tree.unflatten(treedef, f_x), jax.tree.unflatten(treedef, f_dx)
-
-
-def transposed(f: Callable[..., Any], primals: Sequence[Component], cotangents: Any) -> Row:
-    """`jax.vjp` of a function of components: the derivative of `f` at `primals`, transposed, times `cotangents`.
-
-    `cotangents` stand as f's outputs do. What f returns exactly is constant, and what meets it is dropped.
-    """
-    moves: list[bool] = []
-
-    def arrays_only(*xs):
-        leaves = jax.tree.leaves(f(*xs))
-        moves[:] = [not is_exact(x) for x in leaves]
-        return [x for x in leaves if not is_exact(x)]
-
-    outputs, pull = jax.vjp(arrays_only, *primals)
-    leaves = [ct for ct, m in zip(jax.tree.leaves(cotangents), moves, strict=True) if m]
-    return pull([jnp.asarray(ct, dtype=x.dtype) for ct, x in zip(leaves, outputs, strict=True)])
+from .arguments import Row, as_row
+from .description import (
+    DescriptionEvaluator,
+    jvp,
+    transposed,
+)
 
 
 def unit(n: int, r: int) -> Row:
@@ -112,195 +71,17 @@ def unit(n: int, r: int) -> Row:
     return tuple(1.0 if i == r else 0.0 for i in range(n))
 
 
-class DescriptionEvaluator:
-    """The description of a system, at any time, coordinates and speeds.
-
-    `read` gives parts of it as components, from one trace of the description; `motion` evaluates the method itself.
-    """
-
-    def __init__(self, system: System, inputs: Mapping[str, Component] | None = None):
-        self.system = system
-        self.name = type(system).__name__
-        if batched := in_batches(system):
-            raise ValueError(
-                f"{self.name}: {', '.join(batched)} has more axes than it was declared with. For a batch of systems "
-                "use jax.vmap, or jaxkane.sweep.sweep for their motions."
-            )
-        self.n, self.k = len(system.speeds), len(system.dependent_speeds)
-        self.inputs = Inputs(checked_values(system, inputs), inputs_of(system))
-        self._memory: dict[Any, Any] = {}
-
-    def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
-        """One of the parts of `EvaluatedDescription`."""
-        return _parts.replay(part, self.system, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
-
-    def motion(self, t: Component, q: Row, u: Row) -> Motion:
-        motion = self.system.motion(t, q, u)
-        if not isinstance(motion, Motion):
-            raise TypeError(f"{self.name}.motion must return a jaxkane.Motion, got {motion!r}.")
-        return motion
-
-    def loads_at(self, t: Component, q: Row, u: Row, motion: Motion) -> tuple[Load, ...]:
-        return flatten_loads(self.system.loads(t, q, u, motion, self.inputs), f"{self.name}.loads")
-
-    def rates(self, t: Component, q: Row, u: Row) -> Row:
-        return self.read("rates", t, q, u)
-
-    def configuration(self, t: Component, q: Row) -> Row:
-        return self.read("configuration", t, q, (0.0,) * (self.n + self.k))
-
-    def residuals(self, t: Component, q: Row, u: Row) -> Row:
-        """Velocity residuals c(t, q, u), one for each dependent speed."""
-        c = self.read("velocity_residuals", t, q, u)
-        if len(c) == self.k:
-            return c  # the configuration constraints, if there are any, are integrals of these
-        h, h_dot = jvp(lambda t, *q: self.configuration(t, q), (t, *q), (1.0, *self.rates(t, q, u)))
-        if len(c) + len(h) != self.k:
-            names = ", ".join(self.system.dependent_speeds) or "none"
-            raise ValueError(
-                f"{self.name}: {self.k} dependent speeds are named ({names}), but there are {len(c)} velocity "
-                f"residuals in its motion and {len(h)} configuration constraints. Name as many dependent speeds as "
-                "there are velocity residuals; or as many as both together, and the constraints' rates are added."
-            )
-        return (*c, *h_dot)
-
-
-class EvaluatedDescription:
-    """A description at one time, coordinates and speeds, in parts that are components."""
-
-    parts = ("rates", "configuration", "velocity_residuals", "bodies", "orientations")
-    parts += ("velocities", "momenta", "frame_velocities", "forces")
-
-    def __init__(self, evaluator: DescriptionEvaluator, t: Component, q: Row, u: Row):
-        self.evaluator, self.t, self.q, self.u = evaluator, t, q, u
-
-    def all_parts(self) -> dict[str, Any]:
-        return {part: getattr(self, part)() for part in self.parts}
-
-    @functools.cached_property
-    def motion(self) -> Motion:
-        return self.evaluator.motion(self.t, self.q, self.u)
-
-    @functools.cached_property
-    def loads(self) -> tuple[Load, ...]:
-        # `loads` makes points of its own from these speeds. No exact zero may divide there.
-        dtype = jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float]))
-        u = tuple(jnp.asarray(x, dtype) if is_exact(x) else x for x in self.u)
-        return self.evaluator.loads_at(self.t, self.q, u, self.motion)
-
-    def rates(self) -> Row:
-        """q_dot (n_q,)."""
-        system = self.evaluator.system
-        return as_row(system.q_dot(self.t, self.q, self.u), system.coordinates, f"{self.evaluator.name}.q_dot")
-
-    def configuration(self) -> Row:
-        """Residuals (h,) of the configuration constraints."""
-        residuals = self.evaluator.system.configuration_constraints(self.t, self.q)
-        return flatten_residuals(residuals, f"{self.evaluator.name}: the residuals of configuration_constraints")
-
-    def velocity_residuals(self) -> Row:
-        """Those of the motion itself."""
-        return self.motion.constraints
-
-    def bodies(self) -> list[tuple[Component, Rows]]:
-        """Masses and inertias, each in its body's frame."""
-        return [(body.mass, body.inertia) for body in self.motion.bodies]
-
-    def orientations(self) -> tuple[list[Rows], list[tuple[Row, ...]]]:
-        """[R] of the frames in their parents; and of the bodies that turn in their frames, how, and their inertia."""
-        spins = [
-            ((x.angular_velocity - x.frame.angular_velocity).components_in(x.frame), *x.inertia)
-            for x in turning_bodies(self.motion)
-        ]
-        return [frame._to_child for frame in frames_of(self.motion)], spins
-
-    def velocities(self) -> tuple[list, list]:
-        """Velocities (v, omega) of the bodies, each in the frame where it stands, and those that the loads act on."""
-        bodies = [(b.center.velocity.components, b.angular_velocity.components_in(b.frame)) for b in self.motion.bodies]
-        return bodies, [load.velocity.components for load in self.loads]
-
-    def momenta(self) -> list[tuple[Row, Row]]:
-        """p = m v and H = I . omega of the bodies."""
-        return [
-            (scale3(b.mass, b.center.velocity.components), matvec(b.inertia, b.angular_velocity.components_in(b.frame)))
-            for b in self.motion.bodies
-        ]
-
-    def frame_velocities(self) -> list[tuple[Row, Row]]:
-        """Angular velocities of the frames in which the bodies' momenta stand."""
-        frames = [(body.center.velocity.frame, body.frame) for body in self.motion.bodies]
-        return [(a.angular_velocity.components, b.angular_velocity.components) for a, b in frames]
-
-    def forces(self) -> list[Row]:
-        """The loads' vectors, in the frames of the velocities that they act on."""
-        return [load.vector.components_in(load.velocity.frame) for load in self.loads]
-
-
-@ScalarFunction
-def _parts(system: System, components: Any) -> dict[str, Any]:
-    inputs, t, q, u = components
-    return EvaluatedDescription(DescriptionEvaluator(system, inputs), t, q, u).all_parts()
-
-
-def turning_bodies(motion: Motion) -> list[Body]:
-    """The bodies that turn in their frames."""
-    return [body for body in motion.bodies if body.angular_velocity is not body.frame.angular_velocity]
-
-
-def frames_of(motion: Motion, loads: Iterable[Load] = ()) -> list[Frame]:
-    """All frames that bodies, named points and frames, and loads stand in, but for the inertial one."""
-    starts = [*(body.frame for body in motion.bodies), *motion.frames.values()]
-    vectors = (*(body.center for body in motion.bodies), *motion.points.values(), *loads)
-    starts += [x.velocity.frame for x in vectors]
-    frames: dict[Frame, None] = {}
-    for start in starts:
-        frame: Frame | None = start
-        while frame is not None and frame.parent is not None and frame not in frames:
-            frames[frame] = None
-            frame = frame.parent
-    return list(frames)
-
-
-def structure_of(system: System) -> tuple[Any, ...]:
-    """A description, apart from the values of its parameters."""
-    return (version_of(system), jax.tree.structure(system), *(np.shape(x) for x in jax.tree.leaves(system)))
-
-
-def dtype_of(system: System) -> Any:
-    """The type of a system's parameters; that of Python's floats where it has none."""
-    leaves = [x for x in jax.tree.leaves(system) if hasattr(x, "dtype")]
-    dtypes = [x.dtype for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)]
-    return np.result_type(*dtypes) if dtypes else jnp.result_type(float)
-
-
-def at_random_point(tree: tuple[System, Any, Any], rng: np.random.Generator) -> tuple[System, Any, Any]:
-    """A random test point for what is traced: positive parameters, small coordinates; arrays of length 1, as axes and
-    quaternions are, and unit matrices."""
-    system, t, q = tree
-
-    def parameter(x: Any) -> Any:
-        if not isinstance(x, Tracer):
-            return x
-        if np.ndim(x) == 2 and x.shape[0] == x.shape[1]:
-            return np.eye(len(x), dtype=x.dtype)
-        value = rng.uniform(0.5, 1.5, x.shape)
-        return np.asarray(value / np.linalg.norm(value) if value.ndim else value, x.dtype)
-
-    system = jax.tree.map(parameter, system)
-    if q is None or isinstance(q, Tracer):
-        n, dtype = len(system.coordinates), dtype_of(system) if q is None else q.dtype
-        q = rng.uniform(0.1, 0.5, n) * rng.choice((-1.0, 1.0), n)
-        q = q.astype(dtype)
-    return system, 0.3 if isinstance(t, Tracer) else t, np.asarray(q)
-
-
 class KaneEquations(DescriptionEvaluator):
-    """Kane's equations of a system at a state: one time, coordinates and independent speeds.
+    """Kane's equations of a system at one time, coordinates and independent speeds.
 
-    `u_dep`, `q_dot` and the columns of `J` are formed at once, since everything else needs them.
+    - `u_dep` (k,), `u_all` (n + k,): dependent speeds; independent and dependent speeds.
+    - `q_dot` (n_q,): rates of the coordinates.
+    - `J`: its n columns (k,).
     """
 
-    def __init__(self, system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None):
+    def __init__(
+        self, system: System, t: Component, q: Numbers, u: Numbers, inputs: Mapping[str, Component] | None = None
+    ):
         super().__init__(system, inputs)
         self.t = component(t)
         self.q = as_row(q, system.coordinates, f"{self.name}: q")
@@ -314,19 +95,31 @@ class KaneEquations(DescriptionEvaluator):
         self.u_all = (*self.u, *self.u_dep)
         self.q_dot = self.rates(self.t, self.q, self.u_all)
 
-    def loads(self, motion: Motion) -> tuple[Load, ...]:
-        return self.loads_at(self.t, self.q, self.u_all, motion)
-
-    def along_speeds(self, f: Callable[[Row], Any], direction: Row) -> Any:
-        """The derivative of `f(u)` along a direction of speeds, at u = 0: all of it, since f is affine in them."""
-        return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (self._zero(),), (jnp.ones_like(self._zero()),))[1]
-
     @property
     def dtype(self) -> Any:
         return jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float]))
 
     def _zero(self) -> Array:
         return jnp.zeros((), self.dtype)
+
+    def loads(self, motion: Motion) -> tuple[Load, ...]:
+        return self.loads_at(self.t, self.q, self.u_all, motion)
+
+    def velocities(self, u: Row) -> tuple[list, list]:
+        """Velocities (v, omega) of the bodies, and of the points and frames of the loads, at the speeds u."""
+        return self.read("velocities", self.t, self.q, u)
+
+    def momenta(self, u: Row) -> list[tuple[Row, Row]]:
+        return self.read("momenta", self.t, self.q, u)
+
+    def force_components(self) -> list[Row]:
+        return self.read("forces", self.t, self.q, self.u_all)
+
+    def along_speeds(self, f: Callable[[Row], Any], direction: Row) -> PyTree:
+        """The derivative of `f(u)` along a direction of the speeds. f is affine, so u = 0 is used."""
+        return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (self._zero(),), (jnp.ones_like(self._zero()),))[1]
+
+    # -- Constraints: J, J_dot and the bias of the dependent accelerations.
 
     def _constraint_rows(self) -> tuple[Rows, Rows, Row]:
         # c = C_ind u + C_dep u_dep + c0
@@ -338,42 +131,31 @@ class KaneEquations(DescriptionEvaluator):
         rows = tuple(zip(*along, strict=True))
         return [row[:n] for row in rows], [row[n:] for row in rows], c0
 
-    def partials(self) -> list[tuple[list, list]]:
-        """For each independent speed: the partial velocities (V, W) of the bodies, and those of the loads."""
-        # V_ir = dv_i/du_r,  W_ir = domega_i/du_r, along the columns of [1; J]
-        return [self.along_speeds(self.velocities, (*unit(self.n, r), *self.J[r])) for r in range(self.n)]
-
-    def velocities(self, u: Row) -> tuple[list, list]:
-        """Velocities (v, omega) of the bodies, and those that the loads act on, at speeds `u`."""
-        return self.read("velocities", self.t, self.q, u)
-
-    def momenta(self, u: Row) -> list[tuple[Row, Row]]:
-        return self.read("momenta", self.t, self.q, u)
-
     def with_dependent(self, direction: Row) -> Row:
-        """A direction of the independent speeds, with what the dependent ones do: [1; J] of it."""
+        """[1; J] times a direction (n,) of the independent speeds: a direction (n + k,) of all speeds."""
         return (*direction, *(dot(row, direction) for row in zip(*self.J, strict=True)))
 
-    def onto_speeds(self, f: Callable[[Row], Any], cotangents: Any) -> Row:
-        """For every independent speed, the derivative of `f(u)` along it times `cotangents`; at the cost of a few f."""
-        return transposed(lambda *u: f(self.with_dependent(u)), (self._zero(),) * self.n, cotangents)
+    def J_dot(self) -> list[Row]:
+        """The columns (k,) of J_dot, the derivative of J(t, q) along (1, q_dot).
 
-    def mass_times(self, direction: Row) -> Row:
-        """M times a direction of the independent speeds: the momenta along it, onto all speeds. Order b, not n b."""
-        along = self.along_speeds(self.momenta, self.with_dependent(direction))
-        return self.onto_speeds(lambda u: self.velocities(u)[0], along)
+            J_dot = -C_dep^-1 (C_ind_dot + C_dep_dot J)
 
-    def forcing(self, u_dot: Row | None = None) -> Row:
-        """f of M u_dot = f, or f - M u_dot, without partial velocities: all vectors onto all speeds at once."""
-        u_dot_all = None if u_dot is None else (*u_dot, *self.dependent_accelerations(u_dot))
-        inertia = [tuple(scale3(-1.0, rate) for rate in rates) for rates in self.momentum_rates(u_dot_all)]
-        return self.onto_speeds(self.velocities, (inertia, self.force_components()))
+        The textbook prints a minus before C_dep_dot (Example 7).
+        """
+        at_rest = (0.0,) * self.n
+
+        def columns(t: Component, *q: Component) -> list[Row]:
+            return KaneEquations(self.system, t, q, at_rest).J
+
+        return jvp(columns, (self.t, *self.q), (1.0, *self.q_dot))[1]
 
     def bias(self) -> Row:
-        """u_dep_dot at u_dot = 0: the residual is differentiated, never the solution of the solve.
+        """The dependent accelerations (k,) at u_dot = 0.
 
-        u_dep_dot = J u_dot - C_dep^-1 (dc/dt at frozen speeds)
+        u_dep_dot = J u_dot - C_dep^-1 (dc/dt at constant speeds)
         """
+        # Differentiate the residual. Differentiating the solution u_dep of the linear system gives the same value, but
+        # needs the derivatives of C_ind, C_dep and their factorization.
         if not self.k:
             return ()
         _, c_dot = jvp(lambda t, *q: self.residuals(t, q, self.u_all), (self.t, *self.q), (1.0, *self.q_dot))
@@ -385,12 +167,18 @@ class KaneEquations(DescriptionEvaluator):
             return ()
         return tuple(add(dot(row, u_dot), b) for row, b in zip(zip(*self.J, strict=True), self.bias(), strict=True))
 
-    def momentum_rates(self, u_dot: Row | None = None) -> list[tuple[Row, ...]]:
-        """dp/dt and dH/dt of every body in the inertial frame; each in the frame where it stands.
+    # -- Rates of momenta, for both formulations.
 
-        `u_dot` (n + k,) of the independent and the dependent speeds; by default u_dot = 0 and `bias`.
+    def momentum_rates(self, u_dot: Row | None = None) -> list[tuple[Row, ...]]:
+        """dp/dt and dH/dt of every body in the inertial frame, with components in the frame of the body.
+
+        `u_dot` (n + k,): rates of all speeds. By default the rates of the independent speeds are zero, and those of
+        the dependent speeds are `bias`.
         """
-        momenta = lambda t, *q: self.read("momenta", t, q, self.u_all)  # noqa: E731
+
+        def momenta(t: Component, *q: Component) -> list[tuple[Row, Row]]:
+            return self.read("momenta", t, q, self.u_all)
+
         values, rates = jvp(momenta, (self.t, *self.q), (1.0, *self.q_dot))
         if u_dot is None and self.k:
             u_dot = (*(0.0,) * self.n, *self.bias())
@@ -404,13 +192,17 @@ class KaneEquations(DescriptionEvaluator):
             for each in zip(rates, frames, values, strict=True)
         ]
 
+    # -- Formulation by partial velocities: sums over the bodies for each pair of speeds. For few speeds.
+
+    def partial_velocities(self) -> list[tuple[list, list]]:
+        """For each independent speed, the partial velocities (V, W) of the bodies and those of the loads."""
+        # V_ir = dv_i/du_r,  W_ir = domega_i/du_r, along the columns of [1; J]
+        return [self.along_speeds(self.velocities, (*unit(self.n, r), *self.J[r])) for r in range(self.n)]
+
     def active_forces(self, partials: list) -> Row:
         # F_r = sum F . V_r + T . W_r
         vectors = self.force_components()
         return tuple(total(dot(v, x) for v, x in zip(columns, vectors, strict=True)) for _, columns in partials)
-
-    def force_components(self) -> list[Row]:
-        return self.read("forces", self.t, self.q, self.u_all)
 
     def inertia_forces(self, partials: list, u_dot: Row | None = None) -> Row:
         # F*_r = -sum_i V_ir . dp_i/dt + W_ir . dH_i/dt
@@ -422,7 +214,7 @@ class KaneEquations(DescriptionEvaluator):
 
     def mass_matrix(self, partials: list) -> list[list[Component]]:
         # M_rs = sum_i V_ir . m_i V_is + W_ir . I_i W_is
-        n = self.n
+        n = len(partials)
         M: list[list[Component]] = [[0.0] * n for _ in range(n)]
         for i, (mass, inertia) in enumerate(self.read("bodies", self.t, self.q, self.u_all)):
             for s in range(n):
@@ -436,15 +228,32 @@ class KaneEquations(DescriptionEvaluator):
                 M[s][r] = M[r][s]
         return M
 
-    def equations(self) -> tuple[list[list[Component]], Row]:
+    def equations_by_partial_velocities(self) -> tuple[list[list[Component]], Row]:
         """M and f of M u_dot = f."""
-        partials = self.partials()
+        partials = self.partial_velocities()
         # f = F_r + F*_r
         f = tuple(map(add, self.active_forces(partials), self.inertia_forces(partials)))
         return self.mass_matrix(partials), f
 
-    def accelerations(self) -> Row:
-        return solve_positive(*self.equations())
+    def accelerations_by_partial_velocities(self) -> Row:
+        return solve_positive(*self.equations_by_partial_velocities())
+
+    # -- Formulation by transposition: all vectors are projected onto all speeds at once. For many speeds.
+
+    def projected_onto_speeds(self, f: Callable[[Row], Any], cotangents: Any) -> Row:
+        """The derivatives of `f(u)` with respect to the independent speeds, times `cotangents` (n,). Costs a few f."""
+        return transposed(lambda *u: f(self.with_dependent(u)), (self._zero(),) * self.n, cotangents)
+
+    def mass_matrix_times(self, direction: Row) -> Row:
+        """M times a direction (n,) of the independent speeds: its momenta, projected onto all speeds. Order b."""
+        along = self.along_speeds(self.momenta, self.with_dependent(direction))
+        return self.projected_onto_speeds(lambda u: self.velocities(u)[0], along)
+
+    def forcing_by_transposition(self, u_dot: Row | None = None) -> Row:
+        """f (n,) of M u_dot = f. With `u_dot`, f - M u_dot."""
+        u_dot_all = None if u_dot is None else (*u_dot, *self.dependent_accelerations(u_dot))
+        inertia = [tuple(scale3(-1.0, rate) for rate in rates) for rates in self.momentum_rates(u_dot_all)]
+        return self.projected_onto_speeds(self.velocities, (inertia, self.force_components()))
 
 
 def _negative(row: Sequence[Component]) -> Row:
@@ -454,20 +263,25 @@ def _negative(row: Sequence[Component]) -> Row:
 def motion_rates(
     system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
 ) -> tuple[Float[Array, " n_q"], Float[Array, " n"]]:
-    """q_dot and u_dot: the right-hand side, from arrays that were checked."""
+    """q_dot and u_dot, from checked arrays."""
     if is_written_out(len(system.speeds)):
         return _motion_rates(system, t, q, u, inputs)
-    q_dot, f = _rates_and_forcing(system, t, q, u, inputs)
-    # The equation is differentiated, never the solution of the solve.
-    times = lambda u_dot: _mass_times(system, t, q, u, inputs, u_dot)  # noqa: E731
-    solve = lambda _, f: _accelerations_under(system, t, q, u, inputs, f)  # noqa: E731
+    q_dot, f = rates_and_forcing(system, t, q, u, inputs)
+
+    def times(u_dot: Array) -> Array:
+        return _mass_times(system, t, q, u, inputs, u_dot)
+
+    def solve(_: Any, f: Array) -> Array:
+        return _accelerations_under(system, t, q, u, inputs, f)
+
+    # Its derivative is that of M u_dot = f (implicit function theorem). The elimination itself is never differentiated.
     return q_dot, jax.lax.custom_linear_solve(times, f, solve, symmetric=True)
 
 
 def motion_rates_by_matrix(
     system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
 ) -> tuple[Float[Array, " n_q"], Float[Array, " n"]]:
-    """As `motion_rates`, in operations that can be exported."""
+    """As `motion_rates`, with operations that can be exported: no custom derivative and no native kernel."""
     if is_written_out(len(system.speeds)):
         return _motion_rates(system, t, q, u, inputs)
     q_dot, M, f = rates_and_equations(system, t, q, u, inputs)
@@ -477,68 +291,71 @@ def motion_rates_by_matrix(
 def rates_and_equations(
     system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
 ) -> tuple[Float[Array, " n_q"], Float[Array, "n n"], Float[Array, " n"]]:
-    """q_dot, M and f of M u_dot = f, from arrays that were checked."""
+    """q_dot, M and f of M u_dot = f, from checked arrays."""
     if is_written_out(len(system.speeds)):
         return _equations_written_out(system, t, q, u, inputs)
-    q_dot, f = _rates_and_forcing(system, t, q, u, inputs)
-    return q_dot, _columns(system, t, q, u, inputs), f
+    q_dot, f = rates_and_forcing(system, t, q, u, inputs)
+    return q_dot, mass_matrix_columns(system, t, q, u, inputs), f
 
 
-def _columns(system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]) -> Float[Array, "n n"]:
-    """M. Its columns are one program, whose lanes are the directions."""
-    times = jax.vmap(lambda direction: _mass_times(system, t, q, u, inputs, direction))
-    return times(np.eye(len(system.speeds), dtype=q.dtype))
+def mass_matrix_columns(system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]) -> Float[Array, "n n"]:
+    """M (n, n), by one batched program for all columns."""
+
+    def column(direction: Numbers) -> Array:
+        return _mass_times(system, t, q, u, inputs, direction)
+
+    return jax.vmap(column)(np.eye(len(system.speeds), dtype=q.dtype))
 
 
 def accelerations_and_mass_matrix(
     system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """u_dot and M, from arrays that were checked."""
+    """u_dot and M, from checked arrays."""
     if is_written_out(len(system.speeds)):
         return _accelerations_and_mass_matrix(system, t, q, u, inputs)
-    return motion_rates(system, t, q, u, inputs)[1], _columns(system, t, q, u, inputs)
+    return motion_rates(system, t, q, u, inputs)[1], mass_matrix_columns(system, t, q, u, inputs)
 
 
 def _equations_at(system, t, q, u, inputs, u_dot, r):
     kane = KaneEquations(system, t, q, u, inputs)
     u_dot, r = (as_row(x, system.speeds, "u_dot") for x in (u_dot, r))
-    solution = solve_positive(kane.mass_matrix(kane.partials()), r)
-    return as_vector(kane.q_dot, q), as_vector(kane.forcing(u_dot), q), as_vector(solution, q)
+    solution = solve_positive(kane.mass_matrix(kane.partial_velocities()), r)
+    return as_vector(kane.q_dot, q), as_vector(kane.forcing_by_transposition(u_dot), q), as_vector(solution, q)
 
 
 @functools.partial(LinearSolution, equations=_equations_at)
 def _motion_rates(system, t, q, u, inputs):
     kane = KaneEquations(system, t, q, u, inputs)
-    return as_vector(kane.q_dot, q), as_vector(kane.accelerations(), q)
+    return as_vector(kane.q_dot, q), as_vector(kane.accelerations_by_partial_velocities(), q)
 
 
 @ScalarFunction
 def _equations_written_out(system, t, q, u, inputs):
     kane = KaneEquations(system, t, q, u, inputs)
-    M, f = kane.equations()
+    M, f = kane.equations_by_partial_velocities()
     return as_vector(kane.q_dot, q), stack(M).astype(q.dtype), as_vector(f, q)
 
 
 @ScalarFunction
 def _accelerations_and_mass_matrix(system, t, q, u, inputs):
-    M, f = KaneEquations(system, t, q, u, inputs).equations()
+    M, f = KaneEquations(system, t, q, u, inputs).equations_by_partial_velocities()
     return as_vector(solve_positive(M, f), q), stack(M).astype(q.dtype)
 
 
 @ScalarFunction
-def _rates_and_forcing(system, t, q, u, inputs):
+def rates_and_forcing(system, t, q, u, inputs):
     kane = KaneEquations(system, t, q, u, inputs)
-    return as_vector(kane.q_dot, q), as_vector(kane.forcing(), q)
+    return as_vector(kane.q_dot, q), as_vector(kane.forcing_by_transposition(), q)
 
 
 @ScalarFunction
 def _mass_times(system, t, q, u, inputs, direction):
     kane = KaneEquations(system, t, q, u, inputs)
-    return as_vector(kane.mass_times(as_row(direction, system.speeds, "direction")), q)
+    return as_vector(kane.mass_matrix_times(as_row(direction, system.speeds, "direction")), q)
 
 
 def _accelerations_by_lapack(system, t, q, u, inputs, f):
-    return solve_positive_array(_columns(system, t, q, u, inputs), f)
+    return solve_positive_array(mass_matrix_columns(system, t, q, u, inputs), f)
 
 
 @functools.partial(ScalarSolve, by_lapack=_accelerations_by_lapack)
@@ -551,3 +368,12 @@ def _accelerations_under(system, t, q, u, inputs, u_dot):
     for mass, inertia in kane.read("bodies", kane.t, kane.q, kane.u_all):
         rows += [(mass, 0.0, 0.0), (0.0, mass, 0.0), (0.0, 0.0, mass), *inertia]
     return stack(vectors).astype(q.dtype), stack(rows).astype(q.dtype).reshape(-1, 3, 3)
+
+
+compiled = {f: jit(f) for f in (motion_rates, rates_and_equations)}
+
+
+def as_one_program(f: Callable[..., Any], system: System) -> Callable[..., Any]:
+    """`f` as one compiled program also outside of `jax.jit`. With few speeds it is one program already. With many
+    speeds it is several operations. One of these, `custom_linear_solve`, is traced in each call: 14 ms, 30 speeds."""
+    return f if is_written_out(len(system.speeds)) else compiled[f]

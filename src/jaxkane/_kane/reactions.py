@@ -1,12 +1,12 @@
-"""Constraint forces, by auxiliary speeds that the library adds itself. Knows the method; knows no mechanism.
+"""Constraint forces, by auxiliary speeds that the library adds. Depends on Kane's method, not on a mechanism.
 
-An auxiliary speed is zero in the motion and gives a point or a frame a velocity that it does not have. Its Kane
-equation holds one unknown more, the force there (Kamman, Unit 5, Example 7, note on constraint forces; Kane and
-Levinson, "Dynamics", section 4.9). With R_r = F_r + F*_r at the accelerations of the motion, without elimination of the
-dependent speeds, and the residuals c = C_ind u + C_dep u_dep + C_aux u_aux + c0:
+An auxiliary speed is a virtual velocity of a point or a frame. Its value in the motion is zero. Its Kane equation
+contains one more unknown, the force at this point (Kamman, Unit 5, Example 7, note on constraint forces; Kane and
+Levinson, "Dynamics", section 4.9). Let R_r = F_r + F*_r at the accelerations of the motion, without elimination of the
+dependent speeds. With the residuals c = C_ind u + C_dep u_dep + C_aux u_aux + c0:
 
     R_dep + C_dep^T lambda = 0                  multipliers of the residuals
-    R_aux + C_aux^T lambda + Q = 0              the force (moment) Q that holds the auxiliary speed at zero
+    R_aux + C_aux^T lambda + Q = 0              the force (moment) Q that keeps the auxiliary speed at zero
 """
 
 from __future__ import annotations
@@ -15,27 +15,29 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from .._scalarjit.cache_key import jit
-from .._scalarjit.components import Component, Triple, add, as_vector, dot, mul, solve, total
-from .._scalarjit.function import ScalarFunction
+from .._scalarjit.components import Component, Numbers, Triple, add, as_vector, dot, mul, solve, total
+from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point, auxiliary_speed
 from .._system.motion import Motion
 from .._system.system import System
+from .api import InputValues
 from .arguments import Row, as_row
-from .equations import InputValues
-from .kanes_method import EvaluatedDescription, KaneEquations, motion_rates, unit
+from .description import EvaluatedDescription
+from .kanes_method import KaneEquations, motion_rates, unit
 
 
 @jit
 def multipliers_now(system, t, q, u, inputs):
-    """Of the residuals (k,), at the accelerations of the motion."""
+    """Multipliers of the velocity residuals (k,), at the accelerations of the motion."""
     return _multipliers(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
 @jit
 def forces_now(system, t, q, u, inputs):
-    """By name, numbers and components in N (3,), at the accelerations of the motion."""
+    """Constraint forces by name, at the accelerations of the motion: numbers, or components in N (3,)."""
     return _forces(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
@@ -51,15 +53,58 @@ def _forces(system, t, q, u, inputs, u_dot):
     return vectors | {name: jnp.asarray(x, dtype=q.dtype) for name, x in kane.forces_of_auxiliary_speeds()}
 
 
-class Reactions(KaneEquations):
-    """Kane's equations at a state and its accelerations `u_dot` (n,), with the multipliers of the residuals.
+class AuxiliarySpeeds(KaneEquations):
+    """Kane's equations at a state, and derivatives along auxiliary speeds of points and frames."""
 
-    The accelerations are an argument: they are a program of their own, which for many speeds calls into libraries.
-    """
-
-    def __init__(self, system: System, t: Any, q: Any, u: Any, inputs: InputValues, u_dot: Any):
+    def __init__(self, system: System, t: Any, q: Any, u: Any, inputs: InputValues = None):
         super().__init__(system, t, q, u, inputs)
         self.description: Motion = self.motion(self.t, self.q, self.u_all)
+
+    def read(self, part: str, t: Component, q: Row, u: Row) -> PyTree:
+        # Evaluate the system directly: the recorded trace contains neither auxiliary velocities nor auxiliary speeds.
+        return getattr(EvaluatedDescription(self, t, q, u), part)()
+
+    def auxiliary_residuals(self, part: Point | Frame, axis: int) -> Row:
+        """C_aux: the derivatives of velocity residuals by an auxiliary velocity.
+
+        For configuration constraints, the derivatives are by a displacement.
+        """
+        if not self.k:
+            return ()
+        still = (0.0,) * (self.n + self.k)
+        rows = self.along_auxiliary(part, axis, lambda: self.read("velocity_residuals", self.t, self.q, still))
+        if len(rows) < self.k:
+            more = self.along_auxiliary(part, axis, lambda: self.configuration(self.t, self.q), displace=True)
+            rows = (*rows, *more)
+        return rows
+
+    def along_auxiliary(self, part: Point | Frame, axis: int, read: Callable[[], Any], displace: bool = False) -> Any:
+        """The derivative of `read()` along an auxiliary velocity (or displacement) of a point or a frame."""
+
+        def displaced(row: Row) -> Any:
+            along: Triple = tuple(row[0] if i == axis else 0.0 for i in range(3))  # type: ignore[assignment]
+            with auxiliary_speed(part, **{"displacement" if displace else "velocity": along}):
+                return read()
+
+        return self.along_speeds(displaced, (1.0,))
+
+    def is_cut(self, part: Point | Frame) -> bool:
+        """Whether bodies are built from a point whose own velocity is not a constraint residual. True for frames."""
+        if isinstance(part, Frame):
+            return True
+        if any(part.velocity is residual for residual in self.description.residuals):
+            return False
+        return any(part in body.center.chain() for body in self.description.bodies)
+
+
+class Reactions(AuxiliarySpeeds):
+    """Kane's equations at a state with accelerations `u_dot` (n,), and the multipliers of the velocity residuals.
+
+    The accelerations are an argument, because a separate program computes them. With many speeds, it calls LAPACK.
+    """
+
+    def __init__(self, system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues, u_dot: Numbers):
+        super().__init__(system, t, q, u, inputs)
         u_dot = as_row(u_dot, system.speeds, f"{self.name}: u_dot")
         u_dep_dot = self.dependent_accelerations(u_dot)
         self.momentum_derivatives = self.momentum_rates((*u_dot, *u_dep_dot))
@@ -68,10 +113,6 @@ class Reactions(KaneEquations):
         directions = [unit(self.n + self.k, self.n + r) for r in range(self.k)]
         R = [mul(-1.0, self.unbalanced(self.along_speeds(self.velocities, direction))) for direction in directions]
         self.multipliers: Row = solve(tuple(zip(*self.C_dep, strict=True)), R)[0] if self.k else ()
-
-    def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
-        # The description itself: its trace knows neither auxiliary velocities nor auxiliary speeds.
-        return getattr(EvaluatedDescription(self, t, q, u), part)()
 
     def unbalanced(self, partial: Any) -> Component:
         """R = sum F . V + T . W - V . dp/dt - W . dH/dt along one direction."""
@@ -84,9 +125,11 @@ class Reactions(KaneEquations):
         return total([*active, *inertia])
 
     def power_of_prescribed_motions(self) -> Component:
-        """Power [W] of what drives velocities that are left when all speeds are zero, and of moving constraints.
+        """Power [W] of prescribed motions and of moving constraints.
 
         sum V_t . dp/dt + W_t . dH/dt - F . V_t - T . W_t - lambda . c0
+
+        V_t and W_t are the velocities that remain if all speeds are zero.
         """
         still = (0.0,) * (self.n + self.k)
         c0 = self.residuals(self.t, self.q, still)
@@ -95,7 +138,7 @@ class Reactions(KaneEquations):
     def forces_of_parts(self) -> Iterator[tuple[str, Row]]:
         """Forces at the named points, moments at the named frames."""
         for name, point in self.description.points.items():
-            is_cut = self._is_cut(point)
+            is_cut = self.is_cut(point)
             if is_cut or self.k:
                 yield name, self._force(point, transmitted=is_cut)
         for name, frame in self.description.frames.items():
@@ -112,39 +155,14 @@ class Reactions(KaneEquations):
             yield name, mul(-1.0, add(R, dot(C_aux, self.multipliers)))
 
     def _force(self, part: Point | Frame, transmitted: bool) -> Row:
-        """By three auxiliary speeds of a point or a frame, along N.x, N.y and N.z: the force that is `transmitted` to
-        what is built from it, or that of the constraint residuals that depend on its motion."""
+        """The force on a point or the moment on a frame, by three auxiliary speeds along N.x, N.y and N.z.
+
+        If `transmitted`, this is the force that is transmitted to the bodies that are built from the part. Otherwise,
+        it is the force of the constraint residuals that depend on the motion of the part.
+        """
         still = (0.0,) * (self.n + self.k)
-        Q = [dot(self._auxiliary_residuals(part, axis), self.multipliers) for axis in range(3)]
+        Q = [dot(self.auxiliary_residuals(part, axis), self.multipliers) for axis in range(3)]
         if transmitted:
-            partials = [self._along_auxiliary(part, axis, lambda: self.velocities(still)) for axis in range(3)]
+            partials = [self.along_auxiliary(part, axis, lambda: self.velocities(still)) for axis in range(3)]
             Q = [mul(-1.0, add(self.unbalanced(partial), x)) for partial, x in zip(partials, Q, strict=True)]
         return tuple(Q)
-
-    def _auxiliary_residuals(self, part: Point | Frame, axis: int) -> Row:
-        """C_aux: how the residuals change with a auxiliary velocity; constraints of the configuration, with a
-        displacement."""
-        if not self.k:
-            return ()
-        still = (0.0,) * (self.n + self.k)
-        rows = self._along_auxiliary(part, axis, lambda: self.read("velocity_residuals", self.t, self.q, still))
-        if len(rows) < self.k:
-            configuration = lambda: self.configuration(self.t, self.q)  # noqa: E731
-            rows = (*rows, *self._along_auxiliary(part, axis, configuration, displace=True))
-        return rows
-
-    def _along_auxiliary(self, part: Point | Frame, axis: int, read: Callable[[], Any], displace: bool = False) -> Any:
-        """The derivative of what `read` reads, along a auxiliary velocity (or displacement) of a point or a frame."""
-
-        def displaced(row: Row) -> Any:
-            along: Triple = tuple(row[0] if i == axis else 0.0 for i in range(3))  # type: ignore[assignment]
-            with auxiliary_speed(part, **{"displacement" if displace else "velocity": along}):
-                return read()
-
-        return self.along_speeds(displaced, (1.0,))
-
-    def _is_cut(self, point: Point) -> bool:
-        """Whether bodies are built from a point, which is not itself held by a residual."""
-        if any(point.velocity is residual for residual in self.description.residuals):
-            return False
-        return any(point in body.center.chain() for body in self.description.bodies)

@@ -1,4 +1,4 @@
-"""Kane's equations as a regressor: the columns of the bodies' parameters, in which the equations are linear."""
+"""Kane's equations as a regressor: the equations are linear in the inertial parameters, one column each."""
 
 from __future__ import annotations
 
@@ -10,49 +10,42 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._common.lookup import as_names, refuse_unknown
-from .._scalarjit.cache_key import Cache
+from .._scalarjit.cache import Cache
 from .._scalarjit.compat import concretely, depends_on
-from .._scalarjit.components import ZERO3, Component, add, add3, as_vector, is_zero, mul, stack
-from .._scalarjit.function import ScalarFunction
-from .._system.kinematics import Point, Vector
+from .._scalarjit.components import ZERO3, Component, Numbers, add, add3, as_vector, is_zero, mul, stack
+from .._scalarjit.scalar_function import ScalarFunction
+from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import UNNAMED, Body, Force, Motion, parallel_axis
 from .._system.system import System
 from .arguments import Row
-from .kanes_method import (
-    DescriptionEvaluator,
-    EvaluatedDescription,
-    KaneEquations,
-    at_random_point,
-    dtype_of,
-    jvp,
-    structure_of,
-)
+from .description import DescriptionEvaluator, EvaluatedDescription, at_random_point, dtype_of, jvp, structure_of
+from .kanes_method import KaneEquations
 
 TEN = ("m", "mx", "my", "mz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
-"""Mass [kg], first moment [kg m], and inertia [kg m^2] as matrix entries, about the body's own point."""
+"""Mass [kg], first moment [kg m], and inertia [kg m^2] as matrix entries, about the body's origin (`origin_of`)."""
 UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6)
 
 
 Bodies = str | Sequence[str] | Mapping[str, str | Sequence[str]] | None
-"""Names of bodies, or with each the names of its parameters that are columns; None for all."""
+"""Names of bodies, or a dict that gives the names of the parameters for each body. None selects all."""
 
 
 class BodyParameters(NamedTuple):
-    """A body with parameters of its own in a regressor: its place among the motion's bodies, and its parameters."""
+    """A body whose parameters are columns of a regressor."""
 
-    place: int
+    place: int  # index of the body in the bodies of the motion
     name: str
     about: str  # name of the point that the first moment and the inertia are about
-    indices: tuple[int, ...] = tuple(range(10))  # of the ten
-    axis: int | None = None  # about which it spins in its frame: both moments of inertia across are one
-    has_constant_mass: bool = False  # its mass is a number of the description, and no parameter
+    indices: tuple[int, ...] = tuple(range(10))  # of the parameters in TEN
+    axis: int | None = None  # spin axis in the frame: both transverse moments of inertia are one parameter
+    has_constant_mass: bool = False  # its mass is a constant in the code, not a parameter of the system
 
     @property
     def basis(self) -> np.ndarray:
-        """(10, k): each parameter as a combination of the ten."""
+        """(10, k): each parameter as a linear combination of the ten."""
         columns = np.eye(10)[:, list(self.indices)]
         if self._across in self.indices:
             columns[4:7, self.indices.index(self._across)] = [i != self.axis for i in range(3)]
@@ -67,7 +60,7 @@ class BodyParameters(NamedTuple):
         return tuple(f"{self.name}.{'Iacross' if i == self._across else TEN[i]}" for i in self.indices)
 
     def only(self, names: Sequence[str] | str) -> BodyParameters:
-        """With these of its parameters alone."""
+        """The body with only these of its parameters."""
         names = as_names(names)
         known = [name.rpartition(".")[2] for name in self.names]
         refuse_unknown(names, known, f"`bodies`: {self.name} has no parameter", "it has")
@@ -76,7 +69,7 @@ class BodyParameters(NamedTuple):
 
 
 class RegressorModel(eqx.Module):
-    """A system, and its bodies that have parameters in a regressor. `leaves`: of those that the bodies' masses read."""
+    """A system and the bodies in its regressor. `leaves`: indices of the leaves on which the masses depend."""
 
     system: System
     bodies: tuple[BodyParameters, ...] = eqx.field(static=True)
@@ -84,8 +77,8 @@ class RegressorModel(eqx.Module):
 
 
 def origin_of(body: Body) -> tuple[Point, list[Vector]]:
-    """The farthest point from which the mass centre was built inside its body, as a joint, and the way from there."""
-    # Where a body spins in its frame, only points of the axis are fixed in both.
+    """The farthest point in a body from which its mass centre was created, e.g. a joint; the vectors between them."""
+    # If a body spins in its frame, only points of the axis are fixed in both.
     turns = not body.is_particle and body.angular_velocity is body.frame.angular_velocity
     point, way = body.center, []
     for base in [*point.chain()][1:]:
@@ -102,10 +95,10 @@ _BODIES = Cache()  # by structure
 
 
 def regressor_model(system: System, bodies: Bodies) -> RegressorModel:
-    """A system and those of its bodies that are named, by default all that have a mass.
+    """A system and its named bodies, by default all bodies with a mass.
 
-    **Raises:** `ValueError` for a name that is no body's, or no parameter's that it can have, and for a body that spins
-    in its frame about no axis of it.
+    **Raises:** `ValueError` for an unknown or repeated body, and for a parameter that the body does not have. Also for
+    a body that rotates in its frame about an axis other than one of the frame's axes.
     """
     chosen, leaves = _BODIES.get(structure_of(system), lambda: _bodies_of(system))
     if bodies is not None:
@@ -114,7 +107,7 @@ def regressor_model(system: System, bodies: Bodies) -> RegressorModel:
         refuse_unknown(names, known, f"{type(system).__name__} has no body with a mass named", "it has")
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(f"`bodies` names {', '.join(twice)} twice.")
+            raise ValueError(f"`bodies` contains {', '.join(twice)} twice. Name each body once.")
         chosen = tuple(
             body if parameters.get(body.name) is None else body.only(parameters[body.name])
             for body in chosen
@@ -123,19 +116,19 @@ def regressor_model(system: System, bodies: Bodies) -> RegressorModel:
     skew = [body.name for body in chosen if body.axis == SKEW]
     if skew:
         raise ValueError(
-            f"{type(system).__name__}: the body {skew[0]!r} turns in its frame, and not about one of the frame's axes "
-            "alone: which moments of inertia it may have there cannot be said. Give it a frame that turns with it, or "
-            "name the others in `bodies`."
+            f"{type(system).__name__}: the body {skew[0]!r} rotates in its frame, but not about an axis of this frame. "
+            "Its moments of inertia there cannot be varied. Pass a frame that rotates with the body, or name only the "
+            "other bodies in `bodies`."
         )
     return RegressorModel(system, chosen, leaves)
 
 
 def _bodies_of(system: System) -> tuple[tuple[BodyParameters, ...], tuple[int, ...]]:
-    """The bodies with a mass, and the numbers of the leaves that the masses read."""
+    """The bodies with a mass, and the indices of the leaves on which the masses depend."""
     leaves, structure = jax.tree.flatten(system)
     motions: list[Motion] = []
 
-    def masses_and_spins(leaves: Any, t: Any, q: Any, u: Any) -> tuple[list[Any], list[Any]]:
+    def masses_and_spins(leaves: Any, t: Component, q: Numbers, u: Numbers) -> tuple[list[Any], list[Any]]:
         motion = DescriptionEvaluator(jax.tree.unflatten(structure, leaves)).motion(t, tuple(q), tuple(u))
         motions[:] = [motion]
         bodies = [body for body in motion.bodies if not is_zero(body.mass)]
@@ -179,30 +172,30 @@ def _at_random_speeds(f: Callable[..., Any], system: System, n_u: int) -> Any:
         return jax.device_get(jax.jit(f)(jax.tree.leaves(system), jnp.asarray(t, q.dtype), list(q), list(u)))
 
 
-SKEW = -1  # the axis of a body that turns about none of its frame's
+SKEW = -1  # the body rotates in its frame about an axis that is not one of the frame's axes
 
 
 def _axis(spin: np.ndarray) -> int | None:
-    """The axis of its frame about which an axisymmetric body spins there; None where it turns with its frame."""
+    """The axis of the frame about which an axisymmetric body spins. None if the body rotates with its frame."""
     turning = np.flatnonzero(np.abs(spin) > np.finfo(spin.dtype).eps ** 0.5 * max(1.0, float(np.abs(spin).max())))
     return None if not turning.size else int(turning[0]) if turning.size == 1 else SKEW
 
 
 class RegressorKinematics(NamedTuple):
-    """Of the points of b bodies, each in its body's frame."""
+    """Kinematics of the origins of b bodies. Components are in the frame of the body."""
 
-    V: Float[Array, "b 3 n"]
-    W: Float[Array, "b 3 n"]
+    V: Float[Array, "b 3 n"]  # partial velocities
+    W: Float[Array, "b 3 n"]  # partial angular velocities
     a: Float[Array, "b 3"]  # [m/s^2]
     alpha: Float[Array, "b 3"]
     omega: Float[Array, "b 3"]
-    g: Float[Array, "b 3"]  # weight by mass [m/s^2]
+    g: Float[Array, "b 3"]  # weight per mass [m/s^2]
 
 
 class _EvaluatedOrigins(EvaluatedDescription):
-    """As `EvaluatedDescription`, with the velocities of the bodies' origins in the place of momenta."""
+    """As `EvaluatedDescription`, with the velocities of the bodies' origins instead of the momenta."""
 
-    parts = ("rates", "configuration", "velocity_residuals", "velocities", "momenta", "frame_velocities")
+    quantities = ("rates", "configuration", "velocity_residuals", "velocities", "momenta", "frame_velocities")
 
     def __init__(self, evaluator: DescriptionEvaluator, bodies: tuple[BodyParameters, ...], *at: Any):
         super().__init__(evaluator, *at)
@@ -225,25 +218,27 @@ class _EvaluatedOrigins(EvaluatedDescription):
 
 
 @ScalarFunction
-def _parts_of_origins(model: RegressorModel, components: Any) -> dict[str, Any]:
+def _quantities_of_origins(model: RegressorModel, components: Any) -> dict[str, Any]:
     inputs, t, q, u = components
-    return _EvaluatedOrigins(DescriptionEvaluator(model.system, inputs), model.bodies, t, q, u).all_parts()
+    return _EvaluatedOrigins(DescriptionEvaluator(model.system, inputs), model.bodies, t, q, u).all_quantities()
 
 
 class _OriginKinematics(KaneEquations):
-    """Kane's equations at a state, whose velocities and momenta are those of the bodies' origins."""
+    """Kane's equations at a state. `velocities` and `momenta` return the velocities of the bodies' origins."""
 
-    def __init__(self, model: RegressorModel, t: Any, q: Any, u: Any, inputs: Any):
+    def __init__(self, model: RegressorModel, t: Component, q: Numbers, u: Numbers, inputs: Any):
         self.model = model
         super().__init__(model.system, t, q, u, inputs)
 
-    def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
-        return _parts_of_origins.replay(part, self.model, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
+    def read(self, quantity: str, t: Component, q: Row, u: Row) -> PyTree:
+        components = dict(self.inputs), t, tuple(q), tuple(u)
+        return _quantities_of_origins.replay(quantity, self.model, components, self._memory)
 
     def weights(self) -> list[tuple[Component, Row]]:
-        """How each body's mass changes with the parameters that it reads, and how the forces at its centre do.
+        """For each body, derivatives of the mass and of the forces at the mass centre, along a change of the mass.
 
-        A mass that is a number of the description is changed by itself: `weight` reads it off the body.
+        The change is made in the parameters on which the masses depend. A mass that does not depend on parameters is
+        changed in the `Body`, from which `weight` reads it.
         """
         leaves, structure = jax.tree.flatten(self.system)
         places, parameters = self.model.leaves, self.model.bodies
@@ -263,7 +258,7 @@ class _OriginKinematics(KaneEquations):
             return [(body.mass, _at_center(body, loads)) for body in bodies]
 
         primals = [*[leaves[i] for i in places], self._zero()]
-        # Each by another amount, so that no sum or difference of them stays as it is.
+        # Use a different tangent for each parameter, so that no sum or difference of them remains constant.
         tangents = [jnp.full_like(x, 1.0 + 0.1 * i) for i, x in enumerate(primals)]
         return jvp(masses_and_weights, primals, tangents)[1]
 
@@ -276,20 +271,24 @@ def _at_center(body: Body, loads: Sequence[Any]) -> Row:
     return force
 
 
+def _components_in(frame: Frame, own: Frame, x: Row) -> Row:
+    """The components in `frame` of a vector that is given by components in its `own` frame."""
+    return own.vector(*x).components_in(frame)
+
+
 @ScalarFunction
 def regressor_kinematics(model: RegressorModel, t, q, u, inputs, u_dot) -> RegressorKinematics:
-    """Of the bodies of a model, at accelerations `u_dot` (n,) of the independent speeds."""
+    """Kinematics of the bodies of a model, at accelerations `u_dot` (n,) of the independent speeds."""
     kane = _OriginKinematics(model, t, q, u, inputs)
     row = tuple(u_dot[i] for i in range(kane.n))
-    partials = kane.partials()
+    partials = kane.partial_velocities()
     rates = kane.momentum_rates((*row, *kane.dependent_accelerations(row)))
     omegas = [omega for _, omega in kane.momenta(kane.u_all)]
     motion = kane.motion(kane.t, kane.q, kane.u_all)
     V, W, a, alpha, g = [], [], [], [], []
     for i, (each, (dm, dF)) in enumerate(zip(model.bodies, kane.weights(), strict=True)):
         body = motion.bodies[each.place]
-        own = origin_of(body)[0].velocity.frame
-        into = lambda x, frame=own, body=body: frame.vector(*x).components_in(body.frame)  # noqa: E731
+        into = functools.partial(_components_in, body.frame, origin_of(body)[0].velocity.frame)
         V.append([into(bodies[i][0]) for bodies, _ in partials])
         W.append([bodies[i][1] for bodies, _ in partials])
         a.append(into(rates[i][0]))
@@ -307,27 +306,31 @@ def regressor_kinematics(model: RegressorModel, t, q, u, inputs, u_dot) -> Regre
 
 
 def regressor_columns(kinematics: RegressorKinematics, bodies: Sequence[BodyParameters]) -> Float[Array, "n p"]:
-    """The columns of all bodies' parameters, side by side.
+    """The columns of the parameters of all bodies, side by side.
 
-    Of the ten parameters of a body (m, m r, I) about its origin, with a less the weight by mass:
+    For the ten parameters (m, m r, I) of a body about its origin, where a is the acceleration minus the weight per
+    mass:
 
         F = m a + alpha x m r + omega x (omega x m r),   T = m r x a + I alpha + omega x I omega
     """
-    V, W, a, alpha, omega, g = kinematics
-    a = a - g
-    turn = _cross(omega)
-    of_moment = _cross(alpha) + turn @ turn
-    zero = jnp.zeros_like(of_moment)
-    F = jnp.concatenate([a[:, :, None], of_moment, zero, zero], axis=2)  # (b,3,10)
-    T = jnp.concatenate([jnp.zeros_like(a)[:, :, None], -_cross(a), _times(alpha) + turn @ _times(omega)], axis=2)
-    Y = jnp.swapaxes(V, 1, 2) @ F + jnp.swapaxes(W, 1, 2) @ T  # (b,n,10)
-    columns = [Y[i] @ jnp.asarray(body.basis, Y.dtype) for i, body in enumerate(bodies)]
-    return jnp.concatenate([jnp.zeros((V.shape[2], 0), Y.dtype), *columns], axis=1)
+    # By default, JAX multiplies float32 matrices on NVIDIA GPUs with mantissas of 10 bits (TF32): relative errors of
+    # 3e-4 were measured on an H100.
+    with jax.default_matmul_precision("highest"):
+        V, W, a, alpha, omega, g = kinematics
+        a = a - g
+        turn = _cross(omega)
+        of_moment = _cross(alpha) + turn @ turn
+        zero = jnp.zeros_like(of_moment)
+        F = jnp.concatenate([a[:, :, None], of_moment, zero, zero], axis=2)  # (b,3,10)
+        T = jnp.concatenate([jnp.zeros_like(a)[:, :, None], -_cross(a), _times(alpha) + turn @ _times(omega)], axis=2)
+        Y = jnp.swapaxes(V, 1, 2) @ F + jnp.swapaxes(W, 1, 2) @ T  # (b,n,10)
+        columns = [Y[i] @ jnp.asarray(body.basis, Y.dtype) for i, body in enumerate(bodies)]
+        return jnp.concatenate([jnp.zeros((V.shape[2], 0), Y.dtype), *columns], axis=1)
 
 
 @ScalarFunction
 def parameter_values(model: RegressorModel, t, q, u) -> Float[Array, " p"]:
-    """The parameters of the bodies, in the order of the columns; they are the same at all times, `u` (n + k,)."""
+    """The parameters of the bodies, in the order of the columns. They do not depend on time. `u` has shape (n + k,)."""
     rows = [tuple(x[i] for i in range(x.shape[0])) for x in (q, u)]
     motion = DescriptionEvaluator(model.system).motion(t, *rows)
     values = [_ten(motion.bodies[each.place])[i] for each in model.bodies for i in each.indices]
@@ -335,7 +338,7 @@ def parameter_values(model: RegressorModel, t, q, u) -> Float[Array, " p"]:
 
 
 def _ten(body: Body) -> Row:
-    """The ten parameters of a body, about the point that it was built from."""
+    """The ten parameters of a body, about its origin."""
     m, r = body.mass, ZERO3
     for step in origin_of(body)[1]:
         r = add3(r, step.components_in(body.frame))
@@ -351,7 +354,7 @@ def _cross(x: Float[Array, "b 3"]) -> Float[Array, "b 3 3"]:
 
 
 def _times(x: Float[Array, "b 3"]) -> Float[Array, "b 3 6"]:
-    """The matrix that takes (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) to I x."""
+    """The matrix that maps (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) to I x."""
     zero = jnp.zeros_like(x[:, 0])
     a, b, c = x[:, 0], x[:, 1], x[:, 2]
     rows = [a, zero, zero, b, c, zero, zero, b, zero, a, zero, c, zero, zero, c, zero, a, b]
@@ -360,9 +363,9 @@ def _times(x: Float[Array, "b 3"]) -> Float[Array, "b 3 6"]:
 
 @ScalarFunction
 def unbalanced(system: System, t, q, u, inputs, u_dot) -> Float[Array, " n"]:
-    """-(F_r + F*_r) (n,) at accelerations `u_dot`: zero in the motion."""
+    """-(F_r + F*_r) (n,) at accelerations `u_dot`. It is zero at the accelerations of the motion."""
     kane = KaneEquations(system, t, q, u, inputs)
     row = tuple(u_dot[i] for i in range(kane.n))
-    partials = kane.partials()
+    partials = kane.partial_velocities()
     inertia = kane.inertia_forces(partials, (*row, *kane.dependent_accelerations(row)))
     return as_vector([mul(-1.0, add(x, F)) for x, F in zip(inertia, kane.active_forces(partials), strict=True)], q)

@@ -1,1 +1,2 @@
-"""Programs of scalars: exact zeros, one operation of a whole program, native kernels. Knows no mechanics."""
+"""Programs of scalars: exact zeros, a whole program as one operation of JAX, native kernels. Independent of
+mechanics."""

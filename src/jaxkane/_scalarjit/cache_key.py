@@ -1,96 +1,44 @@
-"""What is noticed when code or data change: a program is traced again where its cache key differs, and nowhere else.
+"""Cache keys of programs. A program is traced again if its key differs, and only then.
 
-1. A key is the structure, shapes and dtypes of the arguments, with all that is static in them;
-2. the settings of JAX on which a trace depends: precision, promotion, checks for NaN;
-3. and a digest of what the code in the arguments reads: globals, closures, defaults, attributes of classes, of objects
-   and of modules, lists, dicts and arrays among these, modules that it imports, and the functions that it calls.
-4. A look costs some microseconds; the digest is formed anew only where a look sees another value.
-5. A value that comes back finds its program again. Mutations made while tracing do not invalidate the trace.
-6. Not noticed: the environment, files, objects of libraries and C extensions, names put together for `getattr`,
-7. arrays above a megabyte that are changed in place, the inside of what holds more than 20 000 objects,
-8. and what a function read that was compiled by `jax.jit` outside of this library.
-9. For these there is `jk.forget()`. Better: make a parameter of what changes, and nothing is compiled again.
-10. Keys and programs are kept in `Cache`: a bounded number, shared by threads, and no arguments.
+A key contains
+
+1. the structure, shapes and dtypes of the arguments, and their static values,
+2. the settings of JAX on which a trace depends: precision, promotion, checks for NaN,
+3. a digest of the values that the code in the arguments uses (`captured_values`; see `docs/caching.md`).
+
+A check takes some microseconds. The digest is computed again only if a value has changed. If a value changes back, the
+earlier program is used again. Mutations during tracing do not invalidate the trace. Programs are kept in `Cache`,
+without the arguments. They are freed with the functions and controllers of the trace, or as the least recently used.
 """
 
 from __future__ import annotations
 
-import collections
 import contextlib
 import dataclasses
 import functools
-import gc
 import itertools
 import threading
+import types
 import weakref
 from collections.abc import Callable, Hashable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
+from .cache import Cache, owners_of
 from .captured_values import NUMBERS, CapturedValues, is_of_library
-from .compat import Tracer, is_under_way, settings
+from .compat import Tracer, filter_jit_uncached, is_under_way, settings, storable_checks
 
-_MISSING = object()
 _count = itertools.count()
 _forgotten = b"0"
-
-
-class Cache:
-    """Results by key, of which those go first that were used least recently. `forget` empties every cache."""
-
-    _all: weakref.WeakSet[Cache] = weakref.WeakSet()
-    _all_lock = threading.Lock()
-
-    def __init__(self, size: int = 256) -> None:
-        self.size = size
-        self._results: collections.OrderedDict[Hashable, Any] = collections.OrderedDict()
-        self._lock = threading.RLock()  # a key may compare by code that asks a cache
-        with Cache._all_lock:
-            Cache._all.add(self)
-
-    def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """The result of a key; the first time it is made, and kept unless that fails."""
-        result = self.known(key)
-        return self.keep(key, make()) if result is _MISSING else result
-
-    def known(self, key: Hashable, default: Any = _MISSING) -> Any:
-        with self._lock:
-            if key not in self._results:
-                return default
-            self._results.move_to_end(key)
-            return self._results[key]
-
-    def keep(self, key: Hashable, result: Any) -> Any:
-        with self._lock:
-            self._results[key] = result
-            self._results.move_to_end(key)
-            if len(self._results) > self.size:
-                self._results.popitem(last=False)
-        return result
-
-    def __len__(self) -> int:
-        return len(self._results)
-
-    def clear(self) -> None:
-        with self._lock:
-            self._results.clear()
-
-    @classmethod
-    def clear_all(cls) -> None:
-        with cls._all_lock:
-            caches = list(cls._all)
-        for cache in caches:
-            cache.clear()
-
-
-_captured = Cache()  # by the identity of the root, which its entry keeps alive
+_captured = Cache()  # by the identity of the root
 
 
 class _Tracing(threading.local):
-    """What is being traced in this thread: a trace belongs to the values that were captured when it began."""
+    """The values that were captured at the start of the current traces of this thread."""
 
     def __init__(self) -> None:
         self.captured: dict[int, CapturedValues] = {}
@@ -103,12 +51,21 @@ def _captured_by(root: Any) -> CapturedValues:
     values = _tracing.captured.get(id(root))
     if values is not None:
         return values
-    values = _captured.known(id(root), None)
-    if values is None or values.root is not root or not values.unchanged():
+    values = _stored(root)
+    if values is None or not values.unchanged(root):
         values = CapturedValues(root)
-        if not values.tracers:
-            _captured.keep(id(root), values)
+        _store(root, values)
     return values
+
+
+def _stored(root: Any) -> CapturedValues | None:
+    return _captured.known(id(root), (None, None))[0]
+
+
+def _store(root: Any, values: CapturedValues) -> None:
+    if not values.tracers:
+        owners = owners_of(root)
+        _captured.keep(id(root), (values, None if owners else root), owners)
 
 
 _nothing_to_read: set[type] = {*NUMBERS, np.ndarray, np.dtype}
@@ -120,9 +77,9 @@ def _roots(value: Any, roots: list[Any]) -> list[Any]:
     parts: Any = ()
     is_tree = True
     if isinstance(value, eqx.Module):
-        # Its numbers are arguments of the program, and what is static in it is compared with them.
+        # Its arrays are arguments of the program, and its static fields are compared with them.
         parts = vars(value).values()
-    elif isinstance(value, (jax.Array, np.generic)):  # a tracer too
+    elif isinstance(value, (jax.Array, np.generic)):  # also tracers
         _nothing_to_read.add(kind)
     elif isinstance(value, jax.tree_util.Partial):
         parts = value.func, value.args, value.keywords
@@ -135,7 +92,10 @@ def _roots(value: Any, roots: list[Any]) -> list[Any]:
         parts = own.values() if own else jax.tree.leaves(value, is_leaf=lambda x: x is not value)
     else:
         is_tree = False
-        if isinstance(value, type) or callable(value) or dataclasses.is_dataclass(value) or not is_of_library(kind):
+        if isinstance(value, types.MethodType):
+            # Each access makes a new method object, so its function and its object identify it.
+            parts = value.__func__, value.__self__
+        elif isinstance(value, type) or callable(value) or dataclasses.is_dataclass(value) or not is_of_library(kind):
             roots.append(value)
     if is_tree and not is_of_library(kind):
         roots.append(kind)
@@ -146,12 +106,12 @@ def _roots(value: Any, roots: list[Any]) -> list[Any]:
 
 
 def version_of(*values: Any) -> bytes:
-    """A digest of all that the code in these values reads at this moment, for the key of a program."""
+    """A digest of all values that the code in these values reads at this moment, for the key of a program."""
     return b"".join([_forgotten, *[_captured_by(root).version for root in _roots(values, [])]])
 
 
 def captured_tracers(*values: Any) -> tuple[Tracer, ...]:
-    """The numbers under a trace that is under way which code in these values reads from outside: by a closure."""
+    """The tracers of unfinished traces that code in these values reads from outside, by a closure."""
     tracers = {id(x): x for root in _roots(values, []) for x in _captured_by(root).tracers}
     return tuple(filter(is_under_way, tracers.values()))
 
@@ -162,7 +122,7 @@ def captures_any(kind: type, *values: Any) -> bool:
 
 
 class CacheKey(NamedTuple):
-    """On what a program depends that is traced of some arguments."""
+    """Everything on which a traced program depends, except the numbers in its arguments."""
 
     structure: Any
     types: tuple[Any, ...]
@@ -171,23 +131,25 @@ class CacheKey(NamedTuple):
 
 
 def key_of(*args: Any) -> tuple[list[Any], CacheKey]:
-    """The numbers of the arguments, and the key under which what is traced of them is kept."""
+    """The arrays of the arguments, and the key under which their programs are stored."""
     leaves, structure = jax.tree.flatten(args)
-    return leaves, CacheKey(structure, tuple(map(jax.typeof, leaves)), version_of(*args), settings())
+    # Not `jax.typeof`: it also looks up the sharding, on which no program here depends. 1 us for each parameter.
+    types = tuple([x.aval if isinstance(x, jax.Array) else jax.typeof(x) for x in leaves])
+    return leaves, CacheKey(structure, types, version_of(*args), settings())
 
 
 def leaked_tracer(label: str) -> TypeError:
-    """The error where a function returns what it made in an earlier call, of other numbers."""
+    """The exception if a function returns a value that it made in an earlier call, from other numbers."""
     return TypeError(
-        f"{label}: its description returns what it has kept from an earlier call (in a global, an attribute or a "
-        "cache): a motion, a frame, a point or a number that belongs to other coordinates. Make all that follows from "
-        "t, q, u and the parameters anew in every call."
+        f"{label}: its description returns a motion, a frame, a point or a number of an earlier call, which it has "
+        "stored in a global, an attribute or a cache. It belongs to other coordinates. Compute everything that depends "
+        "on t, q, u and the parameters again in every call."
     )
 
 
 @contextlib.contextmanager
 def explain_leaked_tracer(label: str) -> Iterator[None]:
-    """Where JAX meets a number of another trace, the error says what that comes from."""
+    """Replace JAX's exception for a tracer of another trace by one that names the cause."""
     try:
         yield
     except jax.errors.UnexpectedTracerError as error:
@@ -195,89 +157,96 @@ def explain_leaked_tracer(label: str) -> Iterator[None]:
 
 
 def trace_with_snapshot(f: Callable[..., Any]) -> Callable[..., Any]:
-    """`f`, to be traced: mutations that it makes itself in what it reads (a counter, a list) are no change."""
+    """`f`, to be traced: its own changes of values that it reads (a counter, a list) do not count as changes."""
 
     @functools.wraps(f)
     def call(*args: Any, **kwargs: Any) -> Any:
-        before = [_captured_by(root) for root in _roots((args, kwargs), [])]
+        before = [(root, _captured_by(root)) for root in _roots((args, kwargs), [])]
         outer = _tracing.captured
-        _tracing.captured = {id(values.root): values for values in before} | outer
+        _tracing.captured = {id(root): values for root, values in before} | outer
         try:
-            with _uncollected():
+            with storable_checks():
                 result = f(*args, **kwargs)
         finally:
             _tracing.captured = outer
-        for values in before:
-            stored = _captured.known(id(values.root), None)
-            if stored is not None and stored.version == values.version and not stored.unchanged():
-                after = CapturedValues(values.root)
+        for root, values in before:
+            stored = _stored(root)
+            if stored is not None and stored.version == values.version and not stored.unchanged(root):
+                after = CapturedValues(root)
                 after.version = values.version
-                if not after.tracers:
-                    _captured.keep(id(values.root), after)
+                _store(root, after)
         return result
 
     return call
 
 
-@contextlib.contextmanager
-def _uncollected() -> Iterator[None]:
-    """Python's search for cycles of garbage waits: a trace makes a hundred thousand objects that stay, and to look
-    through them again and again takes a tenth of a first call."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
+class _Compiled:
+    """One program of a function, compiled by `eqx.filter_jit`.
 
-
-def with_room(f: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """`f(*args, **kwargs)`, with memory for the frames of some ten thousand calls of Python.
-
-    Python takes such memory from the system in pieces of 16 kB, and gives one back when the call returns that needed
-    it first: a loop that calls from near the end of a piece has memory mapped and unmapped in each turn. As deep as
-    JAX traces, that took an eighth of a first derivative. The frame of this function needs a large piece, of which it
-    leaves the half to others.
+    JAX's caches keep a compiled function and its static arguments longer than its program. Therefore the compiled
+    function refers to this object only by a weak reference, and has arrays as its only arguments.
     """
-    return f(*args, **kwargs)
+
+    def __init__(self, f: Callable[..., Any], structure: Any, fixed: list[Callable[[], Any] | None]) -> None:
+        self.f, self.structure, self.fixed = f, structure, fixed
+        itself = weakref.ref(self)
+
+        def run(arrays: list[Any]) -> PyTree:
+            return cast(_Compiled, itself()).traced(arrays)
+
+        run.__name__, run.__qualname__ = f.__name__, f.__qualname__  # the name of programs that are stored on disk
+        self.run = filter_jit_uncached(run)
+
+    def traced(self, arrays: list[Any]) -> PyTree:
+        remaining = iter(arrays)
+        args, kwargs = jax.tree.unflatten(self.structure, [next(remaining) if x is None else x() for x in self.fixed])
+        return trace_with_snapshot(self.f)(*args, **kwargs)
 
 
-with_room.__code__ = with_room.__code__.replace(co_stacksize=1 << 18)
+def _static(x: Any) -> tuple[Hashable, Callable[[], Any], list[Any]]:
+    """For a static leaf of the arguments: its part of the key, a function that returns it, and its owners. Programs are
+    freed with their owners."""
+    if isinstance(x, types.MethodType) and owners_of(x.__self__):
+        return (id(x.__self__), id(x.__func__)), weakref.WeakMethod(x), [x.__self__, x.__func__]
+    if type(x).__hash__ in (object.__hash__, None):  # None: a dataclass that is not frozen
+        owners = owners_of(x)
+        return id(x), weakref.ref(x) if owners else lambda: x, owners
+    return (type(x), x), lambda: x, []
 
 
 def jit(f: Callable[..., Any]) -> Callable[..., Any]:
-    """`equinox.filter_jit(f)` with one more static argument, `version_of` the others.
-
-    How often it was traced, tests ask of its attribute `jitted`.
-    """
-
-    def run(version: bytes, args: Any, kwargs: Any) -> Any:
-        return trace_with_snapshot(f)(*args, **kwargs)
-
-    run.__name__, run.__qualname__ = f.__name__, f.__qualname__  # under which programs are kept on disk
-    jitted = eqx.filter_jit(run)
+    """`equinox.filter_jit(f)` with a program for each key (see above), in the `Cache` that is its attribute
+    `programs`."""
+    programs = Cache(programs=True)
 
     @functools.wraps(f)
     def call(*args: Any, **kwargs: Any) -> Any:
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        arrays = [x for x in leaves if eqx.is_array(x)]
+        static = [None if eqx.is_array(x) else _static(x) for x in leaves]
+        names, types_of_arrays = tuple(x and x[0] for x in static), tuple(map(jax.typeof, arrays))
+        key = (structure, names, types_of_arrays, version_of(args, kwargs), settings())
+        owners = [owner for x in static if x for owner in x[2]]
+        program = programs.get(key, lambda: _Compiled(f, structure, [x and x[1] for x in static]), owners)
         with explain_leaked_tracer(type(args[0]).__name__ if args else f.__name__):
-            return with_room(jitted, version_of(args, kwargs), args, kwargs)
+            return program.run(arrays)
 
-    vars(call)["jitted"] = jitted
+    vars(call)["programs"] = programs
     return call
 
 
 def forget() -> None:
-    """Forget every compiled program, so that all is read and traced again at the next call.
+    """Free every compiled program, so that everything is traced again at the next call.
 
-        constants_of_a_library.gravity = 1.62  # nobody is told
+        constants_of_a_library.gravity = 1.62  # is not detected
         jk.forget()
 
-    Changes of what a description, an input or a controller reads are noticed without it: see the page "What is
-    noticed". It is for what cannot be seen, and for functions that you compiled yourself with `jax.jit`: their
-    programs are thrown away too (`jax.clear_caches`).
+    Most changes of values that a system, an input or a controller uses are detected automatically. The page
+    "Recompilation and caching" lists them. The programs of functions that you compiled with `jax.jit` are freed too
+    (`jax.clear_caches`).
     """
     global _forgotten
     _forgotten = b"%d" % next(_count)
-    Cache.clear_all()
+    for cache in Cache.all():
+        cache.clear()
     jax.clear_caches()

@@ -1,20 +1,21 @@
-"""All that this library uses of JAX and equinox beyond what they promise. Knows no programs and no mechanics.
+"""Everything that this library uses of JAX and equinox beyond their public API. Independent of programs and mechanics.
 
-Each has a way back, so that where a release takes it away, results stay right and only speed, or a convenience, goes:
+Each feature has a fallback. If a release removes a feature, results stay right; only speed or a convenience is lost:
 
-| what | without it |
+| feature | without it |
 |---|---|
-| jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `MISSING` says why; right-hand sides are plain JAX |
-| the frontend attribute that makes one function of a program | XLA cuts the program as it does any other |
-| tracers of a derivative in forward mode | such a derivative must be announced by `adjoint="forward"` |
-| the state of traces | motions are compiled for derivatives that nobody can take, a tenth slower at first |
-| `reset_cache`, equinox's switch of its checks | programs are kept only where the environment says so from the start |
-| `eval_context` | a sweep on a cluster may be refused, since programs that were first traced in a check differ |
-| whether JAX has started | a flag that repairs two releases may come too late, and nobody is told |
-| `process_allgather` | none: a fit by several processes raises ImportError |
+| jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `MISSING` states the reason; right-hand sides are plain JAX
+|
+| the frontend attribute that makes one function of a program | XLA splits the program as any other |
+| tracers of a derivative in forward mode | forward mode needs `adjoint="forward"` |
+| the state of traces | simulations are compiled with derivatives that are not needed, a tenth slower at first |
+| `_filter_jit_cache` of equinox | compiled programs are never freed |
+| `reset_cache`, equinox's setting for its checks | programs are stored only if the environment sets it from the start |
+| `eval_context` | a sweep on a cluster may be refused, because programs that were first traced in a check differ |
+| whether JAX has started | a flag that repairs two releases may come too late, without a warning |
 
-Jaxprs are read in this room alone: equation by equation by `interpret`, and by `jaxpr`, `graph` and `digest`.
-`tests/scalarjit/test_compat.py` names what has gone.
+Jaxprs are read in this folder only: by `interpret` equation by equation, and by `jaxpr`, `graph` and `digest`.
+`tests/scalarjit/test_compat.py` names features that are missing.
 """
 
 from __future__ import annotations
@@ -23,15 +24,18 @@ import contextlib
 import functools
 import importlib
 import os
+import sys
+import threading
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
+import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer as Tracer
 
-MISSING: str | None = None  # what this JAX lacks, without which there are no scalar programs
+MISSING: str | None = None  # what this JAX lacks; scalar programs are then not possible
 try:
     from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, Var, jaxpr_as_fun
     from jax.interpreters import ad, batching, mlir
@@ -40,10 +44,10 @@ try:
 
     _ = Jaxpr.replace, Jaxpr.eqns, Jaxpr.invars, Jaxpr.constvars, Jaxpr.outvars
     _ = JaxprEqn.replace, JaxprEqn.primitive, JaxprEqn.params, JaxprEqn.invars, JaxprEqn.outvars, JaxprEqn.effects
-    _ = ad.primitive_jvps, ad.primitive_transposes, ad.UndefinedPrimal, ad.Zero
+    _ = ad.primitive_jvps, ad.primitive_transposes, ad.Zero
     _ = ClosedJaxpr.jaxpr, ClosedJaxpr.consts, ClosedJaxpr.in_avals, ClosedJaxpr.out_avals, Primitive.get_bind_params
 except (ImportError, AttributeError) as error:
-    MISSING = f"this JAX lacks what that needs ({error})"
+    MISSING = f"this version of JAX does not have the required functions ({error})"
     missing: Any = None
     ClosedJaxpr = Jaxpr = Primitive = Var = missing
     custom_partial_eval_rules = jaxpr_as_fun = dce_jaxpr = missing
@@ -55,12 +59,12 @@ NO_FUSIONS = "--xla_cpu_experimental_ynn_fusion_type"
 
 
 def switch_off_wrong_fusions() -> None:
-    """Repair two releases of JAX by a flag of XLA, which it reads when it starts.
+    """Repair two releases of JAX by a flag of XLA, which is read when XLA starts.
 
-    On a CPU 0.10.2, the last for Python 3.11, gives products of matrices that are wrong by up to 0.8 % in batches of
-    more than 16 384 (jax issue 39103); it and 0.11.0 end the process on some programs (39257).
+    On a CPU, 0.10.2 (the last for Python 3.11) returns matrix products that are wrong by up to 0.8 % in batches of more
+    than 16 384 (jax issue 39103). It and 0.11.0 terminate the process on some programs (39257).
 
-    **Warns:** where JAX has started already.
+    **Warns:** if JAX has started already.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if jax.__version_info__ not in WRONG_FUSIONS or NO_FUSIONS in flags:
@@ -73,16 +77,23 @@ def switch_off_wrong_fusions() -> None:
         has_started = False
     if has_started:
         warnings.warn(
-            f"JAX {jax.__version__} has started, which may give wrong products of matrices in batches of more than "
-            "16 384 on a CPU (jax issue 39103). Import jaxkane before anything is computed, or set XLA_FLAGS to "
-            f'"{NO_FUSIONS}=" in the environment; or use JAX 0.12, on Python 3.12 or later.',
+            f"JAX {jax.__version__} has started. On a CPU, it may compute wrong matrix products in batches of more "
+            "than 16 384 (jax issue 39103). Import jaxkane before anything is computed, or set XLA_FLAGS to "
+            f'"{NO_FUSIONS}=" in the environment, or use JAX 0.12 on Python 3.12 or later.',
             stacklevel=3,
         )
     else:
         os.environ["XLA_FLAGS"] = f"{flags} {NO_FUSIONS}=".strip()
 
 
-def is_literal(v: Any) -> bool:
+Variable: TypeAlias = Any
+"""A variable of a jaxpr, or a literal, which has a number `val`."""
+
+Equation: TypeAlias = Any
+"""An equation of a jaxpr (`jax.extend.core.JaxprEqn`). JAX does not promise its attributes."""
+
+
+def is_literal(v: Variable) -> bool:
     """Whether a variable of a jaxpr is a number, `v.val`."""
     return hasattr(v, "val")
 
@@ -93,20 +104,33 @@ def interpret(
     rule: Callable[[Any, list[Any]], Iterable[Any]],
     constant: Callable[[Any, Any], Any] = lambda v, x: x,
 ) -> list[Any]:
-    """The outputs of a program whose equations have the results `rule(equation, inputs)`. `constant(v, x)` stands for
-    an array x that it holds, of the variable v, and for a number that is written in it, of the literal v."""
+    """Evaluate a program with other rules.
+
+    **Arguments:**
+
+    - `program`: a closed jaxpr.
+    - `inputs`: the values of its inputs.
+    - `rule`: (equation, inputs) -> the results of an equation.
+    - `constant`: (v, x) -> the value of an array x that the program contains, for the variable v; or of a number, for
+        the literal v.
+
+    **Returns:** the values of its outputs.
+    """
     jaxpr = program.jaxpr
     values = dict(zip(jaxpr.invars, inputs, strict=True))
     values.update(zip(jaxpr.constvars, map(constant, jaxpr.constvars, program.consts), strict=True))
-    read = lambda v: constant(v, v.val) if is_literal(v) else values[v]  # noqa: E731
+
+    def read(v: Variable) -> Any:
+        return constant(v, v.val) if is_literal(v) else values[v]
+
     for equation in jaxpr.eqns:
         values.update(zip(equation.outvars, rule(equation, [*map(read, equation.invars)]), strict=True))
     return [*map(read, jaxpr.outvars)]
 
 
 class Operation(NamedTuple):
-    """What an equation does: the name of its primitive, that of the function it calls, the number of its results, and
-    whether it does nothing besides."""
+    """The operation of an equation: the name of its primitive, the name of the function that it calls, the number of
+    its results, and whether it is free of side effects."""
 
     name: str
     function: str
@@ -114,20 +138,20 @@ class Operation(NamedTuple):
     is_pure: bool
 
 
-def operation_of(equation: Any) -> Operation:
+def operation_of(equation: Equation) -> Operation:
     name = str(equation.params.get("name", ""))
     return Operation(equation.primitive.name, name, len(equation.outvars), not equation.effects)
 
 
-def evaluated(equation: Any, inputs: Sequence[Any]) -> Sequence[Any]:
-    """The results of an equation at other inputs; with its own rules for derivatives, where it has some."""
+def evaluated(equation: Equation, inputs: Sequence[Any]) -> Sequence[Any]:
+    """The results of an equation at other inputs, with its own rules for derivatives if it has any."""
     primitive = equation.primitive
     results = primitive.bind(*inputs, **primitive.get_bind_params(equation.params))
     return results if primitive.multiple_results else [results]
 
 
-def tangents_of(equation: Any, inputs: Sequence[Any], tangents: Sequence[Any]) -> Sequence[Any]:
-    """The tangents of the results of an equation, of those of its inputs. What is None is zero."""
+def tangents_of(equation: Equation, inputs: Sequence[Any], tangents: Sequence[Any]) -> Sequence[Any]:
+    """The tangents of the results of an equation, from those of its inputs. None means zero."""
     primitive = equation.primitive
     if primitive in ad.primitive_jvps:
         dxs = [no_tangent(v.aval) if dx is None else dx for v, dx in zip(equation.invars, tangents, strict=True)]
@@ -135,56 +159,42 @@ def tangents_of(equation: Any, inputs: Sequence[Any], tangents: Sequence[Any]) -
         return [None if is_no_tangent(dy) else dy for dy in (dys if primitive.multiple_results else [dys])]
     places = [i for i, dx in enumerate(tangents) if dx is not None]
 
-    def of_moving(*ys: Any) -> Sequence[Any]:
+    def of_differentiated(*ys: Any) -> Sequence[Any]:
         values = dict(zip(places, ys, strict=True))
         return evaluated(equation, [values.get(i, x) for i, x in enumerate(inputs)])
 
-    dys = jax.jvp(of_moving, [inputs[i] for i in places], [tangents[i] for i in places])[1]
+    dys = jax.jvp(of_differentiated, [inputs[i] for i in places], [tangents[i] for i in places])[1]
     return [dy if jax.numpy.issubdtype(v.aval.dtype, np.inexact) else None for v, dy in zip(equation.outvars, dys)]
 
 
-def transposed(equation: Any, inputs: Sequence[Any], moves: Sequence[bool], cotangents: Sequence[Any]) -> Sequence[Any]:
-    """The cotangents, by input, of an equation that is linear in those of its inputs that move, of the cotangents of
-    its results. What is None is zero. Inputs that move have no values."""
-    primitive, xs = equation.primitive, list(inputs)
-    cts = [ad.Zero(v.aval) if ct is None else ct for v, ct in zip(equation.outvars, cotangents, strict=True)]
-    if primitive in ad.primitive_transposes:
-        for i, v in enumerate(equation.invars):
-            xs[i] = ad.UndefinedPrimal(v.aval) if moves[i] else xs[i]
-        rule, of_results = ad.primitive_transposes[primitive], cts if primitive.multiple_results else cts[0]
-        results = rule(of_results, *xs, **equation.params)
-        return [None if is_no_tangent(ct) else ct for ct in results]
-    places = [i for i, is_one in enumerate(moves) if is_one]
-
-    def linear(*ys: Any) -> Sequence[Any]:
-        values = dict(zip(places, ys, strict=True))
-        return evaluated(equation, [values.get(i, x) for i, x in enumerate(xs)])
-
-    specs = [jax.ShapeDtypeStruct(equation.invars[i].aval.shape, equation.invars[i].aval.dtype) for i in places]
-    of_places = jax.linear_transpose(linear, *specs)([*map(instantiate_zeros, cts)])
-    by_place = dict(zip(places, of_places, strict=True))
-    return [by_place.get(i) for i in range(len(xs))]
-
-
-def programs_in(equation: Any) -> list[Any]:
+def programs_in(equation: Equation) -> list[Any]:
     """The programs that an equation runs."""
     values = [x for p in equation.params.values() for x in (p if isinstance(p, (tuple, list)) else [p])]
     programs = [x for x in values if isinstance(x, (ClosedJaxpr, Jaxpr))]
     return [x if isinstance(x, ClosedJaxpr) else ClosedJaxpr(x, ()) for x in programs]
 
 
-def depends_on(program: Any, inputs: Iterable[int]) -> list[bool]:
-    """Which outputs of a program follow from any of the inputs at these places."""
+def dependencies(program: Any) -> list[frozenset[int]]:
+    """For each output of a program, the indices of the inputs on which it depends."""
     jaxpr = program.jaxpr
-    moved = {jaxpr.invars[i] for i in inputs}
+    places = {v: frozenset([i]) for i, v in enumerate(jaxpr.invars)}
+    none = frozenset[int]()
+
+    def read(v: Variable) -> frozenset[int]:
+        return none if is_literal(v) else places.get(v, none)
+
     for equation in jaxpr.eqns:
-        if any(not is_literal(v) and v in moved for v in equation.invars):
-            moved.update(equation.outvars)
-    return [not is_literal(v) and v in moved for v in jaxpr.outvars]
+        places.update(dict.fromkeys(equation.outvars, none.union(*map(read, equation.invars))))
+    return [*map(read, jaxpr.outvars)]
+
+
+def depends_on(program: Any, inputs: Iterable[int]) -> list[bool]:
+    """Which outputs of a program depend on any of the inputs with these indices."""
+    return [not places.isdisjoint(inputs) for places in dependencies(program)]
 
 
 def types_of(program: Any) -> tuple[list[Any], list[Any]]:
-    """Shapes and dtypes of what a program takes and gives; JAX 0.12 declares them as types without either."""
+    """Shapes and dtypes of a program's inputs and outputs. JAX 0.12 declares some types without either."""
     return [*program.in_avals], [*program.out_avals]
 
 
@@ -199,10 +209,15 @@ def new_primitive(
     traced: Callable[..., Any],
     lower_on_cpu: Callable[..., Any],
     traced_on_gpu: Callable[..., Any] | None = None,
-    parts: Callable[..., Any] | None = None,
+    separate_calls: Callable[..., Any] | None = None,
 ) -> Any:
-    """An operation of JAX with several results and these rules; `traced` is what it stands for, `lower_on_cpu` makes
-    its text for XLA there. `traced_on_gpu`: what it stands for under CUDA; `parts`: see `_partially_evaluated`."""
+    """A primitive of JAX with several results and these rules.
+
+    - `traced`: the function that the primitive represents.
+    - `lower_on_cpu`: makes its text for XLA on a CPU.
+    - `traced_on_gpu`: the function that it represents under CUDA.
+    - `separate_calls`: see `_partially_evaluated`.
+    """
     primitive = Primitive(name)
     primitive.multiple_results = True
     primitive.def_impl(evaluate)
@@ -214,27 +229,31 @@ def new_primitive(
     mlir.register_lowering(primitive, lower_on_cpu, platform="cpu")
     if traced_on_gpu is not None:
         mlir.register_lowering(primitive, mlir.lower_fun(traced_on_gpu, multiple_results=True), platform="cuda")
-    if parts is not None:
-        custom_partial_eval_rules[primitive] = functools.partial(_partially_evaluated, primitive, parts)
+    if separate_calls is not None:
+        custom_partial_eval_rules[primitive] = functools.partial(_partially_evaluated, primitive, separate_calls)
     return primitive
 
 
 def _partially_evaluated(
-    primitive: Any, parts: Callable[..., Any], trace: Any, *inputs: Any, **params: Any
+    primitive: Any, separate_calls: Callable[..., Any], trace: Any, *inputs: Any, **params: Any
 ) -> Sequence[Any]:
-    """Where JAX computes what is known and keeps the rest for later: each of the `parts` of an operation by itself, of
-    which one may be known. Of the parameters, `parts` gives how many of the inputs each has, and its parameters."""
-    each = [trace.default_process_primitive(primitive, inputs[:n], part) for n, part in parts(**params)]
+    """The rule of JAX's partial evaluation, which computes known values at once and keeps the others for later.
+
+    `separate_calls` maps the parameters of a call to the calls of which it consists: for each, the number of its inputs
+    and its parameters. Each is bound separately, because its inputs may all be known.
+    """
+    calls = separate_calls(**params)
+    each = [trace.default_process_primitive(primitive, inputs[:n], parameters) for n, parameters in calls]
     return [x for results in each for x in results]
 
 
-def new_variable(like: Any) -> Any:
-    """A variable of a jaxpr, of the same type as another; they are told apart by identity."""
+def new_variable(like: Variable) -> Variable:
+    """A variable of a jaxpr with the type of another one. Variables are distinguished by identity."""
     return Var(like.aval)
 
 
 def is_moved_forward(x: Any) -> bool:
-    """Whether a derivative in forward mode (`jax.jvp`, `jax.jacfwd`) is under way by `x` that nobody will transpose."""
+    """Whether `x` is being differentiated in forward mode (`jax.jvp`, `jax.jacfwd`) and will not be transposed."""
     try:
         from jax.interpreters.ad import JVPTracer
         from jax.interpreters.partial_eval import JaxprTracer
@@ -246,12 +265,12 @@ def is_moved_forward(x: Any) -> bool:
 
 
 def is_moved_forward_below(x: Any) -> bool:
-    """Whether a derivative of `x` is under way, and one in forward mode of that: `jax.hessian`."""
+    """Whether `x` is being differentiated, and this derivative in forward mode again: `jax.hessian`."""
     return is_moved_forward(getattr(x, "primal", None))
 
 
 def is_under_way(x: Tracer) -> bool:
-    """Whether the trace of a number has not ended yet: one that has ended refuses every operation."""
+    """Whether the trace of a tracer is not finished. After its end every operation raises an exception."""
     try:
         jax.numpy.isfinite(x)
     except jax.errors.UnexpectedTracerError:
@@ -260,22 +279,22 @@ def is_under_way(x: Tracer) -> bool:
 
 
 def as_lowering(f: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of JAX, with several results, as a rule that makes text for XLA."""
+    """A JAX function with several results as a lowering rule."""
     return mlir.lower_fun(f, multiple_results=True)
 
 
 def is_no_tangent(tangent: Any) -> bool:
-    """Whether a tangent is JAX's sign for none at all, which is more than zero."""
+    """Whether a tangent is JAX's symbolic zero, which is stronger than an array of zeros."""
     return type(tangent) is ad.Zero
 
 
 def no_tangent(x: Any) -> Any:
-    """JAX's sign for it, of an abstract value: what truth values and whole numbers have."""
+    """JAX's symbolic zero tangent for an abstract value; booleans and integers have this tangent."""
     return ad.Zero(x.to_tangent_aval())
 
 
 def one_function() -> contextlib.AbstractContextManager[Any]:
-    """Under it, each call of a jitted function is compiled by XLA:CPU as one function of LLVM."""
+    """A context in which XLA:CPU compiles each call of a jitted function as one LLVM function."""
     try:
         from jax.experimental.xla_metadata import set_xla_metadata
 
@@ -285,8 +304,10 @@ def one_function() -> contextlib.AbstractContextManager[Any]:
 
 
 def concretely() -> contextlib.AbstractContextManager[Any]:
-    """Under it numbers that are at hand are computed with at once, inside a trace too; what is traced under it is the
-    same program as elsewhere, which `jax.ensure_compile_time_eval` does not promise."""
+    """A context in which concrete numbers are evaluated at once, also inside a trace.
+
+    Programs that are traced in it are the same as elsewhere. `jax.ensure_compile_time_eval` does not guarantee this.
+    """
     try:
         from jax.core import eval_context
     except ImportError:
@@ -295,7 +316,7 @@ def concretely() -> contextlib.AbstractContextManager[Any]:
 
 
 def nothing_is_traced() -> bool:
-    """Whether no trace is under way at all, so that nobody can differentiate what is computed now."""
+    """Whether no trace is active, so that the current computation cannot be differentiated."""
     try:
         from jax.core import eval_context
         from jax.extend.core import get_opaque_trace_state
@@ -307,12 +328,12 @@ def nothing_is_traced() -> bool:
 
 
 def on_device(x: Any, dtype: Any = None) -> jax.Array:
-    """NumPy's numbers as an array of JAX. `jax.numpy.asarray` compiles a program for each shape (JAX 0.12)."""
+    """A NumPy array as an array of JAX. `jax.numpy.asarray` would compile a program for each shape (JAX 0.12)."""
     return jax.device_put(np.asarray(x, dtype))
 
 
 def settings() -> Any:
-    """JAX's settings on which a traced program depends beside its arguments."""
+    """The settings of JAX on which a traced program depends, in addition to its arguments."""
     return tuple(getattr(jax.config, name, None) for name in _SETTINGS)
 
 
@@ -327,7 +348,7 @@ _SETTINGS = (
 
 
 def look_for_cache_again() -> None:
-    """Have JAX look again where programs are kept: it does so once, when it first compiles."""
+    """Make JAX look again for the folder of stored programs. It looks only once, at its first compilation."""
     try:
         from jax.experimental.compilation_cache.compilation_cache import reset_cache
     except ImportError:
@@ -335,23 +356,48 @@ def look_for_cache_again() -> None:
     reset_cache()
 
 
-def on_failed_checks(how: str) -> str | None:
-    """Have equinox's checks "raise", or give "nan". **Returns:** what they did before; None where that is not known.
+class _Checks:
+    """The number of traces in which equinox's checks return NaN, and equinox's setting before the first of them."""
 
-    equinox reads the environment's EQX_ON_ERROR when it is imported; its checks look at the name in their own module
-    when they are traced.
+    lock = threading.Lock()
+    traces = 0
+    before = ""
+
+
+@contextlib.contextmanager
+def storable_checks() -> Iterator[None]:
+    """Make equinox's checks return NaN in programs traced in this context, if JAX keeps compiled programs on disk.
+
+    equinox's checks call back into Python to raise exceptions, and JAX does not store programs with callbacks. Without
+    this context, no program with a diffrax solve would be stored. equinox reads its setting when a check is traced.
+    Therefore only programs traced in this context are affected, and code outside of jaxkane still raises.
     """
+    config: Any = jax.config
+    equinox: Any = sys.modules.get("equinox._errors")
+    keeps = config.jax_compilation_cache_dir and config.jax_enable_compilation_cache
+    if not keeps or not hasattr(equinox, "EQX_ON_ERROR"):
+        yield
+        return
+    with _Checks.lock:  # other threads may trace at the same time: the first sets it, and the last restores it
+        if not _Checks.traces:
+            _Checks.before, equinox.EQX_ON_ERROR = equinox.EQX_ON_ERROR, "nan"
+        _Checks.traces += 1
     try:
-        checks: Any = importlib.import_module("equinox._errors")
-    except ImportError:
-        return None
-    before = getattr(checks, "EQX_ON_ERROR", None)
-    checks.EQX_ON_ERROR = how
-    return before
+        yield
+    finally:
+        with _Checks.lock:
+            _Checks.traces -= 1
+            if not _Checks.traces:
+                equinox.EQX_ON_ERROR = _Checks.before
 
 
-def process_allgather(x: Any, *, tiled: bool = False) -> Any:
-    """The arrays of all processes, stacked or, if `tiled`, one after the other."""
-    from jax.experimental.multihost_utils import process_allgather
+def filter_jit_uncached(f: Callable[..., Any]) -> Callable[..., Any]:
+    """`equinox.filter_jit(f)`, whose programs are freed with it.
 
-    return process_allgather(x, tiled=tiled)
+    equinox 0.13 keeps them in a dictionary by weak references to f. Its values refer to f themselves, so that they are
+    never freed: each cell that defined a class again and simulated it kept 90 memory mappings.
+    """
+    jitted = eqx.filter_jit(f)
+    with contextlib.suppress(ImportError, AttributeError):
+        importlib.import_module("equinox._jit")._filter_jit_cache.delete(f)
+    return jitted

@@ -1,9 +1,9 @@
-"""Arithmetic, small linear systems and programs that know exact zeros and ones. Knows no mechanics.
+"""Arithmetic, small linear systems and programs with exact zeros and ones. Independent of mechanics.
 
-Small systems are written out (Cramer's rule up to three unknowns, Gaussian elimination up to six, L D L^T without
-pivoting for positive definite ones), which keeps exact zeros and lets a batch stay component-major; so are larger ones
-whose exact zeros let them fall apart into such, one after the other, as closed loops that hang on a bicycle. What is
-left goes to LAPACK.
+Small systems are written out: by Cramer's rule up to three unknowns, by Gaussian elimination up to six, and by L D L^T
+without pivoting if they are positive definite. This preserves exact zeros, and a batch stays component-major. Larger
+systems are written out if their exact zeros split them into such blocks, e.g. closed loops on a bicycle. All other
+systems use LAPACK.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from .compat import ClosedJaxpr, Tracer, evaluated, is_literal
+from .compat import ClosedJaxpr, Equation, Tracer, Variable, evaluated, is_literal
 from .graph import OPERATORS
 
 if TYPE_CHECKING:
-    Scalar: TypeAlias = Any  # numbers are given, arrays are kept: no checker follows the conversion
+    Scalar: TypeAlias = Any  # users pass numbers, fields store arrays: a type checker cannot follow this conversion
 else:
     Scalar = Float[Array, ""]
     """A physical parameter: one float array without axes."""
@@ -31,17 +31,23 @@ else:
 Component: TypeAlias = Any
 """One component of a vector: a float array without axes, or an exact Python float."""
 
+Numbers: TypeAlias = Any
+"""An array of numbers of JAX or NumPy, also traced. These have the same operators, but no common type to declare."""
+
+Bool: TypeAlias = Any
+"""A bool, or an array of bools, also traced."""
+
 Triple: TypeAlias = tuple[Component, Component, Component]
 
 Inputs: TypeAlias = Mapping[str, Any] | Callable[..., Any] | None
-"""Inputs by name; those left out are zero."""
+"""Inputs by name; omitted ones are zero."""
 
 
 ZERO3: Triple = (0.0, 0.0, 0.0)
 
 
 def component(value: Component) -> Component:
-    """`value` as a component: Python and NumPy numbers become exact floats, arrays stay what they are."""
+    """`value` as a component: Python and NumPy numbers become exact floats, arrays do not change."""
     if isinstance(value, float):
         return value
     if isinstance(value, (int, np.number)) and not isinstance(value, bool):
@@ -52,13 +58,13 @@ def component(value: Component) -> Component:
     return jnp.asarray(value) if isinstance(value, np.ndarray) else value
 
 
-def components(values: Any, n: int, what: str) -> tuple[Component, ...]:
-    """`n` numbers in a sequence as components; `what` stands before what is there instead."""
+def components(values: PyTree, n: int, what: str) -> tuple[Component, ...]:
+    """`n` numbers in a sequence as components; `what` is the beginning of the message for other values."""
     return tuple(component(x) for x in several(values, n, what))
 
 
-def several(values: Any, n: int, what: str) -> tuple[Any, ...]:
-    """`n` items of a sequence; `what` stands before what is there instead."""
+def several(values: PyTree, n: int, what: str) -> tuple[Any, ...]:
+    """`n` items of a sequence; `what` is the beginning of the message for other values."""
     if isinstance(values, str) or not hasattr(values, "__iter__") or getattr(values, "shape", None) == ():
         raise TypeError(f"{what}, got {values!r}.")
     items = tuple(values)
@@ -68,9 +74,9 @@ def several(values: Any, n: int, what: str) -> tuple[Any, ...]:
 
 
 def positive(value: Component, what: str) -> Component:
-    """`value`, refused where it is a number that is not positive."""
+    """`value`. **Raises:** `ValueError` for a concrete number that is not positive."""
     if is_exact(component(value)) and not value > 0:
-        raise ValueError(f"{what} is {value}: it is positive.")
+        raise ValueError(f"{what} must be positive, got {value}.")
     return value
 
 
@@ -119,7 +125,7 @@ def mul(a: Component, b: Component) -> Component:
 
 
 def _are_alike(a: Component, b: Component) -> bool:
-    """Whether two numbers under a trace need no conversion: Python's operators take twice as long to find that out."""
+    """Whether two traced numbers need no conversion. Python's operators take twice as long to check this."""
     return isinstance(a, Tracer) and isinstance(b, Tracer) and a.dtype == b.dtype and a.shape == b.shape
 
 
@@ -155,7 +161,7 @@ def matvec(matrix: Sequence[Sequence[Component]], a: Sequence[Component]) -> tup
 Rows = Sequence[Sequence[Component]]
 
 _CRAMER_UP_TO = 3
-ELIMINATE_UP_TO = 6  # by XLA alone, the derivatives of eight take 14 s to compile
+ELIMINATE_UP_TO = 6  # without native kernels, the derivatives of eight take 14 s to compile
 _UNROLL_UP_TO = 12
 
 
@@ -180,7 +186,7 @@ def determinant(A: Rows) -> Component:
     return functools.reduce(mul, factors, float(round(sign)))
 
 
-# By these names `unsupported_primitives` knows that it is not the description that calls a library.
+# By these names `unsupported_primitives` distinguishes calls of the method itself from those of a system.
 
 
 @jax.jit
@@ -197,14 +203,13 @@ Block = tuple[list[int], list[int]]
 
 
 def _blocks(A: Rows) -> list[Block] | None:
-    """Rows and columns of the blocks on the diagonal, where rows and columns of A can be ordered so that all entries
-    above these are exact zeros. None where a block is larger than what is written out, or A is singular by its zeros.
-    """
+    """Rows and columns of diagonal blocks, if rows and columns of A can be ordered so that all entries above the blocks
+    are exact zeros. None if a block is too large to be written out, or if the zeros of A make it singular."""
     reads = np.array([[not is_zero(a) for a in row] for row in A])
     column_of = _matched(reads)
     if column_of is None:
         return None
-    # Row i follows row j where it reads what j is solved for; rows that follow each other are one block.
+    # Row i depends on row j if it uses the unknown of j. Rows that depend on each other form one block.
     follows = reads[:, column_of] | np.eye(len(A), dtype=bool)
     for _ in range(len(A).bit_length()):
         follows = (follows.astype(int) @ follows) > 0
@@ -216,7 +221,7 @@ def _blocks(A: Rows) -> list[Block] | None:
 
 
 def _matched(reads: np.ndarray) -> list[int] | None:
-    """For every row a column of its own that it reads; None where there are not so many."""
+    """A different column with a nonzero entry for each row (a matching); None if this is not possible."""
     owner: dict[int, int] = {}
 
     def find(row: int, tried: set[int]) -> bool:
@@ -256,14 +261,14 @@ def _solved_by_lapack_rows(A: Rows, rights: Sequence[Sequence[Component]]) -> li
 def _solutions_and_det(
     A: Rows, rights: Sequence[Sequence[Component]] = ()
 ) -> tuple[list[tuple[Component, ...]], Component]:
-    """Of as many equations as are written out."""
+    """Solutions and det A for a system that is small enough to be written out."""
     n = len(A)
     if n == 0:
         return [() for _ in rights], 1.0
     if n > _CRAMER_UP_TO:
         return _eliminated(A, rights)
     adjugate, det = _adjugate(A)
-    if is_zero(det):  # an unknown that no equation holds: no number is right, and a zero must not hide it
+    if is_zero(det):  # an unknown that no equation contains: the result is undefined, and a zero must not hide this
         return [(math.nan,) * n for _ in rights], det
     reciprocal = 1.0 / det
     return [tuple(mul(dot(row, b), reciprocal) for row in adjugate) for b in rights], det
@@ -272,8 +277,8 @@ def _solutions_and_det(
 def _eliminated(A: Rows, rights: Sequence[Sequence[Component]]) -> tuple[list[tuple[Component, ...]], Component]:
     """The solutions and det A by Gaussian elimination with partial pivoting.
 
-    The pivot row is found by exchanging rows in pairs, each by a selection among numbers. Rows whose leading entry is
-    an exact zero take no part.
+    The pivot row is found by exchanging rows in pairs, each by selecting numbers. Rows whose leading entry is an exact
+    zero are skipped.
     """
     n, det = len(A), 1.0
     rows = [[*row, *(b[i] for b in rights)] for i, row in enumerate(A)]
@@ -303,7 +308,7 @@ def _eliminated(A: Rows, rights: Sequence[Sequence[Component]]) -> tuple[list[tu
 
 
 def _chosen(condition: Any, a: Component, b: Component) -> Component:
-    """`a` where the condition holds, else `b`."""
+    """`a` if the condition is true, else `b`."""
     if isinstance(condition, bool):
         return a if condition else b
     return a if is_exact(a) and is_exact(b) and a == b else jnp.where(condition, a, b)
@@ -321,27 +326,27 @@ def _adjugate(A: Rows) -> tuple[Rows, Component]:
 
 
 def is_written_out(n: int) -> bool:
-    """Whether positive definite systems of n unknowns are solved among the scalars."""
+    """Whether positive definite systems of n unknowns are written out in scalars."""
     return n <= _UNROLL_UP_TO
 
 
 def solve_positive_array(M, b):
-    """The solution x (n,) of M x = b for a symmetric positive definite array M (n, n), by LAPACK; NaN where M is
-    singular but for rounding."""
+    """The solution x (n,) of M x = b for a symmetric positive definite array M (n, n), by LAPACK. NaN if M is singular
+    within rounding."""
     factor = jsl.cho_factor(M)
     is_regular = jnp.all(jnp.diag(factor[0]) ** 2 > rounding_of_pivots(M.dtype) * jnp.diag(M))
     return jnp.where(is_regular, jsl.cho_solve(factor, b), jnp.nan)
 
 
 def rounding_of_pivots(dtype: Any) -> float:
-    """Pivots of L D L^T that are less than this, beside their diagonal entries of M, are zero but for rounding. Their
-    units do not matter, nor whether masses are small."""
+    """Pivots of L D L^T are regarded as zero if they are below this factor times the diagonal entry of M. The criterion
+    does not depend on units or on the size of masses."""
     return 100 * float(jnp.finfo(dtype).eps)
 
 
 def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
-    """The solution x of M x = b for a symmetric positive definite M, of which the upper triangle is read; NaN where M
-    is singular but for rounding."""
+    """The solution x of M x = b for a symmetric positive definite M, of which the upper triangle is used. NaN if M is
+    singular within rounding."""
     n = len(M)
     # M = L D L^T, column by column; d holds the pivots, L the rows below the diagonal.
     L: list[list[Component]] = [[0.0] * n for _ in range(n)]
@@ -370,7 +375,7 @@ def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
 
 
 def _regular(pivot: Component, diagonal: Component) -> Component:
-    """The pivot, or NaN where it is no more than what rounding has left of the diagonal entry."""
+    """The pivot, or NaN if it is not larger than the rounding error of the diagonal entry."""
     if is_exact(pivot) and is_exact(diagonal):
         return pivot if pivot > rounding_of_pivots(float) * diagonal else math.nan
     threshold = rounding_of_pivots(jnp.result_type(pivot, diagonal)) * diagonal
@@ -383,8 +388,8 @@ def _quotient(a: Component, b: Component) -> Component:
     return a if is_zero(a) else a / b
 
 
-def as_vector(row: Sequence[Component], like: Any) -> Any:
-    """A row of components as an array (n,) of the type of `like`."""
+def as_vector(row: Sequence[Component], like: Numbers) -> Numbers:
+    """A row of components as an array (n,) with the dtype of `like`."""
     return stack([row])[0].astype(like.dtype)
 
 
@@ -399,21 +404,24 @@ def stack(rows: Rows):
 
 
 class Replay:
-    """The equations of a function, and where its parts stand among their results."""
+    """The equations of a function, and the positions of its quantities among their results."""
 
     def __init__(self, program: ClosedJaxpr, structures: dict[str, Any], leaves: Sequence[Any]):
-        """`structures` of the parts by name; `leaves` of all parts, of which those that are exact are no results."""
+        """- `program`: the traced function.
+        - `structures`: the tree of each quantity, by name.
+        - `leaves`: of all quantities. Exact leaves are not results of the program.
+        """
         self.program, self.structures = program, structures
         outputs = iter(program.jaxpr.outvars)
         row = iter([x if is_exact(x) else next(outputs) for x in leaves])
         self.results: dict[str, list[Any]] = {
-            part: [next(row) for _ in range(s.num_leaves)] for part, s in structures.items()
+            name: [next(row) for _ in range(s.num_leaves)] for name, s in structures.items()
         }
         self.needed = functools.cache(self._needed)  # a cached method would keep the instance alive
 
-    def _needed(self, part: str) -> list[Any]:
-        """The equations that a part needs, and those that do something."""
-        read = {v for v in self.results[part] if _is_variable(v)}
+    def _needed(self, quantity: str) -> list[Any]:
+        """The equations that a quantity needs, and those with side effects."""
+        read = {v for v in self.results[quantity] if _is_variable(v)}
         equations = []
         for equation in reversed(self.program.jaxpr.eqns):
             if equation.effects or any(v in read for v in equation.outvars):
@@ -421,25 +429,25 @@ class Replay:
                 read.update(v for v in equation.invars if _is_variable(v))
         return equations[::-1]
 
-    def __call__(self, part: str, numbers: Sequence[Any], memory: dict[Any, Any]) -> Any:
+    def __call__(self, quantity: str, numbers: Sequence[Any], memory: dict[Any, Any]) -> PyTree:
         jaxpr: Any = self.program.jaxpr
         values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*self.program.consts, *numbers), strict=True))
-        for equation in self.needed(part):
+        for equation in self.needed(quantity):
             xs = [v.val if is_literal(v) else values[v] for v in equation.invars]
             key = (id(equation), *(x if is_exact(x) else id(x) for x in xs))
             if key not in memory:
                 known = _with_exact(equation, xs)
                 memory[key] = _results(equation, xs) if known is None else [known], xs, self
             values.update(zip(equation.outvars, memory[key][0], strict=True))
-        results = [values[v] if _is_variable(v) else v if is_exact(v) else v.val for v in self.results[part]]
-        return jax.tree.unflatten(self.structures[part], results)
+        results = [values[v] if _is_variable(v) else v if is_exact(v) else v.val for v in self.results[quantity]]
+        return jax.tree.unflatten(self.structures[quantity], results)
 
 
-def _is_variable(v: Any) -> bool:
+def _is_variable(v: Variable) -> bool:
     return not is_exact(v) and not is_literal(v)
 
 
-def _results(equation: Any, xs: Sequence[Any]) -> Sequence[Any]:
+def _results(equation: Equation, xs: Sequence[Any]) -> Sequence[Any]:
     xs = [np.asarray(x, v.aval.dtype) if is_exact(x) else x for x, v in zip(xs, equation.invars, strict=True)]
     return evaluated(equation, xs)
 
@@ -448,9 +456,9 @@ _OF_TWO = {"add": add, "sub": sub, "mul": mul}
 _OF_EXACT: dict[str, Callable[..., Any]] = {**OPERATORS, "abs": abs, "square": lambda x: x * x}
 
 
-def _with_exact(equation: Any, xs: Sequence[Any]) -> Any:
-    """The result of an equation, of which some values are exact, where it is exact too or needs no equation."""
-    # A number that is written in the function is as exact as Python finds it: only beside an exact value.
+def _with_exact(equation: Equation, xs: Sequence[Any]) -> Component | None:
+    """The result of an equation with some exact values, if it is exact too or needs no equation; else None."""
+    # A literal in the function counts as exact only together with another exact value.
     exact = [is_exact(x) and not is_literal(v) for x, v in zip(xs, equation.invars, strict=True)]
     if not any(exact):
         return None

@@ -17,14 +17,18 @@ from .compat import Tracer
 
 
 def digest(value: Any, code: Callable[[Any], bytes] | None = None) -> str:
-    """Sixteen hexadecimal digits of data: numbers, arrays, and what holds them.
+    """Sixteen hexadecimal digits that identify data: numbers, arrays and containers of these.
 
-    `code`: gives a digest of a function that a program calls back, with all that it reads; by default its name.
+    **Arguments:**
+
+    - `value`: the data.
+    - `code`: function -> digest, for functions that a program calls back, including all that they read. Default: the
+        name.
     """
     return _Hash(code).of(value)
 
 
-# Where and under which name a program runs is not what it computes.
+# Parameters that state where and under which name a program runs do not change its results.
 _NOT_COMPUTED = frozenset(
     "name in_shardings out_shardings in_layouts out_layouts ctx_mesh mesh sharding donated_invars keep_unused inline "
     "debug_info".split()
@@ -36,7 +40,8 @@ class _Hash:
     def __init__(self, code: Callable[[Any], bytes] | None, programs: dict[int, tuple[Any, str]] | None = None) -> None:
         self.sha = hashlib.sha256()
         self.code = code
-        self.programs = {} if programs is None else programs  # those that were read: one is often called many times
+        # programs that were already read: one is often called many times
+        self.programs = {} if programs is None else programs
 
     def of(self, value: Any) -> str:
         self.add(value)
@@ -50,7 +55,7 @@ class _Hash:
     def add(self, value: Any) -> None:
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes)):
             self.words(type(value).__name__, value if isinstance(value, bytes) else repr(value))
-        elif isinstance(value, Tracer):  # a rule of an operation that was traced within another, which holds the value
+        elif isinstance(value, Tracer):  # in a rule of an operation that was traced within another trace
             self.words("traced", value.dtype, value.shape)
         elif isinstance(value, (np.ndarray, np.generic, jax.Array)):
             array = np.asarray(value)
@@ -78,14 +83,14 @@ class _Hash:
             self.thing(value)
 
     def thing(self, value: Any) -> None:
-        """What is neither a number nor a program."""
+        """An object that is neither a number nor a program."""
         inner, params = getattr(value, "program", None), getattr(value, "params", None)
-        if inner is not None:  # of scalars, see `_scalarjit.function`
+        if inner is not None:  # a program of scalars, see `_scalarjit.program`
             self.add(inner)
-        elif isinstance(params, Mapping):  # an operation that holds programs itself: `jax.lax.custom_root`
+        elif isinstance(params, Mapping):  # an operation that contains programs itself: `jax.lax.custom_root`
             self.words("operation", type(value).__qualname__)
             self.add(params)
-        elif self.code is not None and hasattr(value, "callback_func"):  # of `jax.pure_callback`, `io_callback`
+        elif self.code is not None and hasattr(value, "callback_func"):  # `jax.pure_callback`, `io_callback`
             self.words("called back", self.code(value.callback_func))
         elif isinstance(value, (type, types.BuiltinFunctionType, np.dtype)):
             self.words("named", getattr(value, "__qualname__", value))
@@ -103,7 +108,7 @@ class _Hash:
             self.words(type(value).__qualname__, _ADDRESS.sub("", str(value)))
 
     def program(self, program: Any) -> None:
-        """Operations in their order, variables by the places where they were made."""
+        """Operations in their order; variables are identified by the position at which they were computed."""
         constants = getattr(program, "consts", ())
         program = getattr(program, "jaxpr", program)
         numbers: dict[Any, int] = {}

@@ -1,13 +1,13 @@
-"""Functions of scalars that solve linear equations, M x = b. Knows nothing of mechanics.
+"""Functions of scalars that solve linear equations, M x = b. Independent of mechanics.
 
-`LinearSolution`: where the solve is written out. `ScalarSolve`: symmetric positive definite systems whose matrix is
-never formed, by Gaussian elimination along a graph of scalars.
+`LinearSolution`: the solve is written out. `ScalarSolve`: a symmetric positive definite system whose matrix is never
+formed, solved by Gaussian elimination along a graph of scalars.
 
-The matrix is that of a quadratic form, M = sum_i L_i^T D_i L_i, as a mass matrix is that of the kinetic energy. A graph
-computes z_i = L_i x from x, each node from few others. The form goes through the graph from the z_i to x: a node is
-replaced by the nodes that it reads, and an unknown that nothing reads any more is eliminated. Along a tree of bodies
-few nodes are in the form at a time, so that the work grows with the number of bodies, as that of the articulated-body
-method (Featherstone, Rigid Body Dynamics Algorithms, Section 7.3).
+The matrix belongs to a quadratic form, M = sum_i L_i^T D_i L_i, as the mass matrix belongs to the kinetic energy. A
+graph computes z_i = L_i x from x, each node from few others. The elimination moves the form through the graph from the
+z_i to x: a node is replaced by the nodes from which it is computed, and an unknown that no other node uses is
+eliminated. Along a tree of bodies the form contains few nodes at a time. The work therefore grows linearly with the
+number of bodies, as in the articulated-body method (Featherstone, Rigid Body Dynamics Algorithms, Section 7.3).
 """
 
 from __future__ import annotations
@@ -23,23 +23,25 @@ import numpy as np
 from .backends.native import Scalars
 from .cache_key import CacheKey, version_of
 from .compat import ClosedJaxpr, settings, types_of
-from .components import rounding_of_pivots
-from .function import Program, ScalarFunction, jaxpr_at
+from .components import Numbers, rounding_of_pivots
 from .graph import Graph, NotScalarError, graph_of
 from .jaxpr import Solved, cse, is_fusable, specs_of
+from .program import ArgumentRoles, Derived, Program
+from .scalar_function import ScalarFunction, jaxpr_at
 
-_MOST_NODES = 1000  # for each unknown: a chain of bodies takes 300; where all is connected with all, LAPACK is best
+_MOST_NODES = 1000  # for each unknown: a chain of bodies takes 300. If all bodies are connected, LAPACK is faster
 
 
 Affine = tuple[int | None, list[tuple[int, int]]]
-"""A constant, if there is one, and coefficients with the nodes that they belong to."""
+"""An optional constant, and pairs of a coefficient and its node."""
 
 
 class LinearSolution(ScalarFunction):
-    """A pure function at module level whose last result x solves equations that are linear in it, M x = b.
+    """A pure function at module level whose last result x solves linear equations, M x = b.
 
-    `equations(*args, x, r)` gives the other results, b - M x and the y of M y = r, at any x and r. These are
-    differentiated, never the solution of the solve: that takes 1.7 times as many operations along each direction.
+    `equations(*args, x, r)` returns the other results, b - M x, and the y of M y = r, at any x and r. Derivatives use
+    these equations. Differentiating the solution of the solve would take 1.7 times as many operations for each
+    direction.
     """
 
     def __init__(self, f: Callable[..., Any], equations: Callable[..., Any]):
@@ -49,25 +51,26 @@ class LinearSolution(ScalarFunction):
     def _solved(self, key: CacheKey, x: Any) -> Solved | None:
         args = jax.tree.unflatten(key.structure, specs_of(key.types))
         if (version_of(*args), settings()) != (key.version, key.settings):
-            return None  # what the code reads has changed: these are not the equations that were solved
+            return None  # values that the code reads have changed: these are not the equations that were solved
         program, _ = jaxpr_at(key, self.equations, x, x)
         return Solved.of(cse(program)) if is_fusable(program.jaxpr) else None
 
 
 class ScalarSolve(ScalarFunction):
-    """The solution x of M x = b, of a pure function at module level that gives z (m, k) and D (m, k, k) of (*args, x).
+    """The solution x of M x = b, for a pure function at module level that returns z (m, k) and D (m, k, k) of (*args,
+    x).
 
         x^T M x = sum_i z_i^T D_i z_i,  z_i = L_i x
 
-    `solve(*args, b)` is one native kernel. Where there can be none, it is `by_lapack(*args, b)`. It has no derivatives
-    of its own: `jax.lax.custom_linear_solve` gives them.
+    `solve(*args, b)` is one native kernel. If native kernels are not possible, it is `by_lapack(*args, b)`.
+    `jax.lax.custom_linear_solve` defines its derivatives.
     """
 
     def __init__(self, form: Callable[..., Any], by_lapack: Callable[..., Any]):
         super().__init__(form)
         self.by_lapack = by_lapack
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: Any) -> Numbers:
         if not self.is_native(*args):
             return self.by_lapack(*args)
         numbers, program = self.program(*args)
@@ -80,17 +83,15 @@ class ScalarSolve(ScalarFunction):
 
 
 class _Solve(Program):
-    """The program of the solution, of the program of a form. Its last argument is the right-hand side."""
+    """The program of the solution, made from the program of a form. Its last argument is the right-hand side."""
 
     def __init__(self, form: Program, by_lapack: Callable[..., list[Any]]):
-        self.label, self.loop_invariant, self.program = form.label, form.loop_invariant, form.program
+        self.label, self.program, self.compile_cheaply, self.derived = form.label, form.program, False, Derived()
+        self.roles = ArgumentRoles(form.roles.loop_invariant)
         self.in_avals, self.out_avals = form.in_avals, form.in_avals[-1:]
         self.evaluate, self.is_fusable, self.reads = by_lapack, False, (*form.reads[:-1], True)
-        self.tangents, self.values, self.axes_of, self.once = frozenset[int](), None, (None,), False
+        self.dependencies = [frozenset(range(len(self.in_avals)))]
         self.batched, self.jitted = functools.cache(self._batched), functools.cache(self._jitted)
-
-    def moved(self, moving: tuple[bool, ...]) -> tuple[bool, ...]:
-        return (any(moving),)
 
     @functools.cached_property
     def scalars(self) -> Scalars | None:
@@ -101,7 +102,7 @@ class _Solve(Program):
 
 
 def graph_of_solution(form: ClosedJaxpr) -> tuple[Graph, list[np.ndarray]]:
-    """A graph, and the nodes of the solution x in it, whose right-hand side b is in the place of the form's x."""
+    """A graph, and the nodes of the solution x in it. The right-hand side b replaces the form's argument x."""
     graph, (z, D) = graph_of(form)
     *others, x = types_of(form)[0]
     unknowns = [graph.add("input", (len(others), i, x.size), str(x.dtype)) for i in range(x.size)]
@@ -109,11 +110,13 @@ def graph_of_solution(form: ClosedJaxpr) -> tuple[Graph, list[np.ndarray]]:
 
 
 class _Elimination:
-    """The minimum of x^T M x / 2 - b^T x.
+    """The minimum of x^T M x / 2 - b^T x by elimination.
 
-    Q and b are the quadratic form and the linear one of the nodes that are in it now; `size` is what the diagonal of Q
-    would be if nothing had been eliminated, but for products of different nodes. `terms` are, for every node that is
-    linear in the unknowns, the nodes that it is a sum of, and their coefficients.
+    - `Q`, `b`: the quadratic and the linear form, for the nodes that they contain now.
+    - `size`: the diagonal of Q without any elimination, except for products of different nodes; the scale for
+        `rounding_of_pivots`.
+    - `terms`: for each node that is linear in the unknowns, pairs of a coefficient and a node, whose sum it is.
+    - `readers`: for each node, how many remaining nodes use it.
     """
 
     def __init__(self, graph: Graph, unknowns: list[int], z: np.ndarray, D: np.ndarray):
@@ -154,7 +157,7 @@ class _Elimination:
         raise NotScalarError(f"{operation} of the unknowns of a linear system")
 
     def _needed(self) -> Iterator[int]:
-        """The nodes that the form reads, directly or not."""
+        """The nodes that the form uses, directly or indirectly."""
         open_, reached = [*self.Q], set(self.Q)
         while open_:
             k = open_.pop()
@@ -172,13 +175,13 @@ class _Elimination:
         return b if a is None else self._do("add", a, b)
 
     def _add(self, i: int, j: int, value: int, twice: bool = False) -> None:
-        """Q_ij = Q_ji += value; `twice` for a product of two nodes, where these are one."""
+        """Q_ij = Q_ji += value. `twice`: count the product of two nodes twice if they are equal."""
         value = self._do("add", value, value) if twice and i == j else value
         row = self.Q.setdefault(i, {})
         row[j] = self.Q.setdefault(j, {})[i] = self._sum(row.get(j), value)
 
     def _add_along(self, i: int, c: int, b: int | None) -> None:
-        """b_i += c b, where there is a b."""
+        """b_i += c b, unless b is None."""
         if b is not None:
             self.b[i] = self._sum(self.b.get(i), self._do("mul", c, b))
 
@@ -189,12 +192,13 @@ class _Elimination:
         for k, constant, terms in reversed(steps):
             products = [self._do("mul", c, values[i]) for c, i in terms]
             values[k] = functools.reduce(self._sum, products if constant is None else [constant, *products])
-        if not values.keys() >= {*self.unknowns}:  # one that nothing reads has no equation
+        if not values.keys() >= {*self.unknowns}:  # an unknown that is not used has no equation
             return [self.nan for _ in self.unknowns]
         return [values[k] for k in self.unknowns]
 
     def _order(self) -> Iterator[int]:
-        """Nodes of the form that no node reads any more, the one with least work first; the form changes meanwhile."""
+        """Nodes of the form that no remaining node uses, the one with the least work first. The form changes during the
+        iteration."""
         while self.Q:
             ready = [k for k in self.Q if not self.readers[k]]
             k = min(ready, key=lambda k: (len(self.Q[k]) * max(1, len(self.terms[k])), -k))
@@ -203,7 +207,8 @@ class _Elimination:
             yield k
 
     def _removed(self, k: int) -> tuple[dict[int, int], int, int | None, int]:
-        """The row of Q beside the diagonal, the diagonal, b and the size of a node, which leaves the form."""
+        """Remove a node from the form. **Returns:** its row of Q without the diagonal, the diagonal, its b and its
+        size."""
         row = self.Q.pop(k)
         if k not in row:
             raise NotScalarError("a form that is not positive definite")
@@ -213,7 +218,7 @@ class _Elimination:
         return row, diagonal, self.b.pop(k, None), self.size.pop(k)
 
     def _replaced(self, k: int) -> Affine:
-        """Put z_k = sum_i c_i z_i into the form."""
+        """Substitute z_k = sum_i c_i z_i into the form."""
         terms = self.terms[k]
         row, diagonal, b, size = self._removed(k)
         for place, (c, i) in enumerate(terms):
@@ -228,7 +233,7 @@ class _Elimination:
         return None, terms
 
     def _eliminated(self, k: int) -> Affine:
-        """Put z_k = (b_k - sum_j Q_kj z_j) / Q_kk into the form, where its derivative by z_k is zero."""
+        """Substitute z_k = (b_k - sum_j Q_kj z_j) / Q_kk into the form, where its derivative by z_k is zero."""
         row, pivot, b, size = self._removed(k)
         assert b is not None  # k is an unknown
         if pivot != size:

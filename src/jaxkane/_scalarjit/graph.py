@@ -1,4 +1,4 @@
-"""Programs of JAX as graphs of scalars, every node once. Knows jaxprs; knows no machine and no mechanics."""
+"""JAX programs as graphs of scalars, in which each node occurs once. Independent of machines and mechanics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.lax import RoundingMethod
 
-from .compat import ClosedJaxpr, interpret, types_of
+from .compat import ClosedJaxpr, Equation, interpret, types_of
 
 OPERATORS: dict[str, Callable[..., Any]] = {
     "add": operator.add,
@@ -19,10 +19,11 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     "div": operator.truediv,
     "neg": operator.neg,
 }
-"""Arithmetic, by JAX's names of it, for whatever has Python's operators."""
+"""Arithmetic by JAX's names, for all objects with Python's operators."""
 
 CALLS = ("jit", "pjit")
-# Programs within programs, and the parameter that holds them. A rule for derivatives has been used before, or is not.
+# Nested programs, and the parameter that contains them. Their rules for derivatives have been used before, or are not
+# needed.
 _OPENED = dict.fromkeys(CALLS, "jaxpr") | dict.fromkeys(("custom_jvp_call", "custom_vjp_call"), "call_jaxpr")
 
 # Operations by the names of JAX's primitives.
@@ -32,7 +33,7 @@ ARITHMETIC = frozenset("add sub mul div rem".split())
 LOGIC = frozenset("and or xor".split())
 COMPARISONS = frozenset("eq ne lt le gt ge".split())
 SIMPLE = frozenset("sqrt abs floor max min".split())
-# Those that a mathematical library has, by the same names.
+# Operations that a mathematical library has, by the same names.
 LIBRARY = frozenset(
     "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p pow cbrt erf".split()
 )
@@ -42,7 +43,7 @@ _SAME = frozenset("copy copy_p stop_gradient optimization_barrier".split())
 
 
 class NotScalarError(Exception):
-    """The program holds something that is no operation of scalars, or that a language lacks."""
+    """The program contains an operation that is not an operation of scalars, or that a language lacks."""
 
 
 class Node(NamedTuple):
@@ -57,10 +58,12 @@ def symbol(node: Node) -> str:
 
 
 class Graph:
-    """Scalars, each once. Folded is what XLA folds too: x + 0, x - 0, x * 1, x * -1, x / 1; and signs, which are exact:
-    -(-x) is x, and x + (-y) is x - y. Not x * 0 and 0 / x, which are NaN where x is not finite or zero, nor 0 - x,
-    which is no -x where x is zero: the zeros of descriptions and of derivatives are gone before (`components`, and
-    JAX), so that nothing is to be gained."""
+    """Scalars, each stored once, with the simplifications that XLA makes: x + 0, x - 0, x * 1, x * -1, x / 1.
+
+    Signs are exact, so -(-x) becomes x, and x + (-y) becomes x - y. The products x * 0 and 0 / x are not simplified,
+    because they may be NaN. Nor is 0 - x, which differs from -x for x = 0. Zeros of systems and of derivatives have
+    already been removed by `components` and by JAX, so more rules would not help.
+    """
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -76,7 +79,7 @@ class Graph:
         return self._numbers[node]
 
     def constant(self, value: Any, dtype: str) -> int:
-        # By its digits, since -0.0 == 0.0 and nan != nan.
+        # by its digits, because -0.0 == 0.0 and nan != nan
         return self.add("constant", (float(value).hex() if dtype != "bool" else bool(value),), dtype)
 
     def value(self, number: int) -> float | bool | None:
@@ -86,7 +89,8 @@ class Graph:
         return float.fromhex(node.operands[0]) if node.dtype != "bool" else node.operands[0]
 
     def reading_groups(self, groups: Sequence[Sequence[int]]) -> Graph:
-        """The same, of arguments in groups: several numbers are one array. What is in no group is not read."""
+        """The same graph for grouped arguments: the numbers of a group are one array. Arguments without a group are not
+        used."""
         place = {i: (g, e, len(group)) for g, group in enumerate(groups) for e, i in enumerate(group)}
         graph = Graph()
         for node in self.nodes:
@@ -138,7 +142,7 @@ def graph_of(program: ClosedJaxpr) -> tuple[Graph, list[np.ndarray]]:
     graph, inputs = Graph(), []
     given, results = types_of(program)
     for aval in results:
-        if str(aval.dtype) not in DTYPES:  # whole numbers are no nodes
+        if str(aval.dtype) not in DTYPES:  # integers are not nodes
             raise NotScalarError(f"a result of {aval.dtype}")
     for i, aval in enumerate(given):
         elements = [graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)]
@@ -153,16 +157,16 @@ def unrolled(program: ClosedJaxpr, inputs: Sequence[np.ndarray], graph: Graph) -
 
 
 def as_constants(v: Any, x: Any, graph: Graph) -> np.ndarray:
-    """The value x of the variable or literal v. A literal may be a float of Python in a program of float32."""
+    """The value x of the variable or literal v. A literal may be a Python float in a program of float32."""
     x = np.asarray(x)
     x = x.astype(v.aval.dtype) if x.dtype.kind == "f" else x
     dtype = _name_of(x.dtype)
     if dtype in DTYPES:
         return _each(lambda v: graph.constant(v, dtype), x)
-    return x  # whole numbers: exponents, places
+    return x  # integers: exponents, indices
 
 
-def applied(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.ndarray]:
+def applied(equation: Equation, xs: list[np.ndarray], graph: Graph) -> list[np.ndarray]:
     """The outputs of an equation whose inputs are these nodes."""
     if equation.primitive.name in _OPENED:
         inner = equation.params[_OPENED[equation.primitive.name]]
@@ -181,10 +185,10 @@ def _each(f: Callable[..., int], *xs: np.ndarray) -> np.ndarray:
     return np.array(results, np.int64).reshape(xs[0].shape)
 
 
-_name_of = functools.cache(str)  # of a dtype; NumPy composes it anew each time
+_name_of = functools.cache(str)  # of a dtype; NumPy would build the name anew each time
 
 
-def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.ndarray]:
+def _operation(equation: Equation, xs: list[np.ndarray], graph: Graph) -> list[np.ndarray]:
     name, params, aval = equation.primitive.name, equation.params, equation.outvars[0].aval
     name = "add" if name == "add_any" else name
     dtype = _name_of(aval.dtype)
@@ -197,12 +201,12 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
     if moved is not None:
         return moved
     if name == "convert_element_type" and dtype in DTYPES and x_dtype not in DTYPES:
-        return [_each(lambda v: graph.constant(v, dtype), xs[0])]  # whole numbers are constants here
+        return [_each(lambda v: graph.constant(v, dtype), xs[0])]  # integers are constants here
     if x_dtype not in DTYPES or dtype not in DTYPES:
         raise NotScalarError(f"{name} of {x_dtype}")
     number = functools.partial(_full, (), graph=graph, dtype=dtype)
     match name:
-        case "eq" | "ne" if x_dtype == "bool":  # as jnp.mod asks whether two signs differ
+        case "eq" | "ne" if x_dtype == "bool":  # as in jnp.mod, to check whether two signs differ
             differ = each("xor", *xs)
             return [differ if name == "ne" else each("xor", differ, _full((), True, graph, "bool"))]
         case "convert_element_type" if dtype == x_dtype:
@@ -221,7 +225,7 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
             return [each("div", number(1.0), each("add", number(1.0), each("exp", each("neg", xs[0]))))]
         case "square":
             return [each("mul", xs[0], xs[0])]
-        case "one_minus_square":  # of JAX 0.12, in the derivative of tanh
+        case "one_minus_square":  # in JAX 0.12, in the derivative of tanh
             return [each("mul", each("sub", number(1.0), xs[0]), each("add", number(1.0), xs[0]))]
         case "integer_pow":
             return [_power(xs[0], params["y"], each, number(1.0))]
@@ -252,7 +256,7 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
 
 
 def _moved(name: str, params: Any, xs: list[np.ndarray], shape: tuple[int, ...]) -> list[np.ndarray] | None:
-    """What only carries scalars from place to place."""
+    """The results of an operation that only moves scalars; None for other operations."""
     x = xs[0] if xs else np.empty(0)
     match name:
         case _ if name in _SAME:
@@ -281,7 +285,7 @@ def _moved(name: str, params: Any, xs: list[np.ndarray], shape: tuple[int, ...])
         case "pad":
             out = np.full(shape, xs[1], dtype=x.dtype)
             places = [low + (1 + step) * np.arange(n) for n, (low, _, step) in zip(x.shape, params["padding_config"])]
-            kept = [(0 <= at) & (at < n) for at, n in zip(places, shape)]  # a negative padding takes away
+            kept = [(0 <= at) & (at < n) for at, n in zip(places, shape)]  # negative padding removes elements
             out[np.ix_(*(at[k] for at, k in zip(places, kept)))] = x[np.ix_(*kept)]
             return [out]
     return None
@@ -301,7 +305,7 @@ def _power(x: np.ndarray, y: int, each: Callable[..., np.ndarray], one: np.ndarr
 
 
 def _rounded(x: np.ndarray, to_even: bool, each: Callable[..., np.ndarray], graph: Graph, dtype: str) -> np.ndarray:
-    """The nearest whole number; of two that are as near the even one, or else that farther from zero."""
+    """The nearest integer; halves are rounded to even, or else away from zero."""
     half, one = _full((), 0.5, graph, dtype), _full((), 1.0, graph, dtype)
     below = each("floor", x)
     rest, halved = each("sub", x, below), each("mul", half, below)
@@ -321,7 +325,7 @@ def _reduced(
 
 
 def needed(nodes: Sequence[Node], outputs: Iterable[np.ndarray]) -> list[int]:
-    """The nodes that outputs are made of, each after those that it reads."""
+    """The nodes from which the outputs are computed, each after the nodes that it uses."""
     is_needed = [False] * len(nodes)
     for array in outputs:
         for k in array.flat:
@@ -334,5 +338,5 @@ def needed(nodes: Sequence[Node], outputs: Iterable[np.ndarray]) -> list[int]:
 
 
 def reads(node: Node) -> tuple[int, ...]:
-    """The nodes that a node is computed from."""
+    """The nodes from which a node is computed."""
     return () if node.operation in ("input", "constant") else node.operands

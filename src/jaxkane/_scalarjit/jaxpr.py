@@ -1,4 +1,4 @@
-"""Programs of JAX rewritten: common subexpressions once, small products as sums, derivatives as programs again."""
+"""Transformations of JAX programs: common subexpressions once, small products as sums, derivatives as programs."""
 
 from __future__ import annotations
 
@@ -10,36 +10,38 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
-from .cache_key import Cache
+from .cache import Cache
 from .compat import (
     ClosedJaxpr,
+    Equation,
     Jaxpr,
+    Variable,
     dce_jaxpr,
     interpret,
     is_literal,
+    jaxpr_as_fun,
     new_variable,
     settings,
     tangents_of,
-    transposed,
     types_of,
 )
 from .graph import CALLS, Graph, applied, as_constants
 
-_LONGEST, _LARGEST = 64, 4096  # sum, number of products
+_LONGEST, _LARGEST = 64, 4096  # of the sum; number of products
 
 
-def is_small(equation: Any) -> bool:
-    """Whether a `dot_general` is one that is better written out."""
+def is_small(equation: Equation) -> bool:
+    """Whether a `dot_general` is small enough to be written out."""
     (contracted, _), _ = equation.params["dimension_numbers"]
     shape = equation.invars[0].aval.shape
     length = math.prod(shape[i] for i in contracted)
     return length <= _LONGEST and length * equation.outvars[0].aval.size <= _LARGEST
 
 
-def sum_of_products(equation: Any, x: Array, y: Array) -> Array:
-    """What a `dot_general` gives: over (batch, free of x, free of y)."""
+def sum_of_products(equation: Equation, x: Array, y: Array) -> Array:
+    """The result of a `dot_general`, over (batch, free axes of x, free axes of y)."""
     contracted, batch = equation.params["dimension_numbers"]
     x, y = (_ordered(jnp.asarray(z), along, over) for z, along, over in zip((x, y), contracted, batch, strict=True))
     aval = equation.outvars[0].aval
@@ -47,14 +49,14 @@ def sum_of_products(equation: Any, x: Array, y: Array) -> Array:
 
 
 def _ordered(x: Array, contracted: tuple[int, ...], batch: tuple[int, ...]) -> Array:
-    """As (batch, free, contracted)."""
+    """x with the axes (batch, free, contracted)."""
     free = [i for i in range(x.ndim) if i not in (*contracted, *batch)]
     sizes = [math.prod(x.shape[i] for i in axes) for axes in (batch, free, contracted)]
     return jnp.transpose(x, (*batch, *free, *contracted)).reshape(sizes)
 
 
-# What one compiled function may hold: elementwise work and the moving of scalars. Calls into libraries (LAPACK) may not
-# be compiled so, and loops would gain nothing.
+# Operations that one compiled function may contain: elementwise work and moving of scalars. Calls into libraries
+# (LAPACK) cannot be compiled this way, and loops would not be faster.
 _PLAIN = frozenset(
     "abs acos acosh add add_any and asin asinh atan atan2 atanh broadcast_in_dim cbrt ceil clamp concatenate "
     "convert_element_type copy copy_p cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite jit le "
@@ -62,66 +64,66 @@ _PLAIN = frozenset(
     "reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt select_n sign sin sinh slice split sqrt square "
     "squeeze stack stop_gradient sub tan tanh transpose unstack xor".split()
 )
-LARGEST_SUM = 64  # XLA may hand larger ones to a library
+LARGEST_SUM = 64  # XLA may pass larger ones to a library
 
-# In the name of each call of the method itself into LAPACK.
+# Part of the name of each call of LAPACK by the method itself.
 BY_LAPACK = "by_lapack"
-# The name of the primitive of JAX that stands for a program, with the parameters `program`, `sizes` and `where`.
+# The name of the JAX primitive for a program, with the parameters `program`, `sizes` and `batch_mask`.
 PROGRAM = "scalar_program"
 
 
 def cse(program: ClosedJaxpr, keeps_solutions: bool = False) -> ClosedJaxpr:
-    """The same program with every common subexpression once, and without what no output needs; products of small
-    matrices, which XLA would hand to a library, are sums of products.
+    """Remove repeated and unused operations of a program, and write out products of small matrices as sums, because XLA
+    would pass these to a library.
 
-    A description is read once for every speed, and much of it comes out the same. XLA would find that too, but only
-    after JAX has differentiated every copy. `keeps_solutions`: a program within it that solves equations remains one
-    equation, so that these are differentiated.
+    A system is evaluated once for each speed, and many results are the same. XLA would also find these, but only after
+    JAX has differentiated every copy. `keeps_solutions`: keep a nested program that solves equations as one equation,
+    so that derivatives use these equations.
     """
-    once = _Once(keeps_solutions)
-    return once.program(program.jaxpr, program.jaxpr.invars, once.walk(program, program.jaxpr.invars))
+    unique = _UniqueEquations(keeps_solutions)
+    return unique.program(program.jaxpr, program.jaxpr.invars, unique.walk(program, program.jaxpr.invars))
 
 
-class _Once:
-    """Equations of programs in one list, each once. They are put down as they stand and not traced anew, which would
-    take as long as all else that is done to a program."""
+class _UniqueEquations:
+    """Equations of programs in one list, each unique. Equations are copied and not traced again, because tracing would
+    take as long as all other transformations together."""
 
     def __init__(self, keeps_solutions: bool = False) -> None:
         self.keeps_solutions = keeps_solutions
         self.equations: list[Any] = []
         self.consts: dict[Any, Any] = {}  # by their variables
-        self._known: dict[Any, Sequence[Any]] = {}  # the outputs of an equation, by its name
+        self._known: dict[Any, Sequence[Any]] = {}  # the outputs of an equation, by its key
 
     def program(self, like: Jaxpr, inputs: Sequence[Any], outputs: Sequence[Any]) -> ClosedJaxpr:
-        """What has been put down, as a program of these inputs, without what no output needs."""
+        """The collected equations as a program with these inputs, without unused equations."""
         jaxpr = like.replace(constvars=[*self.consts], invars=[*inputs], eqns=self.equations, outvars=[*outputs])
         jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(outputs), instantiate=True)
         return ClosedJaxpr(jaxpr, [*self.consts.values()])
 
     def walk(self, program: ClosedJaxpr, inputs: Sequence[Any]) -> list[Any]:
-        """The variables of a program's outputs, where its inputs are these variables or literals."""
+        """The variables of a program's outputs, if its inputs are these variables or literals."""
         return interpret(program, inputs, self.results, self.constant)
 
-    def results(self, equation: Any, xs: list[Any]) -> Sequence[Any]:
+    def results(self, equation: Equation, xs: list[Any]) -> Sequence[Any]:
         inner = None if self.keeps_solutions and is_solution(equation) else opened(equation)
         if inner is not None:
             return self.walk(inner, xs)
-        # Numbers by their bits, all else by identity.
+        # Numbers are compared by their bits, all else by identity.
         key = (equation.primitive, *(_bits(x) if is_literal(x) else id(x) for x in xs), _parameters_of(equation))
         if key not in self._known:
             self._known[key] = self._put_down(equation, xs)
         return self._known[key]
 
-    def constant(self, variable: Any, value: Any) -> Any:
+    def constant(self, variable: Variable, value: Any) -> Any:
         if is_literal(variable):
             return variable
         key = ("const", id(value))
         if key not in self._known:
             self._known[key] = [new_variable(variable)]
-            self.consts[self._known[key][0]] = value  # which keeps it alive, and its id its own
+            self.consts[self._known[key][0]] = value  # keeps the value alive, so that its id stays unique
         return self._known[key][0]
 
-    def _put_down(self, equation: Any, xs: list[Any]) -> Sequence[Any]:
+    def _put_down(self, equation: Equation, xs: list[Any]) -> Sequence[Any]:
         if equation.primitive.name == "dot_general" and is_small(equation):
             specs = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in xs]
             product = jax.make_jaxpr(functools.partial(sum_of_products, equation))(*specs)
@@ -132,11 +134,11 @@ class _Once:
 
 
 def _bits(literal: Any) -> tuple[bytes, str]:
-    return np.asarray(literal.val).tobytes(), str(literal.aval)  # -0.0 == 0.0, and an array's text is rounded
+    return np.asarray(literal.val).tobytes(), str(literal.aval)  # -0.0 == 0.0, and the text of an array is rounded
 
 
-def _parameters_of(equation: Any) -> Any:
-    """What two equations that do the same have in common: their parameters; itself where these cannot be compared."""
+def _parameters_of(equation: Equation) -> Any:
+    """The parameters that two equal equations have in common; the equation's id if they cannot be compared."""
     key = tuple(sorted(equation.params.items()))
     try:
         hash(key)
@@ -145,22 +147,22 @@ def _parameters_of(equation: Any) -> Any:
     return key
 
 
-def opened(equation: Any) -> ClosedJaxpr | None:
-    """What an equation stands for: a program within a program is opened, so that the whole is one."""
+def opened(equation: Equation) -> ClosedJaxpr | None:
+    """The nested program of an equation that can be inlined, so that the whole is one program; else None."""
     if equation.primitive.name == PROGRAM:
-        program, sizes, where = (equation.params[k] for k in ("program", "sizes", "where"))
-        return (program.batched(sizes, where) if sizes else program).program
+        program, sizes, batch_mask = (equation.params[k] for k in ("program", "sizes", "batch_mask"))
+        return (program.batched(sizes, batch_mask) if sizes else program).program
     return equation.params["jaxpr"] if equation.primitive.name in CALLS else None
 
 
-def is_solution(equation: Any) -> bool:
-    """Whether an equation stands for a program whose last result solves linear equations."""
+def is_solution(equation: Equation) -> bool:
+    """Whether an equation is a program whose last result solves linear equations."""
     name, parameters = equation.primitive.name, equation.params
     return name == PROGRAM and parameters["program"].is_solution and not parameters["sizes"]
 
 
 def reads_of(program: Jaxpr) -> tuple[bool, ...]:
-    """Which of its inputs a program reads at all; the first, if it reads none."""
+    """Which of its inputs a program uses; the first one, if it uses none."""
     variables = {v for e in program.eqns for v in e.invars if not is_literal(v)}
     variables.update(v for v in program.outvars if not is_literal(v))
     is_read = tuple(v in variables for v in program.invars)
@@ -173,8 +175,8 @@ def is_fusable(program: Jaxpr) -> bool:
 
 
 def unsupported_primitives(program: Jaxpr, is_ours: bool = False) -> Iterator[tuple[str, bool]]:
-    """The operations that cannot be part of one compiled function, and whether they are the description's own: the
-    method itself has LAPACK solve what is too large to be written out (`linear`)."""
+    """The operations that cannot be part of one compiled function, and whether they belong to the system. The method
+    itself calls LAPACK for systems that are too large to be written out (`linear`)."""
     for equation in program.eqns:
         name, inner = equation.primitive.name, opened(equation)
         if inner is not None:
@@ -188,7 +190,7 @@ def unsupported_primitives(program: Jaxpr, is_ours: bool = False) -> Iterator[tu
 
 
 def replaced(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -> list[Any]:
-    """The values, with new ones in some places."""
+    """The values, with new ones at some indices."""
     values = list(values)
     for i, x in zip(places, new, strict=True):
         values[i] = x
@@ -200,21 +202,22 @@ def specs_of(avals: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
 
 
 def is_inexact(aval: Any) -> bool:
-    """Whether there can be a derivative of this kind of number, or by it."""
+    """Whether numbers of this kind can be differentiated."""
     return jnp.issubdtype(aval.dtype, jnp.inexact)
 
 
 def program_of(f: Callable[..., Any], *specs: Any, return_shape: bool = False) -> Any:
-    """`jax.make_jaxpr(f)(*specs)` without devices that share the work: in `jax.shard_map` JAX places constants on them,
-    which is no operation of scalars."""
+    """`jax.make_jaxpr(f)(*specs)` without a device mesh. In `jax.shard_map`, JAX would place constants on devices,
+    which is not an operation of scalars."""
     with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
         return jax.make_jaxpr(f, return_shape=return_shape)(*specs)
 
 
 class Solved(NamedTuple):
-    """What the last result x of a program solves, M x = b.
+    """The equations M x = b that the last result x of a program solves.
 
-    `equations`: (inputs, x) -> the other results and b - M x. `solve`: (inputs, r) -> the y of M y = r.
+    - `equations`: (inputs, x) -> the other results and b - M x.
+    - `solve`: (inputs, r) -> the y of M y = r.
     """
 
     equations: ClosedJaxpr
@@ -222,163 +225,128 @@ class Solved(NamedTuple):
 
     @classmethod
     def of(cls, both: ClosedJaxpr) -> Solved:
-        """Of a program (inputs, x, r) -> the other results, b - M x and y."""
+        """From a program (inputs, x, r) -> the other results, b - M x and y."""
         jaxpr, n = both.jaxpr, len(both.out_avals)
         *inputs, x, r = jaxpr.invars
 
-        def part(outputs: Sequence[int], invars: Sequence[Any]) -> ClosedJaxpr:
+        def only(outputs: Sequence[int], invars: Sequence[Any]) -> ClosedJaxpr:
             kept, _ = dce_jaxpr(jaxpr, [i in outputs for i in range(n)], instantiate=True)
             return ClosedJaxpr(kept.replace(invars=[*invars]), both.consts)
 
-        return cls(part(range(n - 1), [*inputs, x]), part([n - 1], [*inputs, r]))
+        return cls(only(range(n - 1), [*inputs, x]), only([n - 1], [*inputs, r]))
 
 
-class _Rule(NamedTuple):
-    """What stands for an equation in a derivative: a program, and which of the derivatives it gives are not zero."""
+class _TangentRule(NamedTuple):
+    """The replacement of an equation in a derivative.
+
+    - `program`: (inputs, tangents of the differentiated ones) -> the nonzero tangents of the results.
+    - `given`: which results have a nonzero tangent.
+    """
 
     program: ClosedJaxpr
     given: tuple[bool, ...]
-
-    def written(self, once: _Once, inputs: Sequence[Any]) -> list[Any]:
-        """Its results, written into a program; None for those that are zero."""
-        results = iter(once.walk(self.program, inputs))
-        return [next(results) if is_given else None for is_given in self.given]
 
 
 _rules = Cache(4096)
 
 
-def _rule(f: Callable[..., Sequence[Any]], equation: Any, which: tuple[bool, ...], *inputs: Any) -> _Rule:
-    """The rule of an equation, traced once for all equations alike, where `f` of its `inputs` gives derivatives or
-    None. `which` of the derivatives it takes are not zero."""
-    types = tuple((v.aval.shape, v.aval.dtype, v.aval.weak_type) for v in (*equation.invars, *inputs))
+def _tangent_rule(equation: Equation, differentiated: tuple[bool, ...]) -> _TangentRule:
+    """JAX's rule for an equation with these differentiated inputs, traced once for all equal equations."""
+    types = tuple((v.aval.shape, v.aval.dtype, v.aval.weak_type) for v in equation.invars)
     parameters = _parameters_of(equation)
-    key = (f.__name__, equation.primitive, parameters, which, types, settings())
+    key = (equation.primitive, parameters, differentiated, types, settings())
 
-    def make() -> _Rule:
+    def make() -> _TangentRule:
         given: list[bool] = []
 
-        def derivatives(*xs: Any) -> list[Any]:
-            results = f(equation, which, *xs)
-            given[:] = [x is not None for x in results]
-            return [x for x in results if x is not None]
+        def tangents(*values: Any) -> list[Any]:
+            xs, dxs = values[: len(differentiated)], iter(values[len(differentiated) :])
+            results = tangents_of(equation, xs, [next(dxs) if d else None for d in differentiated])
+            given[:] = [dy is not None for dy in results]
+            return [dy for dy in results if dy is not None]
 
-        return _Rule(program_of(derivatives, *specs_of([v.aval for v in inputs])), tuple(given))
+        avals = [v.aval for v in equation.invars]
+        of_tangents = [aval for aval, d in zip(avals, differentiated, strict=True) if d]
+        return _TangentRule(program_of(tangents, *specs_of([*avals, *of_tangents])), tuple(given))
 
     return make() if isinstance(parameters, int) else _rules.get(key, make)
 
 
-def _tangents(equation: Any, moves: tuple[bool, ...], *values: Any) -> Sequence[Any]:
-    """Of the inputs of an equation, and the tangents of those that move."""
-    xs, dxs = values[: len(moves)], iter(values[len(moves) :])
-    return tangents_of(equation, xs, [next(dxs) if m else None for m in moves])
-
-
-def _cotangents(equation: Any, moves_and_given: tuple[bool, ...], *values: Any) -> Sequence[Any]:
-    """Of the inputs of an equation that do not move, and the cotangents of its results that are given."""
-    n, values_left = len(equation.invars), iter(values)
-    moves, given = moves_and_given[:n], moves_and_given[n:]
-    xs = [None if m else next(values_left) for m in moves]
-    return transposed(equation, xs, moves, [next(values_left) if is_one else None for is_one in given])
-
-
 def tangent_program(
-    program: ClosedJaxpr, moving: Sequence[int], values: bool = False
+    program: ClosedJaxpr, differentiated: Sequence[int], values: bool = False
 ) -> tuple[ClosedJaxpr, tuple[bool, ...]]:
-    """(inputs, tangents of those at the places `moving`) -> tangents of the outputs that move; and which these are.
-    With `values`, all outputs come before these.
+    """The derivative of a program in forward mode.
 
-    Equation by equation, by JAX's rule of each, traced once for all alike. To trace the whole takes four times as long.
-    Where a program solves M x = b, these equations are differentiated at x, and never the solution of the solve:
+    **Arguments:**
+
+    - `program`: the program.
+    - `differentiated`: indices of the inputs to differentiate.
+    - `values`: whether the outputs precede their tangents.
+
+    **Returns:** a program (inputs, tangents of the inputs `differentiated`) -> the nonzero tangents of the outputs, and
+    which outputs have one.
+
+    Each equation is replaced by JAX's rule, which is traced once for all equal equations. Tracing the whole derivative
+    takes four times as long. If a program solves M x = b, these equations are differentiated at x, and not the solution
+    of the solve:
 
         M dx = d(b - M x) at fixed x
     """
     jaxpr: Any = program.jaxpr
-    once, tangents = _Once(), {jaxpr.invars[i]: new_variable(jaxpr.invars[i]) for i in moving}
+    unique, tangents = _UniqueEquations(), {jaxpr.invars[i]: new_variable(jaxpr.invars[i]) for i in differentiated}
 
-    constant = lambda v, x: (once.constant(v, x), None)  # noqa: E731
+    def constant(v: Variable, x: Any) -> tuple[Any, None]:
+        return unique.constant(v, x), None
 
-    def rule(equation: Any, pairs: list[Any]) -> Sequence[Any]:
+    def rule(equation: Equation, pairs: list[Any]) -> Sequence[Any]:
         xs, dxs = [x for x, _ in pairs], [dx for _, dx in pairs if dx is not None]
-        ys = once.results(equation, xs)
+        ys = unique.results(equation, xs)
         if not dxs:
             return [(y, None) for y in ys]
         solved = equation.params["program"].solved if is_solution(equation) else None
         if solved is not None:
             slopes = [dy for _, dy in interpret(solved.equations, [*pairs, (ys[-1], None)], rule, constant)]
             if slopes[-1] is not None:
-                slopes[-1] = once.walk(solved.solve, [*xs, slopes[-1]])[0]
+                slopes[-1] = unique.walk(solved.solve, [*xs, slopes[-1]])[0]
             return [*zip(ys, slopes, strict=True)]
         inner = opened(equation)
         if inner is not None:
             return interpret(inner, pairs, rule, constant)
-        moves = tuple(dx is not None for _, dx in pairs)
-        moved = [v for v, m in zip(equation.invars, moves, strict=True) if m]
-        dys = _rule(_tangents, equation, moves, *equation.invars, *moved).written(once, [*xs, *dxs])
-        return [*zip(ys, dys, strict=True)]
+        program, given = _tangent_rule(equation, tuple(dx is not None for _, dx in pairs))
+        dys = iter(unique.walk(program, [*xs, *dxs]))
+        return [(y, next(dys) if is_given else None) for y, is_given in zip(ys, given, strict=True)]
 
     inputs = [(v, tangents.get(v)) for v in jaxpr.invars]
     pairs = interpret(program, inputs, rule, constant)
     results = [*(y for y, _ in pairs if values), *(dy for _, dy in pairs if dy is not None)]
-    return once.program(jaxpr, [*jaxpr.invars, *tangents.values()], results), tuple(dy is not None for _, dy in pairs)
+    return unique.program(jaxpr, [*jaxpr.invars, *tangents.values()], results), tuple(dy is not None for _, dy in pairs)
 
 
 def transposed_program(program: ClosedJaxpr, linear: Sequence[int]) -> ClosedJaxpr:
-    """(the other inputs, cotangents of the outputs) -> cotangents of the inputs at the places `linear`.
+    """(the other inputs, cotangents of the outputs) -> cotangents of the inputs with the indices `linear`."""
+    specs, f = specs_of(program.in_avals), jaxpr_as_fun(program)
+    others = [i for i in range(len(specs)) if i not in linear]
 
-    Equations that do not depend on these are put down as they stand, the others by JAX's rule of each, from the last to
-    the first. `jax.linear_transpose` traces the whole program twice, which takes longer than all that JAX does besides.
-    """
-    jaxpr: Any = program.jaxpr
-    once, inputs = _Once(), [v for i, v in enumerate(jaxpr.invars) if i not in linear]
-    moved: set[Any] = {jaxpr.invars[i] for i in linear}
-    moves = lambda v: not is_literal(v) and v in moved  # noqa: E731
-    values: dict[Any, Any] = dict(zip(inputs, inputs, strict=True))
-    values.update(zip(jaxpr.constvars, map(once.constant, jaxpr.constvars, program.consts), strict=True))
-    read = lambda v: v if is_literal(v) else values[v]  # noqa: E731
-    moving = []
-    for equation in jaxpr.eqns:
-        if any(map(moves, equation.invars)):
-            moving.append(equation)
-            moved.update(equation.outvars)
-        else:
-            values.update(zip(equation.outvars, once.results(equation, [*map(read, equation.invars)]), strict=True))
-    sums: dict[Any, Any] = {}
+    def transpose(*values: Any) -> PyTree:
+        fixed = replaced([None] * len(specs), others, values[: len(others)])
 
-    def add(variables: Sequence[Any], cts: Sequence[Any]) -> None:
-        for v, ct in zip(variables, cts, strict=True):
-            if ct is not None and moves(v):
-                sums[v] = once.walk(_sum_of(v.aval), [sums[v], ct])[0] if v in sums else ct
+        def of_linear(*xs: Any) -> PyTree:
+            return f(*replaced(fixed, linear, xs))
 
-    cotangents = [*map(new_variable, jaxpr.outvars)]
-    add(jaxpr.outvars, cotangents)
-    for equation in reversed(moving):
-        cts = [sums.pop(v, None) for v in equation.outvars]
-        given = [(v, ct) for v, ct in zip(equation.outvars, cts, strict=True) if ct is not None]
-        if given:
-            which = (*map(moves, equation.invars), *(ct is not None for ct in cts))
-            fixed = [v for v in equation.invars if not moves(v)]
-            rule = _rule(_cotangents, equation, which, *fixed, *(v for v, _ in given))
-            add(equation.invars, rule.written(once, [*map(read, fixed), *(ct for _, ct in given)]))
-    zeros = lambda aval: once.walk(program_of(lambda: jnp.zeros(aval.shape, aval.dtype)), [])[0]  # noqa: E731
-    results = [sums[v] if v in sums else zeros(v.aval) for v in (jaxpr.invars[i] for i in linear)]
-    return once.program(jaxpr, [*inputs, *cotangents], results)
+        return jax.linear_transpose(of_linear, *[specs[i] for i in linear])([*values[len(others) :]])
+
+    return cse(program_of(transpose, *[specs[i] for i in others], *specs_of(program.out_avals)))
 
 
-def _sum_of(aval: Any) -> ClosedJaxpr:
-    specs = specs_of([aval, aval])
-    return _rules.get(("sum", aval.shape, aval.dtype, aval.weak_type), lambda: program_of(jax.lax.add, *specs))
-
-
-Direction = tuple[int, int]  # an argument and the place of the element in it
+Direction = tuple[int, int]  # an argument, and the index of an element in it
 
 
 def jacobian(
     program: ClosedJaxpr, inputs: Sequence[np.ndarray], directions: Sequence[Direction], graph: Graph
 ) -> list[np.ndarray]:
-    """The derivatives (..., d) of each output by d elements of the inputs, as nodes of the graph."""
-    moving = sorted({i for i, _ in directions})
-    tangents, moved = tangent_program(program, moving)
+    """The derivatives (..., d) of each output with respect to d elements of the inputs, as nodes of the graph."""
+    differentiated = sorted({i for i, _ in directions})
+    tangents, has_tangent = tangent_program(program, differentiated)
     jaxpr: Any = tangents.jaxpr
     avals = types_of(program)
     values = dict(zip(jaxpr.invars, inputs, strict=False)) | {
@@ -386,44 +354,45 @@ def jacobian(
     }
     of_direction = set(jaxpr.invars[len(inputs) :])
     later = []
-    for equation in jaxpr.eqns:  # what depends on the direction waits
+    for equation in jaxpr.eqns:  # equations that depend on the direction are evaluated later, for each direction
         if of_direction.isdisjoint(v for v in equation.invars if not is_literal(v)):
             values.update(zip(equation.outvars, _outputs(equation, values, graph), strict=True))
         else:
             of_direction.update(equation.outvars)
             later.append(equation)
-    moves = _Moves(graph)
+    sparse = _SparseGraph(graph)
     columns = []
     for argument, element in directions:
         along = dict(values)
-        for v, i in zip(jaxpr.invars[len(inputs) :], moving, strict=True):
+        for v, i in zip(jaxpr.invars[len(inputs) :], differentiated, strict=True):
             along[v] = np.full(v.aval.shape, NOTHING, np.int64)
             if i == argument:
                 along[v].flat[element] = graph.constant(1.0, str(v.aval.dtype))
         for equation in later:
-            along.update(zip(equation.outvars, _outputs(equation, along, moves), strict=True))
-        slopes = iter([_read(v, along, moves) for v in jaxpr.outvars])
-        outputs = [(next(slopes) if m else np.full(aval.shape, NOTHING), aval) for m, aval in zip(moved, avals[1])]
-        columns.append([moves.instantiated(x, str(aval.dtype)) for x, aval in outputs])
+            along.update(zip(equation.outvars, _outputs(equation, along, sparse), strict=True))
+        slopes = iter([_read(v, along, sparse) for v in jaxpr.outvars])
+        pairs = zip(has_tangent, avals[1], strict=True)
+        outputs = [(next(slopes) if has else np.full(aval.shape, NOTHING), aval) for has, aval in pairs]
+        columns.append([sparse.instantiated(x, str(aval.dtype)) for x, aval in outputs])
     return [
         np.stack([column[i] for column in columns], axis=-1) if columns else np.zeros((*aval.shape, 0), np.int64)
         for i, aval in enumerate(avals[1])
     ]
 
 
-def _outputs(equation: Any, values: dict[Any, np.ndarray], graph: Any) -> list[np.ndarray]:
+def _outputs(equation: Equation, values: dict[Any, np.ndarray], graph: Any) -> list[np.ndarray]:
     return applied(equation, [_read(v, values, graph) for v in equation.invars], graph)
 
 
-def _read(v: Any, values: dict[Any, np.ndarray], graph: Any) -> np.ndarray:
+def _read(v: Variable, values: dict[Any, np.ndarray], graph: Any) -> np.ndarray:
     return as_constants(v, v.val, graph) if is_literal(v) else values[v]
 
 
-NOTHING = -1  # in the place of a node: no derivative at all
+NOTHING = -1  # instead of a node number: the derivative is zero
 
 
-class _Moves:
-    """A graph, for operations on derivatives of which some are `NOTHING`."""
+class _SparseGraph:
+    """A graph for operations on derivatives, of which some are `NOTHING`."""
 
     def __init__(self, graph: Graph):
         self.graph = graph

@@ -1,7 +1,8 @@
-"""Values that do not exist: NaN, and so is their derivative; and derivatives that are left out. Knows arrays only.
+"""Missing values are NaN, and so are their derivatives. Depends on arrays only.
 
-`jnp.where(missing, jnp.nan, x)` has the derivative zero where it is NaN, and an optimizer takes that for the end of its
-search. A factor NaN instead would be read in reverse mode even by who does not read what is missing: 0 * NaN is NaN.
+`jnp.where(missing, jnp.nan, x)` has the derivative zero where it is NaN, and an optimizer would regard that as
+convergence. Multiplying by NaN does not work: in reverse mode a zero cotangent times NaN is NaN, even if the missing
+value is never used.
 """
 
 from __future__ import annotations
@@ -14,71 +15,73 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, PyTree
 
 
-def nan_where(missing: Bool[Array, " *leading"], values: Any, origin: Any) -> Any:
-    """`values`, and NaN where they are missing, with derivatives of any order that are NaN there too.
+def nan_where(missing: Bool[Array, " *leading"], values: PyTree, origin: PyTree) -> PyTree:
+    """`values`, with NaN where they are missing; derivatives of any order are NaN there too.
 
     **Arguments:**
 
-    - `missing` (*leading): where there is no value. `values`: arrays (*leading, ...).
-    - `origin`: all that the values follow from; its float arrays are what derivatives are taken by.
+    - `missing` (*leading): where values are missing.
+    - `values`: arrays (*leading, ...).
+    - `origin`: all data from which the values are computed. Derivatives are taken with respect to its float arrays.
 
-    The derivative of what is missing is NaN along every direction in which `origin` moves, and zero where it does not.
-    In reverse mode, what is missing and not read adds exactly zero.
+    The derivative of a missing value is NaN in every direction in which `origin` changes, and zero in the others. In
+    reverse mode, a missing value that is not used contributes exactly zero.
     """
     return _masked(False, missing, values, origin)
 
 
-def nan_derivative_where(rough: Bool[Array, " *leading"], values: Any, origin: Any) -> Any:
-    """`values` as they are, with derivatives of any order that are NaN where they are `rough`. As `nan_where`."""
+def nan_derivative_where(rough: Bool[Array, " *leading"], values: PyTree, origin: PyTree) -> PyTree:
+    """`values` unchanged, with derivatives of any order that are NaN where they are `rough`. Arguments as
+    `nan_where`."""
     return _masked(True, rough, values, origin)
 
 
-def all_finite(values: Any) -> Bool[Array, ""]:
-    """Whether all float arrays in these are finite."""
+def all_finite(values: PyTree) -> Bool[Array, ""]:
+    """Whether all float arrays in a tree are finite."""
     return jnp.all(jnp.isfinite(flat(jax.lax.stop_gradient(eqx.filter(values, eqx.is_inexact_array)))))
 
 
-def flat(values: Any) -> Array:
-    """All float arrays one after the other, real and imaginary parts apart."""
+def flat(values: PyTree) -> Array:
+    """All float arrays in one row, with separate real and imaginary parts."""
     parts = _raveled(values)
     return jnp.concatenate(parts) if parts else jnp.zeros(0)
 
 
-def parts_of(values: Any) -> list[Array]:
-    """All float arrays, real and imaginary parts apart: single numbers are one array, the others stay what they are."""
+def parts_of(values: PyTree) -> list[Array]:
+    """All float arrays, with separate real and imaginary parts. Scalars are combined in one array, other arrays do not
+    change."""
     parts = _raveled(values)
     single = [x for x in parts if x.size == 1]
     return [*([jnp.concatenate(single)] if single else []), *[x for x in parts if x.size > 1]]
 
 
-def _raveled(values: Any) -> list[Array]:
+def _raveled(values: PyTree) -> list[Array]:
     parts = [jnp.ravel(x) for x in jax.tree.leaves(values) if eqx.is_inexact_array(x)]
     return [part for x in parts for part in ((x.real, x.imag) if jnp.iscomplexobj(x) else (x,))]
 
 
-def constant(values: Any) -> Any:
-    """The same arrays, of which nothing has a derivative."""
+def constant(values: PyTree) -> PyTree:
+    """The same arrays without derivatives."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, values)
 
 
-def derivative_free_where_not_finite(f: Callable[..., Any], *arguments: Any) -> Any:
-    """`f(*arguments)`, with the derivative zero where any of its values is not finite.
+def derivative_free_where_not_finite(f: Callable[..., Any], *arguments: Any) -> PyTree:
+    """`f(*arguments)`, with zero derivatives if any of its values is not finite.
 
-    For trial values that will be thrown away: nobody reads them, but in reverse mode 0 * NaN would spoil the
-    derivative of what `f` reads. Closed-over arrays count as arguments.
+    For trial values that are discarded: they are not used, but in reverse mode 0 * NaN would make the derivatives with
+    respect to the arguments NaN. Closed-over arrays count as arguments.
     """
     value, moving, fixed = _of_arrays(f, arguments)
 
     @jax.custom_jvp
-    def gated(moving: Any, fixed: Any) -> Any:
+    def gated(moving: PyTree, fixed: PyTree) -> PyTree:
         return value(moving, fixed)
 
     @gated.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
+    def _(primals: PyTree, tangents: PyTree) -> PyTree:
         (moving, fixed), (moving_dot, _) = primals, tangents
         y, slope = jax.linearize(lambda moving: value(moving, fixed), moving)
         finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(y)]))
@@ -87,46 +90,41 @@ def derivative_free_where_not_finite(f: Callable[..., Any], *arguments: Any) -> 
     return gated(moving, fixed)
 
 
-def negligible(f: Callable[..., Array], *arguments: Any, transposes: bool = True) -> Array:
-    """Zeros for the array `f(*arguments)`, whose value and first derivative are negligible, as of a product of two
-    numbers that are both small; its second derivatives are those of `f`. Closed-over arrays count as arguments.
+def nan_beyond_second_derivative(rough: Bool[Array, ""], values: PyTree, origin: PyTree) -> PyTree:
+    """`values`, with derivatives that are NaN from the third order on if they are `rough`. Arguments as `nan_where`."""
+    parts = parts_of(origin)
 
-    The derivatives of `f` are compiled only where second ones are asked for. `transposes`: whether any derivative is
-    in reverse mode, for which `f` is transposed at once.
-    """
-    value, moving, fixed = _of_arrays(f, arguments)
+    def one(x: Array) -> Array:
+        point = [part.astype(x.dtype) for part in parts]
+        return x + jnp.broadcast_to(_zero_until(3, rough, jnp.zeros((), x.dtype), point), x.shape)
 
-    @jax.custom_jvp
-    def zero(moving: Any, fixed: Any) -> Array:
-        y = jax.eval_shape(value, moving, fixed)
-        return jnp.where(_never(flat(moving)), jnp.nan, jnp.zeros(y.shape, y.dtype))
-
-    @zero.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        # The solution of dy - J dx = 0, dx = dx, is said to be dy = 0, but is differentiated as it is. It is one array,
-        # since JAX transposes no such equations of which a part of the right-hand side is known.
-        (moving, fixed), (moving_dot, _) = primals, tangents
-        y, (x_dot, as_tree) = zero(moving, fixed), ravel_pytree(moving_dot)
-
-        def equations(both: Array) -> Array:
-            y_dot, x_dot = both[: y.size], both[y.size :]
-            slope = jax.jvp(lambda x: value(x, fixed), (moving,), (as_tree(x_dot),))[1]
-            return jnp.concatenate([y_dot - jnp.ravel(slope).astype(both.dtype), x_dot])
-
-        right, given = jnp.pad(x_dot, (y.size, 0)), lambda _, right: right
-        solution = jax.lax.custom_linear_solve(equations, right, given, given if transposes else None)
-        return y, solution[: y.size].reshape(y.shape).astype(y.dtype)
-
-    return zero(moving, fixed)
+    return jax.tree.map(one, values)
 
 
-def _of_arrays(f: Callable[..., Any], arguments: Any) -> tuple[Callable[..., Any], Any, Any]:
-    """`f(*arguments)` as a function of its float arrays and its others, closed-over ones among them; and these."""
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _zero_until(order: int, rough: Array, zero: Array, point: list[Array]) -> Array:
+    """Zero; its derivatives are zero below this order and NaN from this order on."""
+    return jnp.where(_never(*point), jnp.nan, zero)
+
+
+@functools.partial(_zero_until.defjvp, symbolic_zeros=True)
+def _(order: int, primals: PyTree, tangents: PyTree) -> PyTree:
+    (rough, zero, point), point_dot = primals, tangents[2]
+    moving = [tangent for tangent in point_dot if not isinstance(tangent, SymbolicZero)]
+    y = _zero_until(order, rough, zero, point)
+    if order == 1:
+        return y, jnp.where(rough, nan_if_moved(moving, point, zero), zero)
+    return y, _zero_until(order - 1, rough, zero, point) * sum(map(jnp.sum, moving), zero)
+
+
+def _of_arrays(f: Callable[..., Any], arguments: PyTree) -> tuple[Callable[..., Any], Any, Any]:
+    """`f(*arguments)` as a function of its float arrays and its other arrays, including closed-over ones. **Returns:**
+    this function, the float arrays and the others."""
     f = eqx.filter_closure_convert(f, *arguments)
     moving, other = eqx.partition((f, arguments), eqx.is_inexact_array)
     fixed, rest = eqx.partition(other, eqx.is_array)
 
-    def value(moving: Any, fixed: Any) -> Any:
+    def value(moving: PyTree, fixed: PyTree) -> PyTree:
         f, arguments = eqx.combine(moving, fixed, rest)
         return f(*arguments)
 
@@ -134,12 +132,12 @@ def _of_arrays(f: Callable[..., Any], arguments: Any) -> tuple[Callable[..., Any
 
 
 def _never(*points: Array) -> Array:
-    """False, and in a batch where any of `points` is: what is batched in a derivative must be so in the value, or JAX
-    takes the one for the other inside of a loop."""
+    """Always False, but batched if any of `points` is. Primal and tangent must have the same batch axes inside a
+    `while_loop`."""
     return functools.reduce(jnp.logical_or, [jnp.any(jnp.isnan(x)) for x in points], jnp.array(False)) & False
 
 
-def _masked(shown: bool, missing: Array, values: Any, origin: Any) -> Any:
+def _masked(shown: bool, missing: Array, values: PyTree, origin: PyTree) -> PyTree:
     parts = parts_of(origin)
 
     def one(x: Array) -> Array:
@@ -161,9 +159,9 @@ def _mask(shown: bool, missing: Array, x: Array, point: list[Array]) -> Array:
     return jnp.where(missing, x if shown else jnp.full_like(x, jnp.nan), x)
 
 
-# A part of the point that does not move, as the times of samples, takes no part in the derivative.
+# A part of the point without a tangent, e.g. the times of samples, does not contribute to the derivative.
 @functools.partial(_mask.defjvp, symbolic_zeros=True)
-def _(shown: bool, primals: Any, tangents: Any) -> Any:
+def _(shown: bool, primals: PyTree, tangents: PyTree) -> PyTree:
     (missing, x, point), (_, x_dot, point_dot) = primals, tangents
     if isinstance(x_dot, SymbolicZero):
         x_dot = jnp.zeros_like(x)
@@ -172,16 +170,16 @@ def _(shown: bool, primals: Any, tangents: Any) -> Any:
 
 
 def nan_if_moved(tangents: list[Array], point: list[Array], like: Array) -> Array:
-    """NaN everywhere if a `point`, which has these tangents or some of them, moves; else zero. `like`: of what shape
-    and type. Twice, so that neither tangents nor cotangents cancel in the sum."""
-    moves = sum([jnp.sum(_nan_if_not_zero(x, point)) for x in tangents], jnp.zeros((), like.dtype))
-    return _nan_if_not_zero(jnp.broadcast_to(moves, like.shape), point)
+    """NaN everywhere if a `point` with these tangents changes, else zero. `like`: shape and dtype of the result.
+    `nan_if_not_zero` is applied before and after the sum, so that neither tangents nor cotangents cancel."""
+    moves = sum([jnp.sum(nan_if_not_zero(x, point)) for x in tangents], jnp.zeros((), like.dtype))
+    return nan_if_not_zero(jnp.broadcast_to(moves, like.shape), point)
 
 
-def _nan_if_not_zero(b: Array, point: list[Array]) -> Array:
-    """The x of 0 x = b: zero for b = 0, else there is none. Linear in b, and its own transpose.
+def nan_if_not_zero(b: Array, point: list[Array]) -> Array:
+    """The x of 0 x = b: zero for b = 0, else NaN. Linear in b, and its own transpose.
 
-    The zero belongs to a `point`: where it moves, the derivative of an x that does not exist does not exist either.
+    The zero belongs to a `point`: if it changes, the derivative of a NaN is NaN too.
     """
     return jax.lax.custom_linear_solve(
         lambda x: _zero_times(x, point), b, lambda _, b: jnp.where(b == 0, jnp.zeros_like(b), jnp.nan), symmetric=True
@@ -190,11 +188,11 @@ def _nan_if_not_zero(b: Array, point: list[Array]) -> Array:
 
 @jax.custom_jvp
 def _zero_times(x: Array, point: list[Array]) -> Array:
-    # Not a constant: what is batched in the derivative must be so in the value.
+    # Not a constant: primal and tangent must have the same batch axes.
     return 0.0 * (x + sum(map(jnp.sum, point), jnp.zeros((), x.dtype)))
 
 
 @_zero_times.defjvp
-def _(primals: Any, tangents: Any) -> Any:
+def _(primals: PyTree, tangents: PyTree) -> PyTree:
     (x, point), (_, tangents) = primals, tangents
     return _zero_times(x, point), jnp.where(x == 0, jnp.zeros_like(x), nan_if_moved(tangents, point, x))

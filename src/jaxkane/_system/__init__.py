@@ -1,1 +1,1 @@
-"""How a mechanism is described: vectors, frames, points, bodies, loads, the system. Differentiates nothing."""
+"""The parts of a model: vectors, frames, points, bodies, loads, the system. The equations of motion are in `_kane`."""

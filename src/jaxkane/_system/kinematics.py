@@ -1,8 +1,8 @@
-"""Vectors, frames and points as on paper, and auxiliary speeds. Knows no body and no equation of motion.
+"""Vectors, frames, points and auxiliary speeds. Does not depend on bodies or equations of motion.
 
-A vector keeps its three components in the frame where they are simple, exact zeros and ones included, and is resolved
-in another frame only when two frames meet. A point knows its velocity, and its position as a chain of vectors that is
-summed only when it is needed.
+A vector stores its components in the frame in which they were given, including exact zeros and ones. It is resolved
+in another frame only if an operation needs this. A point stores its velocity and a chain of vectors to the origin. The
+chain is summed only if the position is needed.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .. import rotations
 from .._scalarjit.components import (
     ZERO3,
     Component,
+    Numbers,
     Triple,
     add3,
     component,
@@ -36,12 +37,13 @@ from .._scalarjit.components import (
     stack,
 )
 from ..rotations import Matrix
+from .prints import text_of
 
 
 class AuxiliarySpeed(NamedTuple):
-    """A velocity and a displacement that one point or frame does not have: the textbook's auxiliary speed.
+    """An auxiliary speed of the textbook: a virtual velocity and displacement of one point or frame.
 
-    For a frame, an angular velocity and a small rotation. Components are in N.
+    For a frame, these are an angular velocity and a small rotation. Components are in N.
     """
 
     number: int
@@ -54,10 +56,10 @@ _AUXILIARY: contextvars.ContextVar[AuxiliarySpeed | None] = contextvars.ContextV
 
 @contextlib.contextmanager
 def auxiliary_speed(part: Point | Frame, *, velocity: Triple = ZERO3, displacement: Triple = ZERO3) -> Iterator[None]:
-    """Descriptions evaluated in this context give a point or frame an auxiliary speed; what is built from it follows.
+    """A context in which a point or frame, and everything that is derived from it, has an auxiliary speed.
 
-    `part` comes from an evaluation without one, and is known by its number: frames and points are numbered as they are
-    made, in an order that every evaluation repeats.
+    `part` comes from an evaluation without auxiliary speed. It is identified by its number: frames and points are
+    numbered in the order in which they are created, which is the same in every evaluation.
     """
     token = _AUXILIARY.set(AuxiliarySpeed(part.number, velocity, displacement))
     try:
@@ -67,36 +69,36 @@ def auxiliary_speed(part: Point | Frame, *, velocity: Triple = ZERO3, displaceme
 
 
 def inertial() -> tuple[Frame, Point]:
-    """The inertial frame N and its origin O, the root of a description. Call it once, at the top of `motion`."""
+    """Return the inertial frame N and its origin O. Call this function once, at the start of `motion`."""
     N = Frame("N", None, rotations.IDENTITY, ZERO3)
     N._auxiliary = _AUXILIARY.get()
     return N, Point(Vector(N, ZERO3), None, Vector(N, ZERO3), "O")
 
 
 class Vector:
-    """A vector of space: components in one frame, exact zeros and ones kept.
+    """A vector with components in one frame. Exact zeros and ones remain exact.
 
-    Sums, multiples, `dot`, `cross` and `norm` as on paper, across frames; `v.to(frame)` gives its components as an
-    array of shape (3,).
+    Sums, multiples, `dot`, `cross` and `norm` accept vectors of different frames. `v.to(frame)` returns the components
+    in a frame as an array (3,).
     """
 
     __slots__ = ("_above", "_resolved", "components", "frame", "mixed")
-    __array_ufunc__ = None  # a NumPy number on the left leaves the product to __rmul__
+    __array_ufunc__ = None  # let __rmul__ handle products with a NumPy number on the left
 
     def __init__(self, frame: Frame, components: Triple, mixed: bool = False):
         self.frame = frame
         self.components = components
-        self.mixed = mixed  # summed from vectors of different frames: no frame in which it is fixed is known
+        self.mixed = mixed  # a sum of vectors of different frames need not be fixed in any frame
         self._resolved: dict[Frame, Triple] | None = None
         self._above: Vector | None = None  # the same vector in the parent frame
 
     def __repr__(self) -> str:
-        a, b, c = self.components
-        name = self.frame.name
-        return f"{a}*{name}.x + {b}*{name}.y + {c}*{name}.z"
+        axes = zip(self.components, "xyz", strict=True)
+        terms = [f"{text_of(a)}*{self.frame.name}.{axis}" for a, axis in axes if not is_zero(a)]
+        return " + ".join(terms).replace("+ -", "- ") or "0"
 
     def components_in(self, frame: Frame) -> Triple:
-        """The three components in `frame`, exact ones as Python floats."""
+        """The three components in `frame`. Exact components are Python floats."""
         if frame is self.frame or all(is_zero(a) for a in self.components):
             return self.components
         if self._resolved is None:
@@ -106,13 +108,18 @@ class Vector:
         return self._resolved[frame]
 
     def _resolve(self, frame: Frame) -> Triple:
-        # Step by step, and every step is remembered: a vector that all links of a chain need costs each one step.
+        # Resolve frame by frame and cache each result. A vector that all links of a chain need costs one step per link.
         if not isinstance(frame, Frame):
-            raise TypeError(f"A Vector has components in a Frame, got {frame!r}.")
+            raise TypeError(f"The components of a Vector need a Frame, got {frame!r}.")
         if self.frame.root is not frame.root:
+            # All inertial frames are the same: `events` may call `inertial()` beside `motion`.
+            if self.frame.parent is None:
+                return Vector(frame.root, self.components).components_in(frame)
+            if frame.parent is None:
+                return self.components_in(self.frame.root)
             raise ValueError(
                 f"The frames {self.frame.name} and {frame.name} have no common inertial frame. Call "
-                "jaxkane.inertial() once in `motion`, and in `loads` take the frames from the motion it receives."
+                "jaxkane.inertial() once in `motion`. In `loads`, use the frames of the motion that it receives."
             )
         if frame.depth > self.frame.depth:
             above = self.components_in(frame.parent)  # type: ignore[arg-type]
@@ -123,11 +130,11 @@ class Vector:
         return self._above.components_in(frame)
 
     def to(self, frame: Frame) -> Float[Array, 3]:
-        """Components in `frame`, an array of shape (3,)."""
+        """Return the components in `frame` as an array (3,)."""
         return stack([self.components_in(frame)])[0]
 
     def express(self, frame: Frame) -> Vector:
-        """The same vector, its components kept in `frame` from here on."""
+        """Return the same vector with components in `frame`."""
         return Vector(frame, self.components_in(frame), self.mixed)
 
     def __add__(self, other: Vector) -> Vector:
@@ -172,35 +179,38 @@ class Vector:
         return Vector(frame, cross(a, b), mixed=self.mixed or other.mixed or self.frame is not other.frame)
 
     def norm(self) -> Component:
-        """The length. Its derivative is infinite where the vector is zero."""
+        """The length. Its derivative is infinite if the vector is zero."""
         if all(is_exact(a) for a in self.components):
             return math.hypot(*self.components)
         return jnp.sqrt(dot(self.components, self.components))
 
     def normalize(self) -> Vector:
-        """The unit vector in this direction. **Raises:** `ValueError` for a vector that is exactly zero."""
+        """The unit vector in this direction.
+
+        **Raises:** `ValueError` if the vector is exactly zero.
+        """
         length = self.norm()
         if not is_exact(length):
             return self / length
         if length == 0.0:
             raise ValueError(
-                f"The vector {self} is zero, and has no direction: an axis, a normal, or the line between two points "
-                "that are always in one place."
+                f"The vector {self} is zero, so it has no direction. Check the axis or the normal, or whether two "
+                "points always coincide."
             )
         return self if abs(length - 1.0) < 1e-15 else self / length
 
     def _is_denser_than(self, other: Vector) -> bool:
-        count = lambda v: sum(not is_zero(a) for a in v.components)  # noqa: E731
-        return count(self) >= count(other)
+        n, n_other = (sum(not is_zero(a) for a in v.components) for v in (self, other))
+        return n >= n_other
 
 
 def check_vector(value: Any, verb: str) -> None:
     if not isinstance(value, Vector):
-        raise TypeError(f"{verb} takes a Vector such as 3.0 * N.x, got {value!r}.")
+        raise TypeError(f"{verb} needs a Vector such as 3.0 * N.x, got {value!r}.")
 
 
 def _meet(a: Vector, b: Vector) -> tuple[Frame, Triple, Triple]:
-    # The deeper frame is where both are likely to be needed next: velocities are built from the root outwards.
+    # Use the deeper frame, because velocities are computed from the root outwards and are needed there next.
     frame = a.frame if a.frame.depth >= b.frame.depth else b.frame
     return frame, a.components_in(frame), b.components_in(frame)
 
@@ -208,8 +218,9 @@ def _meet(a: Vector, b: Vector) -> tuple[Frame, Triple, Triple]:
 class Frame:
     """A rigid frame: a parent, a rotation and an angular velocity.
 
-    Frames are made from other frames, the first by `jaxkane.inertial()`. `frame.x`, `frame.y`, `frame.z` are its unit
-    vectors (the textbook's 1, 2 and 3), `frame.vector(a, b, c)` any other vector that is simple in it.
+    Create the first frame with `jaxkane.inertial()`, and other frames with the methods of a frame. `frame.x`,
+    `frame.y` and `frame.z` are the unit vectors (1, 2 and 3 in the textbook). `frame.vector(a, b, c)` is a vector with
+    these components.
     """
 
     __slots__ = ("_auxiliary", "_n_made", "_omega", "_spin", "_to_child", "_units", "depth", "name", "number", "parent")
@@ -221,7 +232,7 @@ class Frame:
         self._spin = spin  # angular velocity relative to the parent, in this frame's components
         self._omega: Vector | None = None
         self._units: tuple[Vector, Vector, Vector] | None = None
-        self._n_made: int = 0  # frames and points of this root
+        self._n_made: int = 0  # number of frames and points of this root
         self._auxiliary: AuxiliarySpeed | None = None
         self.number = 0 if parent is None else self.root._next_number()
         self._to_child = to_child  # components in the parent -> components in this frame
@@ -239,7 +250,7 @@ class Frame:
         return self._n_made
 
     def _auxiliary_speed(self) -> AuxiliarySpeed | None:
-        """That of this frame, if it has one."""
+        """The auxiliary speed of this frame, if it has one."""
         auxiliary = self.root._auxiliary if self.parent is not None else None
         return auxiliary if auxiliary is not None and auxiliary.number == self.number else None
 
@@ -273,7 +284,7 @@ class Frame:
 
     @property
     def angular_velocity(self) -> Vector:
-        """Angular velocity in the inertial frame [rad/s]: the sum of all spins from the root on (summation rule)."""
+        """Angular velocity in the inertial frame [rad/s]: the sum of all relative ones (summation rule)."""
         if self._omega is None:
             if self.parent is None:
                 self._omega = Vector(self, ZERO3)
@@ -286,17 +297,17 @@ class Frame:
         return self._omega
 
     def rotate(self, axis: int | Vector, angle: Component, rate: Component, name: str | None = None) -> Frame:
-        """A frame turned from this one about one axis.
+        """A frame that is rotated from this frame about one axis.
 
         **Arguments:**
 
-        - `axis`: 1, 2 or 3, or a vector that is fixed in this frame (a hinge in any direction). Its length is of no
-            account: an exact one is brought to 1 beforehand, and a unit vector costs nothing.
+        - `axis`: 1, 2 or 3, or a vector that is fixed in this frame. The length of the vector does not matter. Exact
+            vectors are normalized once, while tracing.
         - `angle`: right-hand rotation about the axis [rad].
-        - `rate`: its time derivative [rad/s]; 0.0 for a fixed tilt.
-        - `name`: for error messages and pictures.
+        - `rate`: the time derivative of the angle [rad/s]. Pass 0.0 for a fixed rotation.
+        - `name`: used in error messages and animations.
 
-        **Raises:** `ValueError` for an axis that is none of these, or a vector that is exactly zero.
+        **Raises:** `ValueError` for any other axis, and for a vector that is exactly zero.
         """
         angle, rate = component(angle), component(rate)
         if isinstance(axis, Vector):
@@ -306,7 +317,7 @@ class Frame:
         else:
             if isinstance(axis, bool) or not isinstance(axis, (int, np.integer)) or axis not in (1, 2, 3):
                 raise ValueError(
-                    f"{self.name}.rotate(axis, angle, rate): the axis is the whole number 1, 2 or 3, or a Vector as "
+                    f"{self.name}.rotate(axis, angle, rate): the axis must be 1, 2 or 3, or a Vector such as "
                     f"{self.name}.vector(0, 1, 1); got {axis!r}."
                 )
             direction = rotations.IDENTITY[axis - 1]
@@ -322,19 +333,23 @@ class Frame:
         angular_velocity: Sequence[Component] | Vector | None = None,
         name: str | None = None,
     ) -> Frame:
-        """A frame turned from this one by a body-fixed sequence, such as "3-2-1", "3-1-2", "3-1-3" or "1-2-3".
+        """A frame that is rotated from this frame by a body-fixed sequence, such as "3-2-1", "3-1-2" or "3-1-3".
+
+        Pass either `rates` or `angular_velocity`.
 
         **Arguments:**
 
         - `sequence`: the axes in their order.
         - `angles`: one for each axis [rad].
-        - `rates`: their time derivatives [rad/s]. Or, where the speeds are angular velocity components:
-        - `angular_velocity`: relative to this frame [rad/s]: three components in the new frame, or a Vector.
+        - `rates`: the time derivatives of the angles [rad/s].
+        - `angular_velocity`: relative to this frame [rad/s], three components in the new frame or a Vector.
         """
         axes = rotations.axes_of(sequence)
         angles = components(angles, len(axes), f"The sequence {sequence!r} takes {len(axes)} angles")
         if (rates is None) == (angular_velocity is None):
-            raise ValueError("rotate_sequence takes either the `rates` of the angles or the `angular_velocity`.")
+            raise ValueError(
+                "rotate_sequence: pass either the `rates` of the angles or the `angular_velocity`, not both."
+            )
         if rates is None:
             rotation = rotations.sequence_matrix(sequence, angles)
             return self._oriented(rotation, angular_velocity, name)  # type: ignore[arg-type]
@@ -351,13 +366,13 @@ class Frame:
         angular_velocity: Sequence[Component] | Vector | None = None,
         name: str | None = None,
     ) -> Frame:
-        """A frame oriented in this one by Euler parameters.
+        """A frame that is rotated from this frame by Euler parameters.
 
         **Arguments:**
 
-        - `parameters`: (e1, e2, e3, e4) of unit norm, e4 the scalar: scalar last, as in the textbook.
-        - `angular_velocity`: relative to this frame [rad/s]: three components in the new frame, or a Vector. None for a
-            fixed rotation, as of a sensor on its body; the norm of its parameters is of no account.
+        - `parameters`: (e1, e2, e3, e4) of unit norm. e4 is the scalar part (scalar last), as in the textbook.
+        - `angular_velocity`: relative to this frame [rad/s], three components in the new frame or a Vector. Pass None
+            for a fixed rotation, such as the mounting of a sensor. In this case the norm does not matter.
         """
         e = components(parameters, 4, "Euler parameters are four numbers, the scalar last")
         if angular_velocity is None:
@@ -365,27 +380,31 @@ class Frame:
         return self._oriented(rotations.euler_parameters_matrix(e), angular_velocity, name)
 
     def rotate_fixed(self, rotation_vector: Sequence[Component], name: str | None = None) -> Frame:
-        """A frame fixed in this one, turned by a rotation vector: how an instrument is mounted on its body.
+        """A frame that is fixed in this frame, rotated by a rotation vector, such as the mounting of a sensor.
 
-        **Arguments:** `rotation_vector`: three components in this frame [rad], its length the angle, right-hand about
-        its direction; smooth at zero, so that a fit can start there.
+        **Arguments:**
+
+        - `rotation_vector`: three components in this frame [rad]. Its length is the angle of a right-hand rotation
+            about its direction. The rotation is smooth at zero, so a fit can start there.
         """
         e = rotations.of_rotation_vector(components(rotation_vector, 3, "A rotation vector has three components"))
         return self._oriented(rotations.euler_parameters_matrix(e), ZERO3, name)
 
     def rotate_by(
-        self, orientation: Callable[..., Any], t: Component, q: Any, q_dot: Any, name: str | None = None
+        self, orientation: Callable[..., Any], t: Component, q: Numbers, q_dot: Any, name: str | None = None
     ) -> Frame:
-        """A frame whose orientation is a given function; its angular velocity is the function's derivative.
+        """A frame whose orientation is a function. Its angular velocity is computed by differentiation.
 
         **Arguments:**
 
-        - `orientation`: (t, q) -> (3, 3) rotation matrix [R] that takes components in this frame to components in
-            the new one. `q` is any pytree of floats.
-        - `t`, `q`, `q_dot`: time [s], the function's variables, and their rates.
+        - `orientation`: (t, q) -> rotation matrix [R] (3, 3), which maps components in this frame to components in the
+            new frame. `q` is a pytree of floats.
+        - `t`: time [s].
+        - `q`: the variables of the function.
+        - `q_dot`: the rates of the variables.
         """
         if not callable(orientation):
-            raise TypeError(f"rotate_by: the orientation is a function (t, q) -> (3, 3), got {orientation!r}.")
+            raise TypeError(f"rotate_by: the orientation must be a function (t, q) -> (3, 3), got {orientation!r}.")
         R, R_dot = _value_and_rate(lambda t, q: jnp.asarray(orientation(t, q)), t, q, q_dot)  # (3,3) (3,3)
         if R.shape != (3, 3):
             raise ValueError(f"rotate_by: the orientation must be a (3, 3) matrix, got {R.shape}.")
@@ -403,24 +422,27 @@ class Frame:
         return frame
 
     def matrix(self, other: Frame) -> Float[Array, "3 3"]:
-        """The rotation matrix (3, 3) that takes components in `other` to components in this frame."""
+        """The rotation matrix (3, 3) that maps components in `other` to components in this frame."""
         return stack([Vector(other, unit).components_in(self) for unit in rotations.IDENTITY]).T
 
 
 def _value_and_rate(function, t, q, q_dot):
-    """Value and time derivative of `function(t, q)` along the motion."""
-    plain = lambda tree: jnp.asarray(tree) if hasattr(tree, "__jax_array__") else tree  # noqa: E731
-    as_floats = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(float, x)), tree)  # noqa: E731
-    t, q, q_dot = as_floats(t), as_floats(plain(q)), as_floats(plain(q_dot))
+    """The value and the time derivative of `function(t, q)`."""
+
+    def as_floats(tree: Any) -> PyTree:
+        tree = jnp.asarray(tree) if hasattr(tree, "__jax_array__") else tree
+        return jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(float, x)), tree)
+
+    t, q, q_dot = as_floats(t), as_floats(q), as_floats(q_dot)
     q_dot = jax.tree.map(lambda x, dx: jnp.asarray(dx, dtype=x.dtype), q, q_dot)
     return jax.jvp(function, (t, q), (jnp.ones_like(t), q_dot))
 
 
 class Point:
-    """A point: its velocity in the inertial frame, and its position from the origin where one is known.
+    """A point with its velocity in the inertial frame and, if known, its position from the origin.
 
-    Points are made from other points, the first by `jaxkane.inertial()`: `fixed` is the two-point theorem, `moving`
-    the one-point theorem, `located` differentiates a position function.
+    Create the first point with `jaxkane.inertial()`, and other points with the methods of a point: `fixed` is the
+    two-point theorem, `moving` the one-point theorem, and `located` differentiates a position function.
     """
 
     __slots__ = ("_base", "_offset", "_relative_motion", "name", "number", "velocity")
@@ -442,7 +464,7 @@ class Point:
         return f"Point({self.name})"
 
     def chain(self) -> Iterator[Point]:
-        """This point, the one it was made from, and so on."""
+        """This point, the point from which it was created, and so on."""
         point: Point | None = self
         while point is not None:
             yield point
@@ -453,8 +475,8 @@ class Point:
         """Position from the inertial origin [m]."""
         if self._offset is None:
             raise ValueError(
-                f"The position of {self.name} is not known: it was made from a velocity alone. Make it with `fixed`, "
-                "`moving` or `located`, or with Point.at(..., position=...)."
+                f"The position of {self.name} is not known, because only its velocity was given. Create the point with "
+                "`fixed`, `moving` or `located`, or with Point.at(..., position=...)."
             )
         return self._offset if self._base is None else self._base.position + self._offset
 
@@ -463,12 +485,15 @@ class Point:
         return all(point._offset is not None for point in self.chain())
 
     def fixed(self, r: Vector, frame: Frame | None = None, name: str | None = None) -> Point:
-        """The point at `r` from this one, both fixed in one frame (two-point theorem).
+        """The point at `r` from this point, where both are fixed in one frame (two-point theorem).
 
             v_Q = v_P + omega x r
 
-        **Arguments:** `r` [m]; `frame`: the frame in which both points are fixed, by default the one that `r` is
-        written in. With a frame the point may be that of a body which is at `r` now: of a wheel, at its contact.
+        **Arguments:**
+
+        - `r`: position relative to this point [m].
+        - `frame`: the frame in which both points are fixed. The default is the frame of `r`. With another frame, the
+            result is the material point that is at `r` at this instant, such as the contact point of a wheel.
         """
         carrier = frame or _own_frame(r, "fixed")
         point = Point(self.velocity + carrier.angular_velocity.cross(r), self, r, name or f"{self.name}'")
@@ -476,12 +501,15 @@ class Point:
         return point
 
     def moving(self, r: Vector, velocity: Vector, frame: Frame | None = None, name: str | None = None) -> Point:
-        """The point now at `r` from this one, that moves in a frame in which this one is fixed (one-point theorem).
+        """The point at `r` from this point that moves in a frame in which this point is fixed (one-point theorem).
 
             v_Q = v_P + omega x r + v_rel
 
-        **Arguments:** `r` [m]; `velocity`: relative to the frame [m/s]; `frame`: by default the one that `r` is
-        written in.
+        **Arguments:**
+
+        - `r`: position relative to this point [m].
+        - `velocity`: velocity relative to the frame [m/s].
+        - `frame`: the frame. The default is the frame of `r`.
         """
         frame = frame or _own_frame(r, "moving")
         check_vector(velocity, "Point.moving, as the velocity,")
@@ -494,38 +522,42 @@ class Point:
         self,
         position: Callable[..., Any],
         t: Component,
-        q: Any,
+        q: Numbers,
         q_dot: Any,
         frame: Frame | None = None,
         name: str | None = None,
     ) -> Point:
-        """The point whose place is a given function; its velocity is the function's derivative.
+        """The point whose position is a function. Its velocity is computed by differentiation.
 
         **Arguments:**
 
-        - `position`: (t, q) -> three components in `frame` [m], from this point. `q` is any pytree of floats.
-        - `t`, `q`, `q_dot`: time [s], the function's variables, and their rates.
-        - `frame`: by default the inertial frame. This point must be fixed in it.
+        - `position`: (t, q) -> three components in `frame` [m], from this point. `q` is a pytree of floats.
+        - `t`: time [s].
+        - `q`: the variables of the function.
+        - `q_dot`: the rates of the variables.
+        - `frame`: the frame of the components, in which this point must be fixed. The default is the inertial frame.
         """
         if not callable(position):
-            raise TypeError(f"Point.located: the position is a function (t, q) -> three components, got {position!r}.")
+            raise TypeError(
+                f"Point.located: the position must be a function (t, q) -> three components, got {position!r}."
+            )
         frame = frame or self.velocity.frame.root
         r, r_dot = _value_and_rate(lambda t, q: jnp.stack([jnp.asarray(x, float) for x in position(t, q)]), t, q, q_dot)
         return self.moving(frame.vector(*r), frame.vector(*r_dot), frame, name)
 
     @staticmethod
     def at(velocity: Vector, position: Vector | None = None, name: str = "point") -> Point:
-        """A point with a given velocity [m/s] and, where it is known, a given position from the origin [m].
+        """A point with a given velocity [m/s] and, optionally, a given position from the origin [m].
 
-        The contact point of a wheel that rolls is `Point.at(0.0 * N.x)`: a point of the wheel that is at rest now. It
-        has no position, since the ground under the wheel is another point at every instant.
+        The contact point of a rolling wheel is `Point.at(0.0 * N.x)`, the material point that is at rest at this
+        instant. It needs no position.
         """
         point = Point(velocity, None, position, name)
         point._relative_motion = None if position is None else RelativeMotion(velocity.frame.root, velocity)
         return point
 
     def position_from(self, other: Point) -> Vector:
-        """The vector from `other` to this point [m], by way of the last point that both were made from."""
+        """The vector from `other` to this point [m], by way of the last common point of their chains."""
         origins = {id(point) for point in other.chain()}
         common = next((point for point in self.chain() if id(point) in origins), None)
         if common is None:
@@ -533,7 +565,7 @@ class Point:
         return self._from(common) - other._from(common)
 
     def _from(self, origin: Point) -> Vector:
-        """The vector to this point from one of those that it was made from."""
+        """The vector to this point from a point of its chain."""
         if self is origin:
             return Vector(self.velocity.frame.root, ZERO3)
         if self._offset is None or self._base is None or self._base is origin:
@@ -545,17 +577,17 @@ def _own_frame(r: Vector, verb: str) -> Frame:
     check_vector(r, f"Point.{verb}")
     if r.mixed:
         raise ValueError(
-            f"Point.{verb}: the vector adds parts written in different frames, so the frame it belongs to is not "
-            f"clear. Say which: point.{verb}(r, ..., frame=B); or go there in two steps, one for each frame."
+            f"Point.{verb}: the vector is a sum of vectors of different frames, so its frame is ambiguous. Pass the "
+            f"frame: point.{verb}(r, ..., frame=B). Or use two steps, one for each frame."
         )
     return r.frame
 
 
 class RelativeMotion(NamedTuple):
-    """How a point moves in `frame`, as seen from the point it was made from: with `velocity`.
+    """The velocity of a point relative to the point from which it was created, in `frame`.
 
-    Its place is a function of time and coordinates and its velocity is given: the two may contradict. A point without a
-    relative motion is only where it is now, as the point of a wheel that is in contact.
+    Position and velocity are given separately, so they may contradict each other; `checks.py` compares them. A point
+    without relative motion has a position at this instant only, such as the contact point of a wheel.
     """
 
     frame: Frame

@@ -1,14 +1,11 @@
-"""Bodies, the forces and torques that act on them, and what `System.motion` returns.
-
-Differentiates and solves nothing.
-"""
+"""Bodies, forces, torques, and `Motion`, which `System.motion` returns."""
 
 from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Self
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Self
 
 import jax
 import numpy as np
@@ -16,8 +13,9 @@ import numpy as np
 from .._common.lookup import not_there
 from .._scalarjit.components import Component, Triple, add, component, dot, is_zero, mul, sub
 from .kinematics import Frame, Point, Vector
+from .prints import concrete_numbers, text_of, wrapped
 
-UNNAMED = "body"  # the name of bodies that were not given one
+UNNAMED = "body"  # the default name of bodies
 
 
 class Body:
@@ -25,19 +23,21 @@ class Body:
 
     **Arguments:**
 
-    - `mass` [kg].
-    - `inertia` [kg m^2] about the mass centre, resolved in `frame`: three principal moments, or a (3, 3) matrix
-        whose off-diagonal entries are matrix entries (minus the integrals of xy). 0.0 for a particle.
+    - `mass`: [kg].
+    - `inertia`: [kg m^2] about the mass centre, with components in `frame`. Either three principal moments, or a
+        (3, 3) matrix whose off-diagonal entries are matrix entries (minus the integrals of xy). 0.0 for a particle.
     - `center`: the mass centre, a Point.
-    - `frame`: a Frame in which the inertia does not change. A particle needs none, anything else does.
-    - `angular_velocity`: a Vector, by default the frame's. An axisymmetric body (a wheel, a rotor) may stand in a
-        frame that does not spin with it, with its own angular velocity: the textbook's Examples 5 and 7.
-    - `name`: for error messages, forces, pictures and `motion["name"]`.
-    - `about`: a Point that is fixed in `frame`, about which `inertia` is given instead: it is taken to the mass centre
-        by the parallel axis theorem, I - m (r.r 1 - r r).
+    - `frame`: a Frame in which the inertia is constant. A particle does not need a frame.
+    - `angular_velocity`: a Vector. The default is the angular velocity of the frame. The frame of an axisymmetric body
+        (a wheel, a rotor) need not spin with it; in this case pass the angular velocity of the body (Examples 5 and 7
+        of the textbook).
+    - `name`: for error messages, forces, animations and `motion["name"]`.
+    - `about`: a Point that is fixed in `frame`, if `inertia` is about this point. The parallel axis theorem gives the
+        central inertia, I - m (r.r 1 - r r). If the inertia is about one axis only, (0.0, 0.0, J), only this moment
+        changes.
 
-    **Raises:** `ValueError` for an inertia of another shape, and for one without a frame to turn with; `TypeError` for
-    what is no point, frame or vector.
+    **Raises:** `ValueError` for an inertia of another shape, and for an inertia without a frame. `TypeError` for
+    arguments of a wrong type.
     """
 
     __slots__ = ("about", "angular_velocity", "center", "frame", "inertia", "is_particle", "mass", "name")
@@ -54,10 +54,10 @@ class Body:
     ):
         for label, value, kind in (
             (f"the mass centre of {name!r} is a Point", center, Point),
-            (f"the frame of {name!r} is a Frame", frame, Frame | None),
-            (f"the angular velocity of {name!r} is a Vector", angular_velocity, Vector | None),
-            (f"the inertia of {name!r} is about a Point", about, Point | None),
-            ("the name is a text", name, str),
+            (f"the frame of {name!r} must be a Frame", frame, Frame | None),
+            (f"the angular velocity of {name!r} must be a Vector", angular_velocity, Vector | None),
+            (f"the inertia of {name!r} must be about a Point", about, Point | None),
+            ("the name must be a string", name, str),
         ):
             if not isinstance(value, kind):
                 raise TypeError(f"Body(mass, inertia, center, frame): {label}, got {value!r}.")
@@ -67,8 +67,8 @@ class Body:
         has_inertia = about is not None or not all(is_zero(x) for row in self.inertia for x in row)
         if self.is_particle and has_inertia:
             raise ValueError(
-                f"Body(mass, inertia, center): {name!r} has an inertia, but no frame to turn with. Give its frame, "
-                "Body(mass, inertia, center, frame); for a particle write 0.0 for the inertia."
+                f"Body(mass, inertia, center): {name!r} has an inertia, but no frame. Pass its frame: "
+                "Body(mass, inertia, center, frame). For a particle, pass 0.0 as inertia."
             )
         self.center = center
         self.frame = center.velocity.frame.root if frame is None else frame
@@ -76,25 +76,52 @@ class Body:
         self.name = name
         self.about = about
         if about is not None:
-            self.inertia = parallel_axis(self.inertia, self.mass, center.position_from(about).components_in(self.frame))
+            given = self.inertia
+            self.inertia = parallel_axis(given, self.mass, center.position_from(about).components_in(self.frame))
+            places = [(i, j) for i in range(3) for j in range(3) if not is_zero(given[i][j])]
+            if len(places) == 1:
+                # An inertia about one axis only, of a plane mechanism. The parallel axis theorem would give negative
+                # moments: (0, 0, J) about a pin at 0.3 m became (-0.14, 0, J - 0.14).
+                rows: Any = [[self.inertia[i][j] if (i, j) in places else 0.0 for j in range(3)] for i in range(3)]
+                self.inertia = (tuple(rows[0]), tuple(rows[1]), tuple(rows[2]))
 
     def __repr__(self) -> str:
-        return f"Body({self.name})"
+        items, moments = [self.name], [x for row in self.inertia for x in row if not is_zero(x)]
+        if concrete_numbers(self.mass) is not None:
+            items.append(f"mass={text_of(self.mass, 'kg')}")
+        if moments and all(concrete_numbers(x) is not None for x in moments):
+            principal = all(is_zero(self.inertia[i][j]) for i in range(3) for j in range(i))
+            inertia = [self.inertia[i][i] for i in range(3)] if principal else [[*row] for row in self.inertia]
+            items.append(f"inertia={text_of(inertia)} kg m^2")
+        return wrapped(f"Body({', '.join(items)})")
+
+
+class ReflectedInertia(Body):
+    """The inertia of a geared rotor at its joint. It has kinetic energy but no momentum.
+
+    The momentum of the real rotor is smaller by the gear ratio, and its axis is unknown. The angular momentum in the
+    audit therefore does not contain these bodies.
+    """
+
+    __slots__ = ()
 
 
 def point_of(part: Point | Body) -> Point:
-    """A point, or the mass centre of a body. **Raises:** `TypeError` for what is neither."""
+    """A point, or the mass centre of a body.
+
+    **Raises:** `TypeError` for other arguments.
+    """
     point = part.center if isinstance(part, Body) else part
     if not isinstance(point, Point):
-        raise TypeError(f"A Point or a Body is asked for, got {part!r}.")
+        raise TypeError(f"Pass a Point or a Body, got {part!r}.")
     return point
 
 
 def _inertia(value: Any, name: str) -> tuple[Triple, Triple, Triple]:
     if isinstance(value, str) or value is None:
-        raise TypeError(f"{name}: the inertia is three principal moments or a (3, 3) matrix, got {value!r}.")
+        raise TypeError(f"{name}: the inertia must be three principal moments or a (3, 3) matrix, got {value!r}.")
     rows: Any = (0.0, 0.0, 0.0) if isinstance(value, (int, float)) and value == 0 else value
-    if not hasattr(rows, "shape") and isinstance(rows, Sequence):  # of traced numbers, perhaps
+    if not hasattr(rows, "shape") and isinstance(rows, Sequence):  # entries may be traced numbers
         shape = (len(rows), *{len(row) for row in rows if isinstance(row, (tuple, list)) or np.ndim(row) == 1})
     else:
         shape = np.shape(rows)
@@ -104,12 +131,13 @@ def _inertia(value: Any, name: str) -> tuple[Triple, Triple, Triple]:
     if shape == (3, 3):
         return tuple(tuple(component(x) for x in row) for row in rows)  # type: ignore[return-value]
     raise ValueError(
-        f"{name}: the inertia is three principal moments or a (3, 3) matrix about the mass centre, got shape {shape}."
+        f"{name}: the inertia must be three principal moments or a (3, 3) matrix about the mass centre, got the shape "
+        f"{shape}."
     )
 
 
 def parallel_axis(I: tuple[Triple, Triple, Triple], m: Component, r: Triple) -> tuple[Triple, Triple, Triple]:
-    """The inertia about the mass centre, which is at `r` from the point about which it is I: I - m (r.r 1 - r r)."""
+    """The central inertia I - m (r.r 1 - r r). I is about a point, and `r` is from this point to the mass centre."""
     squares = [mul(x, x) for x in r]
     rows = []
     for i in range(3):
@@ -120,28 +148,37 @@ def parallel_axis(I: tuple[Triple, Triple, Triple], m: Component, r: Triple) -> 
 
 
 class Force:
-    """A force [N] that acts at a point: a Point, or the mass centre of a Body."""
+    """A force [N] that acts at a Point or at the mass centre of a Body."""
 
     __slots__ = ("point", "vector")
 
     def __init__(self, vector: Vector, point: Point | Body):
         self.vector = _checked(vector, "Force")
         if not isinstance(point, (Point, Body)):
-            raise TypeError(f"Force(vector, point): the second argument is a Point or a Body, got {point!r}.")
+            raise TypeError(f"Force(vector, point): the second argument must be a Point or a Body, got {point!r}.")
         self.point = point_of(point)
+
+    def __repr__(self) -> str:
+        return f"Force({self.vector} [N] at {self.point.name})"
 
     @property
     def velocity(self) -> Vector:
-        """The velocity whose partial velocities the force is multiplied by."""
+        """The velocity whose partial velocities multiply the force."""
         return self.point.velocity
 
 
 class Torque:
-    """A torque [N m] that acts on a body or on a frame; its reaction, if one is meant, on another.
+    """A torque [N m] that acts on a body or a frame, with an optional reaction on another one.
 
-    Torque(T * C.z, fork, reaction_on=frame)
+        Torque(T * C.z, fork, reaction_on=frame)
 
-    **Raises:** `ValueError` for a particle, which has no frame that could turn.
+    **Arguments:**
+
+    - `vector`: the torque [N m], a Vector.
+    - `on`: the Body or Frame on which the torque acts.
+    - `reaction_on`: the Body or Frame on which the opposite torque acts, or None.
+
+    **Raises:** `ValueError` for a particle, because it has no frame.
     """
 
     __slots__ = ("vector", "velocity")
@@ -150,20 +187,23 @@ class Torque:
         self.vector = _checked(vector, "Torque")
         for part in (on, reaction_on):
             if not isinstance(part, (Frame, Body, type(None))):
-                raise TypeError(f"Torque(vector, on): acts on a Body or a Frame, got {part!r}.")
+                raise TypeError(f"Torque(vector, on): a torque must act on a Body or a Frame, got {part!r}.")
             if isinstance(part, Body) and part.is_particle:
                 raise ValueError(
-                    f"Torque(vector, on): {part.name!r} is a particle, which a torque does not move. Let it act on the "
-                    "frame that turns, or give the body that frame: Body(mass, inertia, center, frame)."
+                    f"Torque(vector, on): {part.name!r} is a particle, on which a torque has no effect. Apply it to "
+                    "the frame that rotates, or pass this frame to the body: Body(mass, inertia, center, frame)."
                 )
         self.velocity = on.angular_velocity
         if reaction_on is not None:
             self.velocity = on.angular_velocity - reaction_on.angular_velocity
 
+    def __repr__(self) -> str:
+        return f"Torque({self.vector} [N m])"
+
 
 def _checked(vector: Any, what: str) -> Vector:
     if not isinstance(vector, Vector):
-        raise TypeError(f"{what}(vector, ...): the first argument is a Vector such as 3.0 * N.x, got {vector!r}.")
+        raise TypeError(f"{what}(vector, ...): the first argument must be a Vector such as 3.0 * N.x, got {vector!r}.")
     return vector
 
 
@@ -171,49 +211,86 @@ Load = Force | Torque
 
 
 def flatten_loads(loads: Any, method: str = "`loads`") -> tuple[Load, ...]:
-    """Loads out of nested tuples and lists."""
+    """Flatten nested tuples and lists of loads."""
     if isinstance(loads, (Force, Torque)):
         return (loads,)
     if isinstance(loads, Iterable) and not isinstance(loads, (str, Mapping)):
         return tuple(load for item in loads for load in flatten_loads(item, method))
     hint = " Does it end without a `return`?" if loads is None else ""
-    raise TypeError(f"{method} returns Forces and Torques, got {loads!r}.{hint}")
+    raise TypeError(f"{method} must return Forces and Torques, got {loads!r}.{hint}")
+
+
+class SomeComponents(NamedTuple):
+    """Some components of one vector residual, and all components of this vector.
+
+    Each component is compared with the size of `all`. Otherwise, the component normal to a plane mechanism would be
+    compared with the rounding errors of its own terms.
+    """
+
+    components: tuple[Component, ...]
+    all: tuple[Component, ...]
+
+
+class GroupedResiduals(list[Component]):
+    """A list of residuals, and their groups."""
+
+    def __init__(self, groups: Iterable[SomeComponents]):
+        self.groups = [*groups]
+        super().__init__(x for group in self.groups for x in group.components)
+
+
+def residual_groups(residuals: Any, label: str) -> Iterator[SomeComponents]:
+    """Flatten residuals: numbers, arrays, Vectors (three components each), and nested tuples and lists of these."""
+    if isinstance(residuals, GroupedResiduals):
+        yield from residuals.groups
+    elif isinstance(residuals, Vector):
+        yield SomeComponents(residuals.components, residuals.components)
+    elif isinstance(residuals, (jax.Array, np.ndarray)) and residuals.ndim:
+        yield from residual_groups([*residuals.reshape(-1)], label)
+    elif isinstance(residuals, Iterable) and not isinstance(residuals, (str, Mapping, jax.Array, np.ndarray)):
+        for item in residuals:
+            yield from residual_groups(item, label)
+    else:
+        try:
+            yield SomeComponents((component(residuals),), (component(residuals),))
+        except TypeError:
+            hint = " Does the method end without a `return`?" if residuals is None else ""
+            raise TypeError(f"{label} must be a list of numbers and Vectors, got {residuals!r}.{hint}") from None
 
 
 def flatten_residuals(residuals: Any, label: str) -> tuple[Component, ...]:
-    """Residuals out of numbers, arrays, Vectors (three components each) and nested tuples and lists of these."""
-    if isinstance(residuals, Vector):
-        return residuals.components
-    if isinstance(residuals, (jax.Array, np.ndarray)) and residuals.ndim:
-        return tuple(component(x) for x in residuals.reshape(-1))
-    if isinstance(residuals, Iterable) and not isinstance(residuals, (str, Mapping, jax.Array, np.ndarray)):
-        return tuple(x for item in residuals for x in flatten_residuals(item, label))
-    try:
-        return (component(residuals),)
-    except TypeError:
-        hint = " Does the method end without a `return`?" if residuals is None else ""
-        raise TypeError(f"{label} are numbers and Vectors in a list, got {residuals!r}.{hint}") from None
+    """The residuals of all groups in one list."""
+    return tuple(x for group in residual_groups(residuals, label) for x in group.components)
 
 
-motion_number = itertools.count().__next__
-"""A number that is larger at every call: it distinguishes a motion from one that was made before."""
+_numbers = itertools.count()
+
+
+def motion_number() -> int:
+    """A number that increases with every call, to distinguish motions.
+
+    This must be a function of this module, because cloudpickle stores it by its name. It would store a copy of
+    `_numbers.__next__`, with other numbers.
+    """
+    return next(_numbers)
 
 
 class DuplicateName(ValueError):
-    """A body, a point or a frame with the name of another."""
+    """Two bodies, points or frames have the same name."""
 
 
 class Motion:
-    """What `System.motion` returns: bodies, velocity residuals, and the frames and points that others ask for.
+    """The result of `System.motion`: bodies, velocity residuals, and named points and frames.
 
     **Arguments:**
 
-    - `bodies`: every Body.
-    - `constraints`: velocity residuals [m/s or rad/s] that are zero in the motion and affine in the speeds; a Vector
-        counts as its three components.
-    - `points`, `frames`: those that `loads`, pictures or a user need, by name: `motion["P"]`.
+    - `bodies`: a list of all Bodies.
+    - `constraints`: velocity residuals [m/s or rad/s], which are zero and affine in the speeds. A Vector is three
+        residuals.
+    - `points`: a dict of named points, for `loads`, animations and `motion["P"]`.
+    - `frames`: a dict of named frames.
 
-    **Raises:** `ValueError` where one name stands for two of these; `TypeError` for what is no body, point or frame.
+    **Raises:** `ValueError` if two parts have the same name. `TypeError` for arguments of a wrong type.
     """
 
     __slots__ = ("N", "_named", "bodies", "constraints", "frames", "number", "points", "residuals")
@@ -228,14 +305,14 @@ class Motion:
     ):
         for label, value, kind in (("bodies", bodies, Body), ("constraints", constraints, (float, int, Vector))):
             if not isinstance(value, (kind, Iterable)) or isinstance(value, str):
-                raise TypeError(f"Motion(bodies, constraints): the {label} are a list, got {value!r}.")
+                raise TypeError(f"Motion(bodies, constraints): the {label} must be a list, got {value!r}.")
         for label, value in (("points", points), ("frames", frames)):
             if not isinstance(value, (Mapping, type(None))):
-                raise TypeError(f"Motion: the {label} are a dict by name, as {{'P': P}}; got {value!r}.")
+                raise TypeError(f"Motion: the {label} must be a dict by name, e.g. {{'P': P}}; got {value!r}.")
         self.bodies = _as_tuple(bodies, Body)
         if not self.bodies:
             raise ValueError("A Motion needs at least one Body.")
-        self.residuals = _as_tuple(constraints, (Vector, float, int, jax.Array))  # Vectors among them
+        self.residuals = _as_tuple(constraints, (Vector, float, int, jax.Array))  # may contain Vectors
         self.constraints = flatten_residuals(self.residuals, "Motion(bodies, constraints): the velocity residuals")
         self.points = dict(points or {})
         self.frames = dict(frames or {})
@@ -253,20 +330,22 @@ class Motion:
         points: Mapping[str, Point] | None = None,
         frames: Mapping[str, Frame] | None = None,
     ) -> Self:
-        """The same motion and more, for a class that inherits from another system's.
+        """The motion with additional parts, for a subclass of another system.
 
             def motion(self, t, q, u):
                 motion = super().motion(t, q, u)
                 basket = jk.Body(self.load, 0.0, motion["S"].fixed(0.3 * motion["H"].x), name="basket")
                 return motion.extended([basket])
 
-        **Arguments:** as of `Motion`: what comes behind the bodies and residuals that there are, and under other names.
+        **Arguments:** as `Motion`. Bodies and residuals are appended. New names must differ from the existing ones.
         """
         for kind, old, new in (("point", self.points, points), ("frame", self.frames, frames)):
             twice = [name for name in new or {} if name in old]
             if twice:
-                raise DuplicateName(f"Motion.extended: there is a {kind} of the name {twice[0]!r} already.")
-        extended = copy.copy(self)  # with the attributes that a subclass adds
+                raise DuplicateName(
+                    f"Motion.extended: a {kind} with the name {twice[0]!r} already exists. Choose another name."
+                )
+        extended = copy.copy(self)  # keeps the attributes of subclasses
         Motion.__init__(
             extended,
             (*self.bodies, *_as_tuple(bodies, Body)),
@@ -282,7 +361,7 @@ class Motion:
         parts += [(Point, *item) for item in self.points.items()] + [(Frame, *item) for item in self.frames.items()]
         for kind, name, part in parts:
             if not isinstance(part, kind):
-                raise TypeError(f"Motion: this is no {kind.__name__}, but stands among these: {part!r}.")
+                raise TypeError(f"Motion: {part!r} is not a {kind.__name__}.")
             if not isinstance(name, str):
                 raise TypeError(f"Motion: the name of {part!r} must be a string, got {name!r}.")
             if name in named and not (name == UNNAMED and kind is Body):
@@ -294,11 +373,16 @@ class Motion:
             named[name] = part
         return named
 
+    def __repr__(self) -> str:
+        parts = {"bodies": [body.name for body in self.bodies], "points": self.points, "frames": self.frames}
+        texts = [f"{kind}: {', '.join(names)}" for kind, names in parts.items() if names]
+        return f"Motion({'; '.join([*texts, f'{len(self.constraints)} velocity residuals'])})"
+
     def __getitem__(self, name: str) -> Any:
         if name not in self._named:
             raise not_there(name, self._named, "this motion, among its bodies, points and frames")
         if name == UNNAMED and sum(body.name == UNNAMED for body in self.bodies) > 1:
-            raise KeyError("Several bodies of this motion have no name of their own: Body(..., name=...).")
+            raise KeyError("Several bodies of this motion have no name. Pass Body(..., name=...).")
         return self._named[name]
 
 
@@ -307,14 +391,20 @@ def _as_tuple(values: Any, one: Any) -> tuple[Any, ...]:
 
 
 def weight(motion: Motion, gravity: Vector) -> tuple[Force, ...]:
-    """The weight of every body of a motion; `gravity` [m/s^2] is a Vector such as `9.81 * N.z`."""
+    """The weights of all bodies of a motion.
+
+    **Arguments:**
+
+    - `motion`: a `Motion`.
+    - `gravity`: the gravitational acceleration [m/s^2], a Vector such as `9.81 * N.z`.
+    """
     if not isinstance(motion, Motion):
-        raise TypeError(f"weight(motion, gravity): the first argument is a Motion, got {motion!r}.")
+        raise TypeError(f"weight(motion, gravity): the first argument must be a Motion, got {motion!r}.")
     return tuple(Force(body.mass * gravity, body.center) for body in motion.bodies)
 
 
 def kinetic_energy_of(motion: Motion) -> Component:
-    """1/2 sum of m v.v + omega . I . omega over the bodies [J]."""
+    """Kinetic energy [J]: 1/2 of the sum of m v.v + omega . I . omega over the bodies."""
     total: Component = 0.0
     for body in motion.bodies:
         v = body.center.velocity.components

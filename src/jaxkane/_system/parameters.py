@@ -1,4 +1,4 @@
-"""Physical parameters: float arrays from birth, in SI units and radians. Knows no mechanics."""
+"""Physical parameters of systems: float arrays in SI units and radians."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._scalarjit.compat import Tracer
+from .._scalarjit.components import Numbers
 
 
 def parameter(
@@ -25,55 +26,58 @@ def parameter(
     shape: tuple[int, ...] | None = None,
     unit: str = "",
 ) -> Any:
-    """A physical parameter of a `System`: a float array from birth, in SI units and radians.
+    """Declare a physical parameter of a `System`: a float array in SI units and radians.
 
         mass: Scalar = jk.parameter(positive=True, unit="kg")
         moments: Array = jk.parameter([0.1, 0.2, 0.2], positive=True, unit="kg m^2")
 
     **Arguments:**
 
-    - `default`: a number, or an array or nested lists of numbers; without one the parameter must be given.
-    - `positive`: refuse zero and negative values, and let a fit move it on a logarithmic scale.
-    - `within`: lower and upper bound, both allowed: a tilt in degrees, a mass centre below the
-        ground are refused. In a batch such a member is `invalid`.
-    - `shape`: of the array, by default that of `default`, or `()` for a number. A value with leading axes more is a
-        batch.
-    - `unit`: as tables and pictures show it; no number is converted.
+    - `default`: a number, an array or nested lists of numbers. Without a default, the parameter must be given.
+    - `positive`: reject zero and negative values. A fit then uses a logarithmic scale.
+    - `within`: lower and upper bound, inclusive, to reject implausible values such as angles in degrees. In a batch,
+        such a member has the status `invalid`.
+    - `shape`: shape of the array. The default is the shape of `default`, or `()`. A value with additional leading axes
+        is a batch.
+    - `unit`: the unit that tables and plots show. Values are not converted.
     """
     if not isinstance(unit, str):
-        raise TypeError(f'parameter(unit="N m"): a unit is a text for tables, got {unit!r}.')
+        raise TypeError(f'parameter(unit="N m"): the unit must be a string, got {unit!r}.')
     if not isinstance(shape, (tuple, type(None))):
-        raise TypeError(f"parameter(shape=(3,)): a shape is a tuple of whole numbers, got {shape!r}.")
+        raise TypeError(f"parameter(shape=(3,)): the shape must be a tuple of integers, got {shape!r}.")
     if default is dataclasses.MISSING:
         return eqx.field(converter=to_float, metadata={"jaxkane": ParameterInfo(positive, shape or (), unit, within)})
-    # A copy, as NumPy: a list that is changed later must not change the default, and JAX must not start yet.
+    # Copy to NumPy: later changes of a list must not change the default, and importing must not initialize JAX.
     default = default if isinstance(default, jax.Array) or np.ndim(default) == 0 else np.array(default)
     metadata = {"jaxkane": ParameterInfo(positive, np.shape(default) if shape is None else shape, unit, within)}
     return eqx.field(converter=to_float, metadata=metadata, default_factory=lambda: default)
 
 
 def learned(default: Any = dataclasses.MISSING) -> Any:
-    """A function of numbers with parameters of its own, a small neural network, as a part of a `System`.
+    """Declare a function with parameters, such as a small neural network, as a field of a `System`.
 
         friction: Any = jk.learned(eqx.nn.MLP("scalar", "scalar", 8, 1, jnp.tanh, key=jax.random.key(0)))
 
-    Its arrays are parameters of the system, which a fit frees by the field's name: `Free("friction", prior=(0, 0.3))`
-    with a prior that keeps it small. What is no array in it, such as its activation, belongs to the description.
+    Its arrays are parameters of the system. A fit estimates them by the name of the field, for example
+    `Free("friction", prior=(0, 0.3))` with a prior that keeps them small. Everything else, such as the activation
+    function, is static.
 
-    **Arguments:** `default`: a module of equinox, or any other pytree that can be called; without one it must be given.
+    **Arguments:**
+
+    - `default`: an equinox module or any other callable pytree. Without a default, the field must be given.
     """
     if default is dataclasses.MISSING:
         return eqx.field(converter=Learned)
     return eqx.field(converter=Learned, default_factory=lambda: default)
 
 
-def _in_default_precision(x: Any) -> Any:
+def _in_default_precision(x: Any) -> Numbers:
     x = to_float(x)
     return x.astype(jnp.result_type(float)) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
 
 class Learned(eqx.Module):
-    """A callable pytree: its arrays as leaves, all else static. It is called as what it holds."""
+    """A callable pytree whose arrays are leaves and whose other fields are static."""
 
     arrays: Any
     rest: Any = eqx.field(static=True)
@@ -84,29 +88,36 @@ class Learned(eqx.Module):
             return
         if not callable(function):
             raise TypeError(
-                f"jk.learned() holds a function with parameters, such as an equinox module; got {function!r}."
+                f"jk.learned() needs a function with parameters, such as an equinox module; got {function!r}."
             )
         arrays, rest = eqx.partition(function, eqx.is_array_like)
         leaves, structure = jax.tree.flatten(rest)
-        self.arrays = jax.tree.map(_in_default_precision, arrays)  # it may have been made before `jk.configure()`
+        self.arrays = jax.tree.map(
+            _in_default_precision, arrays
+        )  # it may have been created in float32, before `jk.configure()`
         self.rest = (tuple(leaves), structure)
 
     @property
     def function(self) -> Any:
-        """The callable, with its present arrays."""
+        """The callable with its current arrays."""
         leaves, structure = self.rest
         return eqx.combine(self.arrays, jax.tree.unflatten(structure, leaves))
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         return self.function(*args, **kwargs)
 
+    def __repr__(self) -> str:
+        function, n = self.function, sum(np.size(x) for x in jax.tree.leaves(self.arrays))
+        name = getattr(function, "__name__", type(function).__name__)
+        return f"{name} with {n} numbers" if n else name
+
     def __reduce__(self):
-        return Learned, (self.function,)  # the structure of a module does not survive pickling, the module does
+        return Learned, (self.function,)  # pickle the module, because its tree structure cannot be pickled
 
 
 @dataclasses.dataclass(frozen=True)
 class ParameterInfo:
-    """What `parameter` declares: whether the value must be positive, the shape of one value, its unit, its bounds."""
+    """The declaration of a parameter: whether it is positive, its shape, unit and bounds."""
 
     positive: bool
     shape: tuple[int, ...]
@@ -115,11 +126,11 @@ class ParameterInfo:
 
     @property
     def is_limited(self) -> bool:
-        """Whether some finite number is refused."""
+        """Whether some finite values are rejected."""
         return self.positive or self.within != (-math.inf, math.inf)
 
-    def allows(self, x: Any) -> Any:
-        """Which numbers of an array are allowed; what is not finite is not."""
+    def allows(self, x: Any) -> Numbers:
+        """Which values of an array are allowed. Values that are not finite are not allowed."""
         lower, upper = self.within
         conditions = [x > 0] if self.positive else []
         conditions += [x >= lower] if lower > -math.inf else []
@@ -128,27 +139,27 @@ class ParameterInfo:
 
 
 ANY = ParameterInfo(False, ())
-"""Of a number about which nothing was declared."""
+"""The declaration that is used for a number without a declaration."""
 
 
 def parameter_info(system: eqx.Module | type[eqx.Module]) -> dict[str, ParameterInfo]:
-    """Name and `ParameterInfo` of every parameter of a system, in the order of their declaration."""
+    """Names and `ParameterInfo` of all parameters of a system, in the order of their declaration."""
     fields = dataclasses.fields(system)  # type: ignore[arg-type]
     return {f.name: f.metadata["jaxkane"] for f in fields if "jaxkane" in f.metadata}
 
 
 def leaf_name(path: tuple[Any, ...]) -> str:
-    """A leaf's name as it is written in Python: "mass", "frame.mass", "links[2].mass"."""
+    """The name of a leaf as in Python: "mass", "frame.mass", "links[2].mass"."""
     return jax.tree_util.keystr(path).lstrip(".")
 
 
 def names_of_leaf(path: tuple[Any, ...]) -> tuple[str, ...]:
-    """The names by which a leaf is meant: its own, and those of the parts that hold it."""
+    """The names that select a leaf: its own name and those of the parts that contain it."""
     return tuple(leaf_name(path[:n]) for n in range(1, len(path) + 1))
 
 
 def _steps(part: Any, path: tuple[Any, ...]) -> Iterator[tuple[Any, ParameterInfo]]:
-    """What stands at every step of the path to a leaf, and what was declared of the field that holds it."""
+    """The objects along the path to a leaf, and the declaration of the field that contains it."""
     info = ANY
     for key in path:
         if isinstance(key, jax.tree_util.GetAttrKey):
@@ -163,25 +174,24 @@ def _steps(part: Any, path: tuple[Any, ...]) -> Iterator[tuple[Any, ParameterInf
 
 
 def declared(system: Any, path: tuple[Any, ...]) -> ParameterInfo:
-    """What `parameter` was given of the field that holds this leaf."""
+    """The declaration of the field that contains this leaf."""
     return [ANY, *(info for _, info in _steps(system, path))][-1]
 
 
 def learned_part(system: Any, path: tuple[Any, ...]) -> str:
-    """The name of the learned function that holds this leaf, or ""."""
+    """The name of the learned function that contains this leaf, or ""."""
     lengths = [n for n, (part, _) in enumerate(_steps(system, path), 1) if isinstance(part, Learned)]
     return leaf_name(path[: lengths[0]]) if lengths else ""
 
 
 def parameters_in(system: Any) -> list[tuple[str, Any, ParameterInfo]]:
-    """Name, value and what was declared of every parameter, those of parts that the system holds too. A parameter that
-    is None is not there."""
+    """Name, value and declaration of each parameter, including those of parts. Omits parameters that are None."""
     leaves = [(path, x, declared(system, path)) for path, x in jax.tree_util.tree_leaves_with_path(system)]
     return [(leaf_name(path), x, info) for path, x, info in leaves if info is not ANY]
 
 
 def in_batches(system: Any) -> list[str]:
-    """Parameters of a system, or of a part of one, that have leading axes more than they were declared with."""
+    """Names of the parameters of a system, or of a part, that have more leading axes than declared."""
     arrays = [(path, x) for path, x in jax.tree_util.tree_leaves_with_path(system) if np.ndim(x)]
     declarations = [declared(system, path) for path, _ in arrays]
     return [
@@ -192,8 +202,8 @@ def in_batches(system: Any) -> list[str]:
 
 
 def with_parameters(system: Any, values: Mapping[str, Any]) -> Any:
-    """The system with other values of some parameters, by the names of `parameters_in`; each part is made anew, and
-    checked as any other."""
+    """The system with other values of some parameters, by the names of `parameters_in`. Every part is constructed and
+    checked again."""
     paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(system)] if values else []
     return _replaced(system, {path: values[name] for path in paths if (name := leaf_name(path)) in values})
 
@@ -214,11 +224,11 @@ def _replaced(part: Any, values: Mapping[tuple[Any, ...], Any]) -> Any:
     return kind(items)
 
 
-def to_float(value: Any) -> Any:
-    # What is no number is left alone here: `System.__check_init__` refuses it by its name.
+def to_float(value: Any) -> Numbers:
+    # Keep values that are not numbers. `System.__check_init__` raises an exception with their name.
     if isinstance(value, np.ma.MaskedArray):
         if np.ma.is_masked(value):
-            raise ValueError("Some values are masked: fill them, or leave these out.")
+            raise ValueError("Some values are masked. Fill or remove them.")
         value = np.asarray(value)
     if isinstance(value, (jax.Array, np.ndarray)) and jnp.issubdtype(value.dtype, jnp.inexact):
         return jnp.asarray(value)
@@ -236,27 +246,27 @@ def to_float(value: Any) -> Any:
 
 
 def check_fields(system: eqx.Module) -> None:
-    """Refuse numbers that a description counts with, names and switches as fields that JAX would trace."""
+    """Raise an exception for fields that JAX would trace, but which are counts, names or switches."""
     for path, value in jax.tree_util.tree_leaves_with_path(system):
         name = path[0].name
         if callable(value):
             raise TypeError(
-                f"{type(system).__name__}.{name} holds a function, {value!r}, which JAX cannot trace. A function with "
-                f"parameters, as a neural network, is declared by `{name}: Any = jk.learned()`; one without, by "
-                f"`{name}: Any = equinox.field(static=True)`."
+                f"{type(system).__name__}.{name} is a function, {value!r}, which JAX cannot trace. Declare a function "
+                f"with parameters, such as a neural network, as `{name}: Any = jk.learned()`. Declare any other "
+                f"function as `{name}: Any = equinox.field(static=True)`."
             )
         if isinstance(value, (bool, int, str)) and name not in parameter_info(system):
             whole = getattr(system, name)
             kind = type(whole).__name__
             raise TypeError(
-                f"{type(system).__name__}.{name} = {whole!r} would be traced as an array, and a description could not "
-                f"count with it. What belongs to the description, as a number of links: `{name}: {kind} = "
-                f"equinox.field(static=True)`. A physical parameter: `{name}: jk.Scalar = jk.parameter()`."
+                f"{type(system).__name__}.{name} = {whole!r} would be traced as an array, so `range(...)` and `if` "
+                f"could not use it. Declare a count, a name or a switch as `{name}: {kind} = "
+                f"equinox.field(static=True)`, and a physical parameter as `{name}: jk.Scalar = jk.parameter()`."
             )
 
 
 def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:
-    """Refuse what is no finite float; a batch is left to the status of its members."""
+    """Raise an exception for values that are not finite floats. Batches are judged by the status of their members."""
     if isinstance(value, Tracer):
         return
     if not (isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)):
@@ -264,7 +274,7 @@ def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:
     n = value.ndim - len(info.shape)
     if n < 0 or value.shape[n:] != info.shape:
         raise ValueError(
-            f"{label} must have the shape {info.shape}, or leading axes more for a batch; got {value.shape}."
+            f"{label} must have the shape {info.shape}, with additional leading axes for a batch; got {value.shape}."
         )
     if n > 0:
         return
@@ -290,4 +300,4 @@ _LIKELY = {
     "kg": " In newtons?",
     "s": " In milliseconds?",
 }
-"""What a number that is too large for its unit probably is in."""
+"""For each unit, the probable mistake if a number is too large."""

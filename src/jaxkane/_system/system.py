@@ -1,8 +1,9 @@
-"""A mechanism: its parameters, names, units, motion and loads. Describes; never differentiates or solves."""
+"""`System`, the base class of mechanisms: parameters, names, units, motion and loads; and `State`."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import inspect
 import sys
@@ -16,18 +17,19 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import not_there, refuse_unknown
 from .._scalarjit.cache_key import leaked_tracer
-from .._scalarjit.components import Component
+from .._scalarjit.components import Component, Numbers
 from .motion import Motion, motion_number
 from .parameters import check_fields, check_parameter, parameter_info, to_float
+from .prints import concrete_numbers, module_text, text_of
 
 
 class NamedVector(Sequence[Component]):
-    """Numbers by place and by name. JAX takes it for an array of shape (n,).
+    """A vector (n,) that is indexed by number or by name.
 
-        q[0], q["roll"]; q["e1":"e4"], of which both ends are meant; q["x", "y"]; q[3:7]; a, b = q; "roll" in q
+        q[0]; q["roll"]; q["e1":"e4"], including both ends; q["x", "y"]; q[3:7]; a, b = q; "roll" in q
 
-    Arithmetic and comparisons, `==` too, go number by number and give arrays; `jnp.asarray(q)` is one, for all else.
-    The items may be exact Python floats, which is how a structural zero reaches a description.
+    Arithmetic and comparisons are elementwise and return arrays. `jnp.asarray(q)` is an array for all other operations.
+    Items may be exact Python floats. Structural zeros are passed to the methods of a system in this way.
     """
 
     __slots__ = ("_items", "names")
@@ -48,9 +50,23 @@ class NamedVector(Sequence[Component]):
             places = slice(start, stop + 1 if isinstance(key.stop, str) else stop, key.step)  # type: ignore[operator]
             return NamedVector(self._items[places], self.names[places])
         if isinstance(key, (tuple, list)):
-            places = [self._place(k) if isinstance(k, str) else range(len(self))[k] for k in key]
+            places = [self._place(k) if isinstance(k, str) else self._checked_place(k) for k in key]
             return NamedVector([self._items[i] for i in places], [self.names[i] for i in places if self.names])
-        return self._items[key]
+        return self._items[self._checked_place(key)]
+
+    def _checked_place(self, key: Any) -> int:
+        try:
+            return range(len(self))[key]
+        except IndexError:
+            named = f" ({', '.join(self.names)})" if self.names else ""
+            raise IndexError(
+                f"The index {key} is out of range for these {len(self)} values{named}. Indices begin at 0."
+            ) from None
+        except TypeError:
+            raise TypeError(
+                f"The index must be a name, an integer or a slice, got {key!r}. For a traced index use an array: "
+                "jnp.asarray(q)[i]."
+            ) from None
 
     def _place(self, name: str) -> int:
         if name not in self.names:
@@ -62,21 +78,22 @@ class NamedVector(Sequence[Component]):
 
     def __contains__(self, name: object) -> bool:
         if not isinstance(name, str):
-            raise TypeError(f"`in` asks for a name, as 'roll' in q; got {name!r}.")
+            raise TypeError(f"`in` requires a name, such as 'roll' in q; got {name!r}.")
         return name in self.names
 
     def __getattr__(self, name: str) -> Any:
         if hasattr(jax.Array, name) and not name.startswith("__"):
             raise AttributeError(
-                f"Values are named numbers and have no `.{name}`: jnp.asarray(q) is an array, which has."
+                f"Named values do not have the method `.{name}`. Convert them to an array: jnp.asarray(q).{name}."
             )
-        raise AttributeError(f"Values have no {name!r}; by name they are read as q[{name!r}].")
+        raise AttributeError(f"There is no attribute {name!r}. To read a value by name, write q[{name!r}].")
 
     def __jax_array__(self) -> Array:
         return jnp.stack([jnp.asarray(x) for x in self._items]) if self._items else jnp.zeros(0)
 
     def __repr__(self) -> str:
-        return f"Values({dict(zip(self.names, self._items, strict=True)) if self.names else self._items})"
+        items = map(text_of, self._items)
+        return f"Values({', '.join(map('='.join, zip(self.names, items, strict=True)) if self.names else items)})"
 
     def __neg__(self) -> Array:
         return -self.__jax_array__()
@@ -94,7 +111,8 @@ def _elementwise(name: str) -> Callable[..., Array]:
             array = jnp.asarray(other)
         except (TypeError, ValueError):
             raise TypeError(
-                f"Values are numbers, and meet numbers and arrays alone; got {other!r}. One of them is q['name']."
+                f"Named values can only be combined with numbers and arrays, got {other!r}. To read one value, write "
+                "q['name']."
             ) from None
         return getattr(self.__jax_array__(), name)(array)
 
@@ -114,8 +132,8 @@ NAMES = ("coordinates", "speeds", "dependent_speeds", "auxiliary_speeds", "depen
 
 
 def _prepared(system: str, name: str, value: Any) -> Any:
-    """What a class gets under a name: checked, if it holds names or units; reading by name, if it is a method."""
-    if hasattr(value, "__get__") and not callable(value):  # a property is read of an instance
+    """Prepare a class attribute: check names and units, and wrap methods so that they can read values by name."""
+    if hasattr(value, "__get__") and not callable(value):  # a property is evaluated on an instance
         return value
     if name in NAMES:
         return _checked_names(system, name, value)
@@ -126,30 +144,34 @@ def _prepared(system: str, name: str, value: Any) -> Any:
 
 def _checked_units(system: str, units: Any) -> Mapping[str, str]:
     if not isinstance(units, Mapping):
-        raise TypeError(f'{system}.units is a dict of texts by name, as {{"angle": "rad"}}; got {units!r}.')
+        raise TypeError(f'{system}.units is a dict of strings by name, such as {{"angle": "rad"}}; got {units!r}.')
     for name, unit in units.items():
         if not (isinstance(name, str) and isinstance(unit, str)):
-            raise TypeError(f'{system}.units has texts by name, as {{"angle": "rad"}}; got {name!r}: {unit!r}.')
+            raise TypeError(
+                f'{system}.units contains strings by name, such as {{"angle": "rad"}}; got {name!r}: {unit!r}.'
+            )
     return units
 
 
 def _checked_names(system: str, kind: str, names: Any) -> tuple[str, ...]:
     if isinstance(names, str):
-        raise TypeError(f"{system}.{kind} is a tuple of names; {names!r} is a string. One name is ({names!r},).")
+        raise TypeError(f"{system}.{kind} must be a tuple of names, got the string {names!r}. Write ({names!r},).")
+    if isinstance(names, dataclasses.Field):
+        raise TypeError(f"{system}.{kind} must be a tuple of names, such as ('angle',), not a field. Rename the field.")
     if not isinstance(names, (tuple, list)) or not all(isinstance(name, str) and name for name in names):
-        raise TypeError(f"{system}.{kind} is a tuple of names, such as ('angle',); got {names!r}.")
+        raise TypeError(f"{system}.{kind} must be a tuple of names, such as ('angle',); got {names!r}.")
     return tuple(names)
 
 
 class SystemMeta(type(eqx.Module)):
     """The metaclass of systems.
 
-    What is set on an existing class, as `Pendulum.loads = f` in a notebook, is prepared as what its body
-    defines.
+    Attributes that are set on an existing class, such as `Pendulum.loads = f` in a notebook, are prepared like those of
+    the class body.
     """
 
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **kwargs: Any) -> Any:
-        # Of a class made by `type(name, bases, members)` Python would say that equinox has made it.
+        # For a class created by `type(name, bases, members)`, Python would report equinox as its module.
         module = sys._getframe(1).f_globals.get("__name__", "__main__")
         return super().__new__(mcs, name, bases, {"__module__": module, **namespace}, **kwargs)
 
@@ -163,35 +185,34 @@ _VALUE_OF_TRACED = (
     jax.errors.ConcretizationTypeError,
 )
 _STATIC_FIELD = (
-    " A number that a description counts with, as that of its links, is a static field: "
+    " A number that is used in `range(...)` or `if`, such as the number of links, must be a static field: "
     "`links: int = equinox.field(static=True)`."
 )
 
 
 @contextlib.contextmanager
 def explain_value_of_traced(label: str, hint: str = "") -> Iterator[None]:
-    """Where a function of the user asks a traced number for its value, the error says which and what to write."""
+    """Explain errors that occur when a user function needs the value of a traced number."""
     try:
         yield
     except _VALUE_OF_TRACED as error:
         raise TypeError(
-            f"{label} asks for the value of a number that has none while it is traced: time, coordinates, speeds, "
-            "parameters, and what follows from them. Write jnp.sin for np.sin and math.sin (jnp.polyval for "
-            "np.polyval), jnp.where(a > b, x, y) for `if`, jnp.maximum and jnp.minimum for max and min, and neither "
-            f"float() nor .item().{hint}"
+            f"{label} uses a traced value where Python needs a concrete number. Time, coordinates, speeds, parameters "
+            "and results computed from them are traced. Write jnp.sin for np.sin and math.sin (jnp.polyval for "
+            "np.polyval), jnp.where(a > b, x, y) for `if`, and jnp.maximum and jnp.minimum for max and min. Do not use "
+            f"float() or .item().{hint}"
         ) from error
 
 
 def _named(method: Callable[..., Any], name: str) -> Callable[..., Any]:
-    """A method of a description, of that name, whose `q`, `u` and `x` may be any sequence, and are read by place and
-    by name."""
-    # A decorator of such a method copies this attribute, and is another function.
+    """Wrap a method of a system, so that `q`, `u` and `x` may be any sequences and can be indexed by name."""
+    # A decorator of such a method copies this attribute, although it is another function.
     if getattr(method, "reads_by_name", None) is method:
         return method
 
     @functools.wraps(method)
-    def call(self: System, t: Component, q: Any, *rest: Any, **kwargs: Any) -> Any:
-        method = vars(call)["__wrapped__"]  # IPython's autoreload replaces this attribute, and no closure
+    def call(self: System, t: Component, q: Numbers, *rest: Any, **kwargs: Any) -> Any:
+        method = vars(call)["__wrapped__"]  # IPython's autoreload replaces this attribute, but not closures
         q = _values(q, self.coordinates, f"{type(self).__name__}: q")
         if rest:
             names = (*self.speeds, *self.dependent_speeds, *self.auxiliary_speeds)
@@ -214,44 +235,50 @@ def _values(values: Any, names: Sequence[str], label: str, n_optional: int = 0) 
         return values
     items = list(values)
     if len(items) == len(names) - n_optional:
-        items += [0.0] * n_optional  # auxiliary speeds are zero in the motion
+        items += [0.0] * n_optional  # auxiliary speeds are zero
     if len(items) != len(names):
         raise ValueError(f"{label} must have {len(names)} entries ({', '.join(names)}), got {len(items)}.")
     return NamedVector(items, names)
 
 
 class State(eqx.Module):
-    """What is integrated: coordinates, independent speeds and, where a system has such, states of the first order.
+    """The state of a system: coordinates, independent speeds and first-order states.
 
-    Attributes: `q` (n_q,) [rad, m], `u` (n_u,) [rad/s, m/s], `x` (n_x,) or None; a batch has leading axes. Or dicts by
-    name, which are read where the state meets its system: `jk.State({"angle": 0.3}, {"rate": 1.0})`. Names left out are
-    zero.
+    Attributes are arrays, with leading axes for a batch. They may also be dicts by name, such as
+    `jk.State({"angle": 0.3}, {"rate": 1.0})`, in which omitted names are zero.
+
+    - `q`: coordinates (n_q,) [rad, m].
+    - `u`: independent speeds (n_u,) [rad/s, m/s].
+    - `x`: first-order states (n_x,), or None if there are none.
     """
 
     q: Float[Array, "*batch n_q"] = eqx.field(converter=to_float)
     u: Float[Array, "*batch n_u"] = eqx.field(converter=to_float)
     x: Float[Array, "*batch n_x"] | None = eqx.field(converter=lambda x: x if x is None else to_float(x), default=None)
 
+    def __repr__(self) -> str:
+        return module_text(self, ndim=1)
+
 
 def packed(state: State) -> Float[Array, "*batch n"]:
-    """q, u and, where there are states of the first order, x in one array."""
+    """q, u and, if present, x in one array."""
     return jnp.concatenate([part for part in (state.q, state.u, state.x) if part is not None], axis=-1)
 
 
 def unpacked(system: System, y: Float[Array, "*batch n"]) -> State:
-    """The state of which `packed` makes y."""
+    """The inverse of `packed`."""
     n_q = len(system.coordinates)
     q, u, x = jnp.split(y, [n_q, n_q + len(system.speeds)], axis=-1)
     return State(q, u, x if system.states else None)
 
 
 class System(eqx.Module, metaclass=SystemMeta):
-    """A mechanism: its array leaves are its parameters, its methods describe it.
+    """The base class of mechanisms. Its array fields are the parameters of the mechanism.
 
-    A subclass names its coordinates and speeds, and writes `motion`; and, where it needs them, `loads`, `q_dot`,
-    `configuration_constraints` and `events`; `state_rates` of what has states of the first order, and `outputs` of what
-    carries sensors. The `u` that these receive holds all speeds: first the independent, then the dependent, then the
-    auxiliary ones. `q`, `u` and `x` are read by place or by name: `q[0]`, `q["roll"]`.
+    A subclass names its coordinates and speeds and defines `motion`. If required, it also defines `loads`, `q_dot`,
+    `configuration_constraints`, `events`, `state_rates` (first-order states) and `outputs` (sensors). In these methods,
+    `u` contains all speeds: first the independent, then the dependent, then the auxiliary speeds. `q`, `u` and `x` can
+    be indexed by number or by name: `q[0]`, `q["roll"]`.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -261,41 +288,44 @@ class System(eqx.Module, metaclass=SystemMeta):
                 setattr(cls, kind, cls.__dict__[kind])
         for method in METHODS:
             owner = next(base for base in cls.__mro__ if method in base.__dict__)
-            if owner is cls or not issubclass(owner, System):  # a class without a System that is mixed in
+            if owner is cls or not issubclass(owner, System):  # a mixin class that is not a System
                 setattr(cls, method, owner.__dict__[method])
 
     coordinates: ClassVar[tuple[str, ...]] = ()
     """Names of the generalized coordinates."""
     speeds: ClassVar[tuple[str, ...]] = ()
-    """Names of the independent generalized speeds: one equation of motion for each."""
+    """Names of the independent generalized speeds. Each has one equation of motion."""
     dependent_speeds: ClassVar[tuple[str, ...]] = ()
-    """Names of the speeds that the velocity residuals determine: as many as there are residuals."""
+    """Names of the speeds that the velocity residuals determine, one for each residual."""
     auxiliary_speeds: ClassVar[tuple[str, ...]] = ()
-    """Names of speeds that are zero in the motion, for the forces that do no work."""
+    """Names of auxiliary speeds. They are zero in the motion and give the forces that do no work."""
     dependent_coordinates: ClassVar[tuple[str, ...]] = ()
-    """Names of the coordinates that `assemble` solves the configuration constraints for; the others are fixed."""
+    """Names of the coordinates for which `assemble` solves the configuration constraints. The others are fixed."""
     inputs: ClassVar[tuple[str, ...]] = ()
     """Names of the inputs that `loads` reads."""
     states: ClassVar[tuple[str, ...]] = ()
-    """Names of states of the first order, which `state_rates` drives: motors that lag, bristles, filters."""
+    """Names of first-order states, whose rates `state_rates` returns, e.g. of motors with a lag, bristles, filters."""
     units: ClassVar[Mapping[Any, str]] = {}
-    """Units of coordinates, speeds, inputs, states and outputs by name, for tables and pictures: `{"q0": "rad", "push":
-    "N"}`. Those of rates follow from what is declared; nothing is guessed from a name."""
+    """Units of coordinates, speeds, inputs, states and outputs by name, for tables and plots: `{"q0": "rad", "push":
+    "N"}`. Units of rates follow from the declared units. No unit is guessed from a name."""
     check_inertia: ClassVar[bool] = True
-    """Whether bodies are refused whose principal moments of inertia break the triangle inequality by more than 5 %."""
+    """Whether to reject bodies whose principal moments of inertia violate the triangle inequality by more than 5 %."""
+
+    __repr__ = module_text
 
     def __check_init__(self) -> None:
+        _check_parameter_names(self)
         _check_names(self)
         check_fields(self)
         for name, info in parameter_info(self).items():
             check_parameter(f"{type(self).__name__}.{name}", getattr(self, name), info)
 
-    def motion(self, t: Component, q: Any, u: Any) -> Motion:
-        """Bodies and velocity residuals at time `t` [s], coordinates `q` and speeds `u`."""
+    def motion(self, t: Component, q: Numbers, u: Numbers) -> Motion:
+        """Return the `Motion` at time `t` [s], coordinates `q` and speeds `u`."""
         raise NotImplementedError(f"{type(self).__name__} must define motion(self, t, q, u) and return a Motion.")
 
-    def q_dot(self, t: Component, q: Any, u: Any) -> Sequence[Component]:
-        """Rates of the coordinates. By default they are the speeds."""
+    def q_dot(self, t: Component, q: Numbers, u: Numbers) -> Sequence[Component]:
+        """Return the rates of the coordinates. By default, these are the speeds."""
         n_q, n = len(self.coordinates), len(self.speeds) + len(self.dependent_speeds)
         if n_q != n:
             raise ValueError(
@@ -304,29 +334,29 @@ class System(eqx.Module, metaclass=SystemMeta):
             )
         return u[:n_q]
 
-    def loads(self, t: Component, q: Any, u: Any, motion: Motion, inputs: Mapping[str, Component]) -> Any:
-        """Active forces and torques: `Force`s and `Torque`s, nested in tuples as is convenient.
+    def loads(self, t: Component, q: Numbers, u: Numbers, motion: Motion, inputs: Mapping[str, Component]) -> Any:
+        """Return the active forces and torques: `Force`s and `Torque`s, also in nested tuples.
 
-        `inputs` holds the values of the inputs, and of the states of the first order, by name.
+        `inputs` contains the values of the inputs and of the first-order states by name.
         """
         return ()
 
     def why_not_finite(self, motion: Motion, inputs: Mapping[str, Component]) -> str:
-        """Why loads are not finite at a state, in words: asked where they are not, for the error; "" if unknown."""
+        """Explain why loads are not finite at a state, for the error message. Return "" if unknown."""
         return ""
 
     def state_rates(
-        self, t: Component, q: Any, u: Any, x: Any, motion: Motion, now: Any
+        self, t: Component, q: Numbers, u: Numbers, x: Any, motion: Motion, now: Any
     ) -> Sequence[Component] | Mapping[str, Component]:
-        """Rates of the states of the first order, in the order of `states`; or by name, in a dict.
+        """Return the rates of the first-order states, in the order of `states` or in a dict by name.
 
             states = ("motor_torque",)
 
             def state_rates(self, t, q, u, x, motion, now):
                 return ((now["command"] - x["motor_torque"]) / self.lag,)
 
-        `now` is a `MeasurementContext`: inputs and states by name, and accelerations, for the filter of an
-        accelerometer. Of a class without states there are none: `super().state_rates(...)` gives an empty dict.
+        `now` is a `MeasurementContext` with inputs and states by name, and accelerations. In a class without states,
+        `super().state_rates(...)` returns an empty dict.
         """
         if inspect.unwrap(type(self).state_rates) is not System.state_rates or not self.states:
             return {}
@@ -335,84 +365,104 @@ class System(eqx.Module, metaclass=SystemMeta):
             "motion, now), one rate for each."
         )
 
-    def outputs(self, t: Component, q: Any, u: Any, motion: Motion, now: Any) -> Mapping[str, Any]:
-        """What the sensors measure, by name: numbers, or dicts of such, whose names are joined by a dot.
+    def outputs(self, t: Component, q: Numbers, u: Numbers, motion: Motion, now: Any) -> Mapping[str, Any]:
+        """Return the outputs by name. Names of nested dicts are joined by a dot.
 
             def outputs(self, t, q, u, motion, now):
                 box = motion.frames["box"]
                 return {"gyro": jk.sensors.gyroscope(box), "strain": self.stiffness * q["bend"]}
 
-        `now` is a `MeasurementContext`: inputs and states by name, accelerations, and the forces of constraints.
+        `now` is a `MeasurementContext` with inputs and states by name, accelerations and constraint forces.
         """
         return {}
 
-    def configuration_constraints(self, t: Component, q: Any) -> Sequence[Component]:
-        """Residuals that are zero in every possible configuration."""
+    def configuration_constraints(self, t: Component, q: Numbers) -> Sequence[Component]:
+        """Return the residuals of the holonomic constraints."""
         return ()
 
-    def implied_constraints(self, t: Component, q: Any) -> Sequence[Component]:
-        """Residuals that are zero wherever the configuration constraints are: those of a closed loop that follow from
-        the others. Nothing is solved for them; a state that does not meet them is refused."""
+    def implied_constraints(self, t: Component, q: Numbers) -> Sequence[Component]:
+        """Return residuals that depend on the configuration constraints, such as those of a redundant loop.
+
+        They are checked but not solved: a state that violates them raises an exception.
+        """
         return ()
 
-    def events(self, t: Component, q: Any, u: Any) -> Mapping[str, Any]:
-        """Signed, smooth quantities by name; a simulation ends, with that name as its status, when one passes zero.
+    def events(self, t: Component, q: Numbers, u: Numbers) -> Mapping[str, Any]:
+        """Return signed smooth quantities by name. A simulation ends when one of them crosses zero.
 
-        `jaxkane.rising` or `jaxkane.falling` of a quantity counts in that direction only. A motion that starts on zero
-        ends at once only if it leaves in its named direction.
+        `jaxkane.falling(quantity, then=...)` changes the state instead. A fourth argument `x`, if the method has it,
+        contains the first-order states. The status of the simulation is the name of the event. `jaxkane.rising` and
+        `jaxkane.falling` select the direction of the crossing. If a quantity is zero at the start, the simulation ends
+        at once only if the quantity then changes in the selected direction.
         """
         return {}
 
 
 def has_outputs(system: System) -> bool:
-    """Whether sensors measure anything; the names of what they measure are known once `outputs` is evaluated."""
+    """Whether the system defines `outputs`. Their names are only known after `outputs` has been evaluated."""
     return type(system).outputs is not System.outputs
 
 
 def names_of(system: System) -> tuple[tuple[str, ...], ...]:
-    """Of coordinates, independent and dependent speeds, and states of the first order: what a motion is read by."""
+    """Names of coordinates, independent and dependent speeds, and first-order states."""
     return tuple(map(tuple, (system.coordinates, system.speeds, system.dependent_speeds, system.states)))
 
 
+_OF_SYSTEM = frozenset(dir(System))  # without attributes of the metaclass, e.g. `register`
+
+
+def _check_parameter_names(system: System) -> None:
+    """Raise an exception for parameters named like a method: a parameter `events` would replace the method."""
+    wrong = [name for name in parameter_info(system) if name in _OF_SYSTEM]
+    if wrong:
+        raise ValueError(
+            f"{type(system).__name__}: the parameter {wrong[0]!r} would replace `System.{wrong[0]}`. Give it another "
+            "name."
+        )
+
+
 def _check_names(system: System) -> None:
-    """Refuse names that stand for two things."""
+    """Raise an exception if one name has two meanings."""
     name = type(system).__name__
     names = {kind: _checked_names(name, kind, getattr(system, kind)) for kind in NAMES}
     units = _checked_units(name, system.units)
-    if "units" in vars(type(system)) and not has_outputs(system):  # inherited units may name what this class lacks
+    # Inherited units may contain names that this class does not have.
+    if "units" in vars(type(system)) and not has_outputs(system):
         refuse_unknown(
             units,
             [each for named in names.values() for each in named],
-            f"{name}.units names what is no coordinate, speed, input or state:",
+            f"{name}.units: not a coordinate, speed, input or state:",
         )
     owners: dict[str, str] = {}
     for kind in NAMES:
         for each in names[kind] if kind != "dependent_coordinates" else ():  # these are coordinates
             if each in owners:
                 places = f"twice in `{kind}`" if owners[each] == kind else f"in `{owners[each]}` and in `{kind}`"
-                raise ValueError(f"{name}: the name {each!r} stands {places}: q, u and trajectories are read by name.")
+                raise ValueError(
+                    f"{name}: the name {each!r} appears {places}. Names must be unique, because values are read by "
+                    "name."
+                )
             owners[each] = kind
     dependent = names["dependent_coordinates"]
     wrong = [each for i, each in enumerate(dependent) if each not in names["coordinates"] or each in dependent[:i]]
     if wrong:
         raise ValueError(
-            f"{name}.dependent_coordinates names coordinates, each once: {', '.join(wrong)} is none, or stands there "
-            f"twice. The coordinates are: {', '.join(names['coordinates']) or 'none'}."
+            f"{name}.dependent_coordinates: {', '.join(wrong)} is not a coordinate, or is repeated. The coordinates "
+            f"are: {', '.join(names['coordinates']) or 'none'}."
         )
 
 
 def unit_of(name: str, declared: Mapping[str, str]) -> str:
     """The declared unit of a name, or "".
 
-    A name with `_rate` or `_dot` behind one that was declared has its unit by the second: "q0_dot" rad/s where "q0" is
-    declared in rad.
+    If the unit of "q0" is rad, the unit of "q0_dot" and "q0_rate" is rad/s.
     """
     base = name.removesuffix("_rate").removesuffix("_dot")
     return declared.get(name) or (_rate_of(declared.get(base, "")) if base != name else "")
 
 
 def units_of(system: System) -> dict[str, str]:
-    """Units by name that a system declares; and of speeds that are the rates of such coordinates."""
+    """The declared units of a system by name, and those of speeds that are rates of such coordinates."""
     speeds = (*system.speeds, *system.dependent_speeds)
     names = (*system.coordinates, *speeds, *system.auxiliary_speeds, *system.inputs, *system.states)
     units = {name: unit for name, unit in system.units.items() if name in names or has_outputs(system)}
@@ -423,18 +473,41 @@ def units_of(system: System) -> dict[str, str]:
     return units
 
 
+def named_numbers(names: Sequence[Sequence[str]], rows: Sequence[Any], more: Mapping[str, Any], units: Any) -> str:
+    """Numbers by name: "roll=0.1 rad, roll_rate=2 rad/s". Empty if some of them are traced or batched.
+
+    **Arguments:**
+
+    - `names`, `rows`: groups of names, and for each group an array (n,).
+    - `more`: further numbers by name.
+    - `units`: pairs of a name and its unit.
+    """
+    units, items = dict(units), []
+    for group, row in zip(names, rows, strict=True):
+        numbers = concrete_numbers(row)
+        if numbers is None or numbers.shape != (len(group),):
+            return ""
+        items += zip(group, numbers, strict=True)
+    for name, value in more.items():
+        number = concrete_numbers(value)
+        if number is None or number.ndim:
+            return ""
+        items.append((name, number))
+    return ", ".join(f"{name}={text_of(x, unit_of(name, units))}" for name, x in items)
+
+
 def in_degrees(unit: str) -> bool:
-    """Whether a unit can be shown in degrees."""
+    """Whether a quantity with this unit can be shown in degrees."""
     return unit in ("rad", "rad/s", "rad/s^2")
 
 
 def refuse_no_angle(names: Iterable[str], units: Iterable[str]) -> None:
-    """`ValueError` where degrees are asked for and nothing that is drawn is known to be an angle."""
+    """Raise `ValueError` if degrees are requested but none of the names is declared to be an angle."""
     names = tuple(names)
     if not any(in_degrees(unit) for unit in units):
         raise ValueError(
-            f"degrees=True: none of {', '.join(names)} is declared to be an angle. Say so where they are named, in the "
-            f'system: `units = {{{names[0]!r}: "rad"}}`; or here, by `units={{{names[0]!r}: "rad"}}`.'
+            f"degrees=True: none of {', '.join(names)} is declared to be an angle. Declare its unit in the system, "
+            f'`units = {{{names[0]!r}: "rad"}}`, or pass `units={{{names[0]!r}: "rad"}}`.'
         )
 
 

@@ -1,4 +1,4 @@
-"""Bicycles put together from parts: tyres, riders, steering, frames, drives, and who steers them."""
+"""Bicycles assembled from parts: tyres, riders, controllers, steering, frames and drives."""
 
 from ._bicycle import Bicycle as Bicycle
 from ._control import LaneChange as LaneChange

@@ -1,7 +1,7 @@
-"""A bicycle put together from parts, on the parameters of the Whipple bicycle.
+"""A bicycle assembled from parts, with the parameters of the Whipple bicycle.
 
-Its motion follows Example 7 and Meijaard et al. (2007). Where a tyre slips, velocities of its contact that ideal
-rolling makes zero are speeds, and forces of the tyre stand in the place of those of the constraint.
+The kinematics follow Example 7 and Meijaard et al. (2007). If a tyre slips, the slip velocities of its contact are
+generalized speeds, and tyre forces replace the constraint forces of ideal rolling.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ import jax.numpy as jnp
 
 from .._common.lookup import not_there, refuse_unknown
 from .._kane.arguments import as_row, is_concrete
-from .._kane.rhs import named_row
+from .._kane.right_hand_side import named_row
 from .._scalarjit.components import Component, add, component, total
 from .._system.kinematics import Frame, Point, Vector
-from .._system.motion import DuplicateName, Motion
+from .._system.motion import DuplicateName
 from .._system.parameters import parameters_in, with_parameters
+from .._system.system import NamedVector
 from ..catalog.bicycle import WhippleBicycle
 from ._files import as_meijaard, read_yaml
 from ._ground import Ground, Slope
@@ -32,10 +33,10 @@ from ._steering import HeadTwist
 from ._tyre import Tyre
 
 OFF_ROAD = 1e-3
-"""[m]: a motion over a `Road` ends where a contact is further from it than that."""
+"""[m]: a simulation on a `Road` ends if the distance of a contact from the road exceeds this value."""
 
 _ORDER = "rider, control, steering, drive, extra"
-_SECOND_OF_A_KIND = "Values are read by name: for a second part of a kind write a Part of your own, with other names."
+_SECOND_OF_A_KIND = "Values are read by name. For a second part of this kind, write your own Part with other names."
 _ASIDE = ("_lateral_slip", "_lateral_deflection")
 
 
@@ -46,33 +47,33 @@ def _as_tuple(parts: Any) -> tuple[Any, ...]:
 
 
 class Bicycle(WhippleBicycle):
-    """A bicycle with parts: tyres, a rider, steering, a drive, who steers it, and what else it carries.
+    """A bicycle with parts: tyres, a rider, a controller, steering, a drive, and others.
 
         Bicycle.benchmark().with_parts(
             front_tyre=Tyre(lateral=LateralSlip(9000.0, 900.0, relaxation_length=0.1)),
             rider=LeaningRider(...),
         )
 
-    Without parts it is the `WhippleBicycle`, whose parameters it has under the same names; those of a part have its
-    name before theirs: "rider.stiffness", "front_tyre.lateral.cornering_stiffness".
+    Without parts it is the `WhippleBicycle`, with the same parameters. The parameters of a part are prefixed by its
+    name: "rider.stiffness", "front_tyre.lateral.cornering_stiffness".
 
-    **Arguments** beside Meijaard's parameters:
+    **Arguments** in addition to Meijaard's parameters:
 
-    - `rear_tyre`, `front_tyre`: `Tyre`, by default a knife edge that rolls. A tyre that slips has the velocity of its
-        contact as a speed of its own, "rear_lateral_slip" and "front_longitudinal_slip" [m/s], which is zero in ideal
-        rolling; with a relaxation length it has states, as "front_lateral_deflection" [m].
-    - `head`: `HeadTwist`, a frame that gives way in torsion at the steering head.
-    - `rider`, `control`, `steering`, `drive`: a `Part` each, or several in a tuple. `extra`: any more.
+    - `rear_tyre`, `front_tyre`: `Tyre`. Default: a knife edge that rolls without slip. A slipping tyre adds the
+        velocity of its contact as a speed, "rear_lateral_slip" and "front_longitudinal_slip" [m/s], which is zero in
+        ideal rolling. A relaxation length adds states, e.g. "front_lateral_deflection" [m].
+    - `head`: `HeadTwist`, a frame with torsional compliance at the steering head.
+    - `rider`, `control`, `steering`, `drive`: a `Part` each, or several in a tuple.
+    - `extra`: any further parts.
+    - `road`: a `Slope`, or a `Road` of given height. Default: level ground. On a `Road`, the position of the front
+        contact and the height of the rear one are coordinates too: "front_x", "front_y" and "rear_height" [m]. Yaw,
+        roll and pitch are then measured from the tangent plane.
 
-    - `road`: a `Slope`, or a `Road` of given height; by default level ground. On a `Road` the place of the front
-        contact and the height of the rear one are coordinates too, "front_x", "front_y" and "rear_height" [m]; yaw,
-        roll and pitch begin at its tangent plane.
+    Methods of parts are called in this order: `rider`, `control`, `steering`, `drive`, `extra`. A subclass may have its
+    own fields that contain parts.
 
-    Methods of parts are called in this order: `rider`, `control`, `steering`, `drive`, `extra`. A class that inherits
-    from this one may have fields of its own that hold parts.
-
-    The motion names what that of `WhippleBicycle` names, and the frame "H" of the fork at zero steer. Inputs that parts
-    command are outputs too, with what came from outside: "applied_steer_torque".
+    The motion contains the names of the motion of `WhippleBicycle`, and the frame "H" of the fork at zero steer. Inputs
+    that parts add to are outputs too, e.g. "applied_steer_torque", the sum including the external input.
     """
 
     rear_tyre: Tyre = eqx.field(default_factory=Tyre)
@@ -91,11 +92,11 @@ class Bicycle(WhippleBicycle):
             value = getattr(self, field)
             if not (isinstance(value, kind) or (field == "head" and value is None)):
                 or_none = " or None" if field == "head" else ""
-                raise TypeError(f"{name}: `{field}` is a {kind.__name__}{or_none}, got {called(value)}.")
+                raise TypeError(f"{name}: `{field}` must be a {kind.__name__}{or_none}, got {called(value)}.")
         for field in _ORDER.split(", "):
             for part in _as_tuple(getattr(self, field)):
                 if not isinstance(part, Part):
-                    raise TypeError(f"{name}: `{field}` holds a Part of jaxkane.bicycles, got {called(part)}.")
+                    raise TypeError(f"{name}: `{field}` must be a Part of jaxkane.bicycles, got {called(part)}.")
         _refuse_equal_names(self)
         known = (*self.coordinates, *self.speeds, *self.dependent_speeds, *self.states)
         for part in self.parts:
@@ -104,16 +105,23 @@ class Bicycle(WhippleBicycle):
         for end, tyre, radius in ((REAR, self.rear_tyre, self.rR), (FRONT, self.front_tyre, self.rF)):
             crown = tyre.crown
             if crown is None or not is_concrete(crown, radius) or crown.ndim or radius.ndim:
-                continue  # members of a batch are not looked at
-            if float(crown) >= float(radius):  # numbers, where others are traced
+                continue  # members of a batch are not checked
+            if float(crown) >= float(radius):  # Python numbers, also while others are traced
                 raise ValueError(
-                    f"{name}: {end}_tyre.crown = {crown} m is the radius of the tyre's cross section, and must be less "
-                    f"than that of its wheel, {radius} m."
+                    f"{name}: {end}_tyre.crown = {crown} m is the radius of the tyre's cross section. It must be less "
+                    f"than the radius of the wheel, {radius} m."
                 )
 
     def with_parts(self, **parts: Any) -> Self:
-        """A copy with other parts by the names of the fields, or with other parameters by their names, those of a part
-        too: `with_parts(**{"extra[0].mass": 4.0})`."""
+        """A copy with other parts or parameters.
+
+        **Arguments:**
+
+        - `parts`: parts by the names of the fields, or parameters by name, also those of parts:
+            `with_parts(**{"extra[0].mass": 4.0})`.
+
+        **Raises:** `ValueError` for an unknown name.
+        """
         fields = [field.name for field in dataclasses.fields(self)]
         changed = dataclasses.replace(self, **{name: part for name, part in parts.items() if name in fields})
         rest = {name: value for name, value in parts.items() if name not in fields}
@@ -125,11 +133,11 @@ class Bicycle(WhippleBicycle):
     def from_file(cls, path: str | os.PathLike[str]) -> Self:
         """A bicycle from a file of BicycleParameters: a text file (`NAME = value+/-deviation`), or YAML by its suffix.
 
-        A YAML file may also hold a rider: a rigid one ("Moore2019", "principal"), or one who leans
-        ("MooreRiderLean2012"). The speed `v` is passed over.
+        A YAML file may also contain a rider: a rigid one ("Moore2019", "principal"), or a leaning one
+        ("MooreRiderLean2012"). The speed `v` is ignored.
 
-        **Raises:** `ValueError` that names the lines that are unknown, repeated or malformed, what is missing, and
-        what is not in metres or radians.
+        **Raises:** `ValueError` with the lines that are unknown, repeated or malformed, the missing names, and the
+        values that do not seem to be in metres or radians.
         """
         if Path(path).suffix.lower() not in (".yml", ".yaml"):
             return super().from_file(path)
@@ -142,7 +150,7 @@ class Bicycle(WhippleBicycle):
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """All parts, in the order in which their methods are called; tyres are not among them."""
+        """All parts, in the order in which their methods are called. Tyres are not included."""
         values = (getattr(self, field.name) for field in dataclasses.fields(self))
         return tuple(part for value in values for part in _as_tuple(value) if isinstance(part, Part))
 
@@ -183,7 +191,7 @@ class Bicycle(WhippleBicycle):
 
     @property
     def lateral(self) -> tuple[str, ...]:
-        """Names of what its linear model about straight riding holds: the coordinates, speeds and states that move to
+        """Names of the states of its linear model about straight riding: coordinates, speeds and states that change to
         first order when it leaves the upright plane."""
         of_tyres = [name for name in (*_slip_speeds(self), *_deflections(self)) if name.endswith(_ASIDE)]
         moving = {*WhippleBicycle.lateral, *of_tyres, *(name for part in self.parts for name in part.lateral())}
@@ -191,7 +199,7 @@ class Bicycle(WhippleBicycle):
 
     @property
     def needs_trim(self) -> bool:
-        """Whether riding straight on takes a torque of the drive, or moves coordinates of parts that gravity loads."""
+        """Whether riding straight needs a drive torque, or changes coordinates of parts that gravity loads."""
         resists = any(part.resists for part in self.parts) or isinstance(self.road, Slope)
         moves = any(
             name not in (*part.lateral(), *part.dependent_coordinates)
@@ -202,9 +210,9 @@ class Bicycle(WhippleBicycle):
 
     @property
     def mode_groups(self) -> dict[str, tuple[str, ...]]:
-        """Those of `lateral` that it has beside the Whipple bicycle's, by the name of the modes that they bring.
+        """The names of `lateral` that the Whipple bicycle does not have, grouped by the names of their modes.
 
-        The front end gives way in the tyre's relaxation or the frame's torsion: then it can wobble.
+        The front end is compliant if the tyre has a relaxation length or the frame has torsion. It can then wobble.
         """
         lateral, groups = self.lateral, {}
         for end in (REAR, FRONT):
@@ -230,8 +238,8 @@ class Bicycle(WhippleBicycle):
 
     @property
     def steer_point(self) -> tuple[Component, Component]:
-        """x, z of the point S [m], of the upright bicycle and from the rear contact: on the steer axis, nearest to the
-        rear wheel's centre (Example 7)."""
+        """x, z of the point S [m], measured from the rear contact of the upright bicycle. S is the point on the steer
+        axis that is nearest to the rear wheel's centre (Example 7)."""
         cos, sin = jnp.cos(self.lam), jnp.sin(self.lam)
         x = (self.w + self.c) * cos * cos - self.rR * sin * cos
         return x, -self.rR - x * sin / cos
@@ -242,21 +250,27 @@ class Bicycle(WhippleBicycle):
             motion = _motion_with(self, part, motion, t, q, u)
         return motion
 
-    def on_frame(self, motion: Motion, x: Component, y: Component, z: Component) -> Point:
-        """A point that is fixed in the frame B, in Meijaard's measures: from the rear contact of the upright bicycle,
-        x forward, y to the right, z down [m]."""
+    def on_frame(self, motion: Any, x: Component, y: Component, z: Component) -> Point:
+        """A point that is fixed in the frame B.
+
+        **Arguments:**
+
+        - `motion`: the motion of the bicycle.
+        - `x`, `y`, `z` [m]: forward, to the right and down, from the rear contact of the upright bicycle (Meijaard's
+            convention).
+        """
         return motion["rear wheel"].center.fixed(motion["B"].vector(x, y, add(z, self.rR)))
 
-    def on_fork(self, motion: Motion, x: Component, y: Component, z: Component) -> Point:
-        """A point that is fixed in the fork, in the same measures, at zero steer."""
+    def on_fork(self, motion: Any, x: Component, y: Component, z: Component) -> Point:
+        """A point that is fixed in the fork; x, y, z [m] as in `on_frame`, at zero steer."""
         return motion["fork"].center.fixed(motion["H"].vector(x - self.xH, y, z - self.zH))
 
     def gravity(self, N: Frame) -> Vector:
         return self.road.gravity(self.g, N)
 
     def tyre_loads(self, motion: Any) -> dict[str, Component]:
-        """What the ground carries under each wheel [N], "rear" and "front", if nothing accelerated: from the moments of
-        all weights about the contacts."""
+        """Static loads under the wheels [N], "rear" and "front": the moments of all weights about the contacts, without
+        accelerations."""
         gravity, Y, P = self.gravity(motion.N), motion["Y"], motion["P"]
         moments = [body.center.position_from(P).cross(body.mass * gravity).dot(Y.y) for body in motion.bodies]
         front = sum(moments[1:], moments[0]) / motion["Q"].position_from(P).cross(motion.front.normal).dot(Y.y)
@@ -264,7 +278,7 @@ class Bicycle(WhippleBicycle):
         return {REAR: pressing - front * motion.front.normal.dot(motion.rear.normal), FRONT: front}
 
     def tyre_forces(self, motion: Any, values: Mapping[str, Component]) -> dict[str, Component]:
-        """Forces of the ground on the tyres that slip [N], as "front_lateral_force"; `values` as of `loads`."""
+        """Forces of the ground on the slipping tyres [N], e.g. "front_lateral_force". `values` as in `loads`."""
         carried, forces = _loads_with_transfer(self, motion, values), {}
         for end, tyre, contact, _, _ in wheels(self, motion):
             of_tyre = tyre.forces(contact, carried[end], _deflections_of(end, tyre, values))
@@ -317,7 +331,7 @@ class Bicycle(WhippleBicycle):
             of_part = _checked_dict(part.outputs(self, t, q, u, motion, now), label)
             twice = [name for name in of_part if name in outputs]
             if twice:
-                raise ValueError(f"{label}: there is an output {twice[0]!r} already.")
+                raise ValueError(f"{label}: the output {twice[0]!r} exists already. Rename it.")
             outputs |= of_part
         return outputs
 
@@ -325,7 +339,8 @@ class Bicycle(WhippleBicycle):
         motion = _motion_at_rest(self, t, q)
         residuals = off_road(self, motion, q)
         if self.road.curved:
-            on_road = sum(x * x for x in residuals) < (1e-3 * OFF_ROAD) ** 2  # not on the way of a solver
+            # only near a solution: intermediate iterates of a solver must stay finite
+            on_road = sum(x * x for x in residuals) < (1e-3 * OFF_ROAD) ** 2
             refused = on_road & (clearance(self, motion) <= 0.0)
             residuals = [jnp.where(refused, jnp.nan, x) for x in residuals]
         return [*residuals, *(x for part in self.parts for x in part.configuration_constraints(self, t, q, motion))]
@@ -335,7 +350,7 @@ class Bicycle(WhippleBicycle):
         if not self.road.curved:
             return events
         motion = _motion_at_rest(self, t, q)
-        # An edge that is narrower than a step of the solver shows by what is off the road after it.
+        # If an edge is narrower than a step of the solver, it is detected by the distance from the road after the step.
         on_road = 1.0 - sum(x * x for x in off_road(self, motion, q)) / OFF_ROAD**2
         return {**events, "wheel_touches_twice": clearance(self, motion), "wheel_off_the_road": on_road}
 
@@ -357,7 +372,7 @@ def _deflections(bicycle: Bicycle) -> tuple[str, ...]:
 
 
 def _load_transfers(bicycle: Bicycle) -> tuple[str, ...]:
-    """States by which the loads of tyres follow what the ground carries."""
+    """States by which the tyres' loads follow the ground's normal forces."""
     return tuple(f"{end}_load_transfer" for end, tyre in _tyres(bicycle) if tyre.load_lag is not None)
 
 
@@ -370,7 +385,7 @@ def _front_speeds(bicycle: Bicycle) -> tuple[str, ...]:
 
 
 def _places(bicycle: Bicycle) -> list[str]:
-    """Where each part stands, and what it is: "extra[0], a Trailer"; one part may stand in two places."""
+    """The name and kind of each part, e.g. "extra[0], a Trailer". One part may be used twice."""
     places = []
     for field in dataclasses.fields(bicycle):
         value = getattr(bicycle, field.name)
@@ -381,7 +396,7 @@ def _places(bicycle: Bicycle) -> list[str]:
 
 
 def _refuse_equal_names(bicycle: Bicycle) -> None:
-    """Parts of one kind have the same names: values could not be told apart."""
+    """Refuse two parts of one kind: their names are equal, so their values could not be distinguished."""
     owners: dict[str, int] = {}
     places = _places(bicycle)
     for i, part in enumerate(bicycle.parts):
@@ -389,12 +404,14 @@ def _refuse_equal_names(bicycle: Bicycle) -> None:
             for name in getattr(part, kind):
                 if owners.setdefault(name, i) != i:
                     raise ValueError(
-                        f"{type(bicycle).__name__}: the name {name!r} stands twice in `{kind}`: of "
-                        f"{places[owners[name]]} and of {places[i]}. {_SECOND_OF_A_KIND}"
+                        f"{type(bicycle).__name__}: the name {name!r} appears twice in `{kind}`: in "
+                        f"{places[owners[name]]} and in {places[i]}. {_SECOND_OF_A_KIND}"
                     )
 
 
-def _motion_with(bicycle: Bicycle, part: Part, motion: BicycleMotion, t: Component, q: Any, u: Any) -> BicycleMotion:
+def _motion_with(
+    bicycle: Bicycle, part: Part, motion: BicycleMotion, t: Component, q: NamedVector, u: NamedVector
+) -> BicycleMotion:
     try:
         extended = part.motion(bicycle, motion, t, q, u)
     except DuplicateName as error:
@@ -403,12 +420,12 @@ def _motion_with(bicycle: Bicycle, part: Part, motion: BicycleMotion, t: Compone
         raise ValueError(f"{type(bicycle).__name__}: {place}: {error} {_SECOND_OF_A_KIND}") from None
     if not isinstance(extended, type(motion)):
         hint = " Does it end without a `return`?" if extended is None else ""
-        raise TypeError(f"{_method(part, 'motion')} returns `motion.extended(...)`, got {extended!r}.{hint}")
+        raise TypeError(f"{_method(part, 'motion')} must return `motion.extended(...)`, got {extended!r}.{hint}")
     return extended
 
 
 def _loads_with_transfer(bicycle: Bicycle, motion: Any, values: Mapping[str, Component]) -> dict[str, Component]:
-    """Loads that the laws of the tyres read [N]."""
+    """Loads that the tyre laws use [N]."""
     loads = bicycle.tyre_loads(motion)
     for name in _load_transfers(bicycle):
         end = name.partition("_")[0]
@@ -416,10 +433,12 @@ def _loads_with_transfer(bicycle: Bicycle, motion: Any, values: Mapping[str, Com
     return loads
 
 
-def _commanded(bicycle: Bicycle, t: Any, q: Any, u: Any, motion: Any, values: Mapping[str, Component]) -> _Commanded:
-    """Inputs and states by name, with what the parts add to the inputs.
+def _commanded(
+    bicycle: Bicycle, t: Component, q: NamedVector, u: NamedVector, motion: Any, values: Mapping[str, Component]
+) -> _Commanded:
+    """Inputs and states by name, including what the parts add to the inputs.
 
-    **Raises:** `KeyError` for an input that no part has; `ValueError` for one that its part has read before.
+    **Raises:** `KeyError` for an input that no part has; `ValueError` if a part adds to an input after it was read.
     """
     name = type(bicycle).__name__
     commanded = _Commanded(values)
@@ -433,7 +452,7 @@ def _commanded(bicycle: Bicycle, t: Any, q: Any, u: Any, motion: Any, values: Ma
                 raise not_there(to, bicycle.inputs, f"the inputs of {name}, of which {kind} adds to this one")
             if to in late:
                 raise ValueError(
-                    f"{name}: {kind} adds to {to!r} after the part that reads it, which would miss it. Put it "
+                    f"{name}: {kind} adds to {to!r} after the part that reads it, so it would have no effect. Put it "
                     f"before that part; parts are called in the order {_ORDER}."
                 )
             commanded[to] = add(commanded.get(to), component(command))
@@ -442,14 +461,15 @@ def _commanded(bicycle: Bicycle, t: Any, q: Any, u: Any, motion: Any, values: Ma
     return commanded
 
 
-def _motion_at_rest(bicycle: Bicycle, t: Component, q: Any) -> Any:
+def _motion_at_rest(bicycle: Bicycle, t: Component, q: NamedVector) -> Any:
     return bicycle.motion(t, q, (0.0,) * (len(bicycle.speeds) + len(bicycle.dependent_speeds)))
 
 
 class _Commanded(dict[str, Any]):
     """Inputs and states by name, as parts receive them.
 
-    `commanded`: names of those inputs that parts add to; `read`: names that were looked up.
+    - `commanded`: names of the inputs that parts add to.
+    - `read`: names that were looked up.
     """
 
     def __init__(self, values: Mapping[str, Component]):
@@ -472,7 +492,7 @@ def _method(part: Part, method: str) -> str:
 def _checked_dict(returned: Any, label: str) -> Mapping[str, Any]:
     if not isinstance(returned, Mapping):
         hint = " Does it end without a `return`?" if returned is None else ""
-        raise TypeError(f"{label} returns numbers by name, in a dict; got {returned!r}.{hint}")
+        raise TypeError(f"{label} must return a dict of numbers by name, got {returned!r}.{hint}")
     return returned
 
 
@@ -480,5 +500,5 @@ def _deflections_of(end: str, tyre: Tyre, values: Any) -> dict[str, Component]:
     return {name: values[f"{end}_{name}_deflection"] for name in tyre.deflects}
 
 
-def _mass(motion: Motion) -> Component:
+def _mass(motion: Any) -> Component:
     return total(component(body.mass) for body in motion.bodies)

@@ -1,4 +1,4 @@
-"""Who steers: feedback of the state, paths, and a rider model."""
+"""Control of a bicycle: state feedback, path following and a rider model."""
 
 from __future__ import annotations
 
@@ -15,25 +15,30 @@ from .._common.lookup import as_names, refuse_unknown
 from .._kane.arguments import is_concrete
 from .._scalarjit.components import Component, Scalar, mul, sub
 from .._system.parameters import Learned, learned, parameter, to_float
+from .._system.prints import module_text
+from .._system.system import NamedVector
 from ..catalog.bicycle import TILT
 from ..loads import smooth_abs
 from ..stability import linearize, lqr, straight_ahead
 from ._bicycle import Bicycle
-from ._part import Part, check_parameters
+from ._part import BicycleMotion, Part, check_parameters
 
 STEER = "steer_torque"
 
 
 class LeanSteerGains(Part):
-    """Steer torque in proportion to lean and steer and their rates.
+    """A steer torque proportional to roll, steer and their rates.
 
         command = follow * desired_roll - sum of gain * state,   state = roll, steer, roll_rate, steer_rate
 
-    At speeds where a bicycle weaves, a negative `roll_rate` alone can balance it:
-    it turns the fork to the side to which the bicycle falls.
+    At speeds where a bicycle weaves, a negative `roll_rate` gain alone can balance it: it turns the fork to the side to
+    which the bicycle falls.
 
-    **Arguments:** the gains `roll`, `steer` [N m/rad], `roll_rate`, `steer_rate` [N m s/rad]; `follow` [N m/rad], by
-    default that of roll, see `follow_gain`; `command`: the input that is written to.
+    **Arguments:**
+
+    - `roll`, `steer` [N m/rad], `roll_rate`, `steer_rate` [N m s/rad]: the gains.
+    - `follow` [N m/rad]: gain of "desired_roll"; `roll` by default, see `follow_gain`.
+    - `command`: name of the input to which the torque is added.
     """
 
     roll: Scalar = parameter(0.0, unit="N m/rad")
@@ -54,17 +59,21 @@ class LeanSteerGains(Part):
 
 
 class ScheduledGains(Part):
-    """Feedback of any states with gains that change with the forward speed v.
+    """State feedback with gains that depend on the forward speed v (gain scheduling).
 
         command = follow(v) * desired_roll - sum of gains(v) * state
 
-    Between the speeds of the schedule the gains are linear in v, with corners that are rounded over a twentieth of the
-    smallest interval, so that every derivative is finite. Below the first speed and above the last the gains stay what
-    they are there. `scheduled_lqr` makes such a part.
+    Between the scheduled speeds the gains are linear in v. The corners are rounded over a twentieth of the smallest
+    interval, so that all derivatives are finite. The gains are constant below the first speed and above the last one.
+    `scheduled_lqr` returns such a part.
 
-    **Arguments:** `at` (n,) [m/s]: the speeds of the schedule, increasing; `measured`: m names of coordinates, speeds
-    and states of the first order; `gains` (n, m), in N m for the unit of each; `follow` (n,) [N m/rad]; `command`: the
-    input that is written to.
+    **Arguments:**
+
+    - `at` (n,) [m/s]: the scheduled speeds, increasing.
+    - `measured`: m names of coordinates, speeds and states of the first order.
+    - `gains` (n, m): in N m divided by the unit of each state.
+    - `follow` (n,) [N m/rad]: gain of "desired_roll".
+    - `command`: name of the input to which the torque is added.
 
     **Raises:** `ValueError` for other shapes, speeds that do not increase, and numbers that are not finite.
     """
@@ -85,16 +94,16 @@ class ScheduledGains(Part):
     def __check_init__(self) -> None:
         n, m = len(self.at), len(self.measured)
         if not (n and all(map(math.isfinite, self.at)) and all(np.diff(self.at) > 0)):
-            raise ValueError(f"ScheduledGains: `at` are speeds [m/s] that increase, got {self.at}.")
+            raise ValueError(f"ScheduledGains: `at` must be increasing, finite speeds [m/s], got {self.at}.")
         for name, shape in (("gains", (n, m)), ("follow", (n,))):
             value = getattr(self, name)
-            if np.shape(value)[-len(shape) :] != shape:  # leading axes more are a batch
+            if np.shape(value)[-len(shape) :] != shape:  # additional leading axes are a batch
                 raise ValueError(
-                    f"ScheduledGains: `{name}` has the shape {shape}, for {n} speeds and the states "
+                    f"ScheduledGains: `{name}` must have the shape {shape}, for {n} speeds and the states "
                     f"{', '.join(self.measured)}; got {np.shape(value)}."
                 )
             if is_concrete(value) and not np.all(np.isfinite(np.asarray(value))):
-                raise ValueError(f"ScheduledGains: `{name}` are not all finite.")
+                raise ValueError(f"ScheduledGains: `{name}` contains a value that is not finite.")
 
     def commands(self, bicycle, t, q, u, motion, values):
         passed = self._passed(motion.rear.speed)
@@ -105,7 +114,7 @@ class ScheduledGains(Part):
         return {self.command: command}
 
     def _passed(self, v: Component) -> list[Component]:
-        """Of each interval of the schedule the share that lies below v: 0 before it and 1 behind it."""
+        """The share of each interval of the schedule that is below v: 0 before the interval and 1 after it."""
         if len(self.at) == 1:
             return []
         lengths = np.diff(self.at)
@@ -122,22 +131,26 @@ def _at(passed: list[Component], values: Any) -> Component:
     return value
 
 
-def _state(name: str, bicycle: Bicycle, q: Any, u: Any, values: Any) -> Component:
+def _state(name: str, bicycle: Bicycle, q: NamedVector, u: NamedVector, values: Any) -> Component:
     if name in bicycle.coordinates:
         return q[name]
     return u[name] if name in (*bicycle.speeds, *bicycle.dependent_speeds) else values[name]
 
 
 def follow_gain(bicycle: Bicycle, speed: float) -> float:
-    """How much "desired_roll" [rad] a balanced bicycle needs for one radian of roll in a steady turn, at `speed` [m/s].
+    """The "desired_roll" [rad] per radian of roll in a steady turn at `speed` [m/s], by the linear model about straight
+    riding.
 
-    Of the linear model about riding straight. A balance with this many times its gain of "desired_roll" leans as it is
-    asked to: `LeanSteerGains(..., follow=...)`, or `PathFollower(path, gain=follow_gain(bicycle, speed))` before it.
+    If a controller's gain of "desired_roll" is multiplied by this factor, the bicycle reaches the desired roll:
+    `LeanSteerGains(..., follow=...)`, or `PathFollower(path, gain=follow_gain(bicycle, speed))` before it.
 
-    **Raises:** `ValueError` where the balance does not read "desired_roll".
+    **Raises:** `ValueError` if no controller reads "desired_roll".
     """
     if "desired_roll" not in bicycle.inputs:
-        raise ValueError(f'{type(bicycle).__name__}: it has no balance that reads the input "desired_roll".')
+        raise ValueError(
+            f'{type(bicycle).__name__} has no controller with the input "desired_roll". Add one, e.g. '
+            "bicycle.with_parts(control=LeanSteerGains(...))."
+        )
     model = linearize(bicycle, straight_ahead(bicycle, speed), states=bicycle.lateral)
     turned = np.linalg.solve(model.A, -np.asarray(model.B)[:, model.inputs.index("desired_roll")])
     return float(1.0 / turned[model.states.index("roll")])
@@ -152,22 +165,29 @@ def scheduled_lqr(
     states: Sequence[str] | None = None,
     command: str = STEER,
 ) -> ScheduledGains:
-    """Linear-quadratic regulators of riding straight at several speeds, as one part with scheduled gains.
+    """Linear-quadratic regulators of straight riding at several speeds, as one part with scheduled gains.
 
         bicycle.with_parts(control=scheduled_lqr(bicycle, jnp.linspace(2.0, 8.0, 7), Q=[10.0, 1.0, 1.0, 0.1], R=0.01))
 
-    At each speed `jaxkane.stability.lqr` of `jaxkane.stability.linearize`. The gain of "desired_roll" is the one with
-    which a steady turn of that linear model has this roll.
+    At each speed, `jaxkane.stability.lqr` uses the model of `jaxkane.stability.linearize`. The gain of "desired_roll"
+    makes the roll of a steady turn of the linear model equal to "desired_roll".
 
-    **Arguments:** `bicycle`, without a balance of its own; `speeds` (n,) [m/s], increasing; `Q` (m, m) or its diagonal
-    (m,), the weights of the states; `R`: of the command; `states`: names, by default `bicycle.lateral`, all that move
-    to first order when it leaves the upright plane; `command`: the input by which it steers.
+    **Arguments:**
 
-    **Raises:** `ValueError` as those two functions, as where no regulator exists, and for a bicycle with a balance.
+    - `bicycle`: without its own controller.
+    - `speeds` (n,) [m/s]: increasing.
+    - `Q`: (m, m) weights of the states, or their diagonal (m,).
+    - `R`: weight of the command.
+    - `states`: names of the states. Default: `bicycle.lateral`, all that change to first order when it leaves the
+        upright plane.
+    - `command`: name of the steering input.
+
+    **Raises:** `ValueError` as those two functions, e.g. if no regulator exists, and for a bicycle with a controller.
     """
     if "desired_roll" in bicycle.inputs:
         raise ValueError(
-            f"scheduled_lqr: the {type(bicycle).__name__} has a balance already: bicycle.with_parts(control=None)."
+            f"scheduled_lqr: the {type(bicycle).__name__} already has a controller. Remove it by "
+            "bicycle.with_parts(control=None)."
         )
     names = bicycle.lateral if states is None else as_names(states)
     gains, follow = [], []
@@ -175,7 +195,8 @@ def scheduled_lqr(
         model = linearize(bicycle, straight_ahead(bicycle, v), states=names)
         K, _, _ = lqr(model, Q, R, inputs=[command])
         A, B = np.asarray(model.A), np.asarray(model.B)[:, model.inputs.index(command)]
-        turned = np.linalg.solve(A - B[:, None] @ K, -B)  # the steady states of a constant command beside the feedback
+        # steady states for a constant command in addition to the feedback
+        turned = np.linalg.solve(A - B[:, None] @ K, -B)
         gains.append(K[0])
         follow.append(1.0 / turned[names.index("roll")])
     return ScheduledGains(speeds, names, np.array(gains), np.array(follow), command)
@@ -186,14 +207,19 @@ class LaneChange(eqx.Module):
 
         y = width * s^3 (10 - 15 s + 6 s^2),   s = (x - start) / length from 0 to 1
 
-    **Arguments:** `width` [m], positive to the right (y of the bicycle); `start`, `length` [m]; `back` [m]: where it
-    begins to come back, over the same length; None: it stays.
+    **Arguments:**
+
+    - `width` [m]: positive to the right (y of the bicycle).
+    - `start`, `length` [m]: where the lane change begins, and its length.
+    - `back` [m]: where it begins to return, over the same length. None: it does not return.
     """
 
     width: Scalar = parameter(3.0, unit="m")
     start: Scalar = parameter(10.0, unit="m")
     length: Scalar = parameter(20.0, positive=True, unit="m")
     back: Scalar | None = parameter(None, unit="m")
+
+    __repr__ = module_text
 
     def __check_init__(self) -> None:
         check_parameters(self)
@@ -208,25 +234,26 @@ class LaneChange(eqx.Module):
 
 
 class PathFollower(Part):
-    """Looks ahead to a point of a path, and asks for the roll of the turn that leads there.
+    """Looks ahead to a point of a path, and commands the roll of the turn that leads there.
 
         aside = (path(x + L cos(yaw)) - y - L sin(yaw)) cos(yaw),   L = speed * preview
         desired_roll = gain * limit * tanh(2 aside / (g preview^2) / limit)
 
-    An arc that begins along the heading and meets the point `aside` needs the lateral acceleration 2 aside / preview^2;
-    over g it is the roll of a steady turn. Small deviations from a straight path then follow
-    y'' + 2 / preview y' + 2 / preview^2 y = 0, with a damping ratio of 0.71, as far as the balance is faster.
+    An arc that begins along the heading and meets the point `aside` needs the lateral acceleration 2 aside / preview^2.
+    Divided by g, this is the roll of a steady turn. Small deviations from a straight path then follow y'' + 2 / preview
+    y' + 2 / preview^2 y = 0, with a damping ratio of 0.71, if the roll controller is faster.
 
-    It writes to "desired_roll", which a balance reads that stands behind it:
+    It adds to "desired_roll". Place the controller that reads this input after it:
     `control=(PathFollower(LaneChange()), LeanSteerGains(...))`.
 
     **Arguments:**
 
-    - `path`: a function y(x) [m] of numbers that JAX can trace, such as a `LaneChange`; its arrays are parameters. It
-        should have a slope everywhere: a jump is followed, but as a jump of the desired roll.
-    - `preview` [s]: how far ahead it looks. Too short, and it asks for faster turns than the balance can make.
-    - `gain`: of the roll, where the balance does not lean as far as it is asked, see `follow_gain`. `limit` [rad]: the
-        largest roll before that gain.
+    - `path`: a function y(x) [m] that JAX can trace, e.g. a `LaneChange`. Its arrays are parameters. It should be
+        differentiable everywhere: a discontinuity of the path is a discontinuity of the desired roll.
+    - `preview` [s]: the preview time. If it is too short, the commanded turns are faster than the controller can
+        follow.
+    - `gain`: multiplies the roll; use it if the controller does not reach the desired roll, see `follow_gain`.
+    - `limit` [rad]: the largest roll before that gain.
     """
 
     path: Any = learned()
@@ -257,7 +284,7 @@ _OF_BENCHMARK = np.array([
 
 
 class SequentialLoopRider(Part):
-    """A human rider as five loops, one around the other, whose arms follow late.
+    """A human rider as five nested feedback loops with a neuromuscular lag.
 
         wanted heading   = deviation * (path - y)                    y, x of the front contact
         wanted roll      = heading * (wanted heading - yaw) + desired_roll
@@ -265,17 +292,18 @@ class SequentialLoopRider(Part):
         wanted steer     = roll_rate * (wanted roll rate - roll rate)
         torque'' + 2 damping frequency torque' + frequency^2 torque = frequency^2 steer * (wanted steer - steer angle)
 
-    with each gain by its own name. Hess, Moore and Hubbard (2012), *Modeling the manually controlled bicycle*, IEEE
-    Transactions on Systems, Man, and Cybernetics A 42(3). The torque [N m] and its rate are the states
-    "rider_torque" and "rider_torque_rate".
+    The gains are `deviation`, `heading`, `roll`, `roll_rate` and `steer`. Hess, Moore and Hubbard (2012), *Modeling the
+    manually controlled bicycle*, IEEE Transactions on Systems, Man, and Cybernetics A 42(3). The torque [N m] and its
+    rate are the states "rider_torque" and "rider_torque_rate".
 
     **Arguments:**
 
-    - `steer` [N m/rad], `roll_rate` [s], `roll` [1/s]: gains of the inner loops. `heading`, `deviation` [rad/m]: of the
-        outer ones, which act where there is a `path`, a function y(x) [m] as of `PathFollower`; without one the rider
-        follows "desired_roll" alone.
-    - `preview` [s]: the path is read where the front contact will be after that time.
-    - `frequency` [rad/s] and `damping` of the neuromuscular lag. `command`: the input that is written to.
+    - `steer` [N m/rad], `roll_rate` [s], `roll` [1/s]: gains of the inner loops.
+    - `heading`, `deviation` [rad/m]: gains of the outer loops, which are used if there is a `path`.
+    - `path`: a function y(x) [m] as of `PathFollower`. Without it the rider follows "desired_roll" only.
+    - `preview` [s]: the path is evaluated at the position of the front contact after this time.
+    - `frequency` [rad/s], `damping`: of the neuromuscular lag.
+    - `command`: name of the input to which the torque is added.
     """
 
     steer: Scalar = parameter(unit="N m/rad")
@@ -295,24 +323,30 @@ class SequentialLoopRider(Part):
 
     @classmethod
     def benchmark(cls, speed: float, **fields: Any) -> Self:
-        """With the gains for the benchmark bicycle at a speed from 2.5 to 12 m/s, between those that its authors found.
+        """A rider with the gains for the benchmark bicycle, interpolated between the authors' values.
 
-        **Arguments:** `fields`: fields of the rider, as `path`.
+        **Arguments:**
 
-        **Raises:** `ValueError` for a speed outside.
+        - `speed` [m/s]: from 2.5 to 12.
+        - `fields`: other fields of the rider, e.g. `path`.
+
+        **Raises:** `ValueError` for another speed.
         """
         speeds, *columns = _OF_BENCHMARK.T
         speed = float(speed)
         if not speeds[0] <= speed <= speeds[-1]:
             known = f"{speeds[0]:g} to {speeds[-1]:g} m/s"
-            raise ValueError(f"SequentialLoopRider.benchmark: gains are known from {known}, not at {speed} m/s.")
+            raise ValueError(
+                f"SequentialLoopRider.benchmark: the gains are defined from {known}, got {speed} m/s. Pass a speed in "
+                "this range."
+            )
         gains: list[Any] = [np.interp(speed, speeds, column) for column in columns]
         return cls(*gains, **fields)
 
     def commands(self, bicycle, t, q, u, motion, values):
         return {self.command: values["rider_torque"]}
 
-    def wanted_roll(self, q: Any, motion: Any, values: Any) -> Component:
+    def wanted_roll(self, q: NamedVector, motion: BicycleMotion, values: Any) -> Component:
         """[rad]: the command of the inner loops."""
         if self.path is None:
             return values["desired_roll"]

@@ -1,4 +1,4 @@
-"""What acts along the ride: drag of the air, and a prescribed speed."""
+"""Longitudinal loads and constraints: aerodynamic drag, and a prescribed speed."""
 
 from __future__ import annotations
 
@@ -13,8 +13,12 @@ from ._part import Part
 class Drag(Part):
     """Drag of still air at a point of the frame: -density / 2 * area * |v| v.
 
-    **Arguments:** `area` [m^2]: frontal area times drag coefficient, of an upright rider some 0.5; `height` over the
-    ground and place `ahead` of the rear contact [m] of the point at which it acts, when upright; `density` [kg/m^3].
+    **Arguments:**
+
+    - `area` [m^2]: frontal area times drag coefficient; about 0.5 for an upright rider.
+    - `height`, `ahead` [m]: the point at which the drag acts on the upright bicycle, above the ground and ahead of the
+        rear contact.
+    - `density` [kg/m^3]: of the air.
     """
 
     area: Scalar = parameter(0.5, positive=True, unit="m^2")
@@ -31,21 +35,23 @@ class Drag(Part):
 
     def loads(self, bicycle, t, q, u, motion, values):
         v = motion["center of drag"].velocity
-        size = 0.5 * self.density * self.area * smooth_abs(v, 1e-3)  # [N s/m]; smooth below a millimetre a second
+        size = 0.5 * self.density * self.area * smooth_abs(v, 1e-3)  # [N s/m]; smoothed below 1 mm/s
         return Force(-size * v, motion["center of drag"])
 
 
 class ConstantSpeed(Part):
-    """The rear wheel turns against the frame at a prescribed rate, whatever torque that takes.
+    """The rear wheel turns relative to the frame at a prescribed rate, with the torque that this needs.
 
         rear_wheel_rate = -speed / rR
 
-    The rate is a dependent speed then, which an initial state leaves out. The output "holding_torque" [N m] is the
-    torque that the drive has to give, on the rear wheel with its reaction on the frame, negative where it pushes on, as
-    "drive_torque". Linear models over speeds are those of the bicycle without this part, with the "drive_torque" that
-    riding straight and upright takes: deviations from it change the speed to second order only.
+    The rate is then a dependent speed; do not include it in an initial state. The output "holding_torque" [N m] is the
+    necessary drive torque on the rear wheel, with its reaction on the frame. As for "drive_torque", a negative value
+    accelerates. For linear models over speeds, remove this part. Straight, upright riding then has the "drive_torque"
+    that it needs, and deviations from it change the speed to second order only.
 
-    **Arguments:** `speed` [m/s].
+    **Arguments:**
+
+    - `speed` [m/s]: the forward speed.
     """
 
     speed: Scalar = parameter(within=(-100.0, 100.0), unit="m/s")

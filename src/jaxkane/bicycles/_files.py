@@ -1,28 +1,29 @@
-"""Parameter files of the package BicycleParameters, as what a bicycle and its rider are made of. Knows numbers only.
+"""Reads parameter files of the package BicycleParameters into parameters of a bicycle and its rider.
 
-Its YAML files hold a header and `values`, or names and numbers alone. They are read strictly, without a library of
-YAML: a line that is neither is an error. Sets of names ("parameterizations") that are read:
+Its YAML files contain a header and `values`, or only names and numbers. Any other entry raises an exception. These sets
+of names ("parameterizations") can be read:
 
-| name | holds |
+| name | contents |
 |---|---|
-| Meijaard2007, benchmark | Meijaard's names; the rider, if there is one, counted in B |
+| Meijaard2007, benchmark | Meijaard's names; a rider, if any, is included in B |
 | Moore2019, principal | a frame D and a rigid rider P, with radii of gyration about their principal axes |
-| Moore2012 | Moore (2012), *Human control of a bicycle*: the rear frame C with the rider in it |
+| Moore2012 | Moore (2012), *Human control of a bicycle*: the rear frame C includes the rider |
 | MooreRiderLean2012 | the same with legs in C and a leaning upper body G |
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from collections.abc import Mapping
 
 from .._common.lookup import decimal_number, hint
-from ..catalog._entry import lines_of
+from ..catalog._entry import text_of
 
 _HEADER = ("parameterization", "parameters", "rider", "description", "values")
 
-# What a set of names is called, and one of its names that no other set has, or only a larger one before it.
+# Each set, and a name that no other set has except a larger one listed before it.
 _SETS = {"MooreRiderLean2012": "ig11", "Moore2012": "ic11", "Moore2019": "kDaa", "Meijaard2007": "IBxx"}
 _CALLED = {"benchmark": "Meijaard2007", "principal": "Moore2019"}
 
@@ -30,56 +31,67 @@ ParameterValues = dict[str, float]
 
 
 def read_yaml(path: str | os.PathLike[str]) -> tuple[str, ParameterValues]:
-    """The name of the set of parameters, and values by name, from a YAML file of BicycleParameters.
+    """Read a YAML file of BicycleParameters.
 
-    **Raises:** `ValueError` with one line for every entry that is malformed or repeated, and for a set of names that is
-    none of those above.
+    **Returns:** the name of the set of parameters, and the values by name.
+
+    **Raises:** `ValueError` with one line for every malformed or repeated entry, and for an unknown set of names.
     """
+    import yaml
+
+    name = os.fspath(path)
+    try:
+        # `yaml.safe_load` would drop repeated names, and read 010 as 8 and 1e-3 as text. Use the nodes instead.
+        root = yaml.compose(text_of(path), Loader=yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        raise ValueError(f"{name} is not a YAML file: {error}.") from None
     header: dict[str, str] = {}
     values: ParameterValues = {}
     lines: dict[str, int] = {}
     faults: list[str] = []
-    section = ""
-    for number, line in enumerate(lines_of(path), start=1):
-        text = line if line.lstrip()[:1] != "#" else ""
-        text = text.partition(" #")[0].rstrip()
-        indented = text[:1].isspace()
-        if text in ("", "---") or (indented and section not in ("", "values")):  # as the lines of a description
+    pairs = list(root.value) if isinstance(root, yaml.MappingNode) else []
+    if not pairs:
+        raise ValueError(f"{name} must contain lines of the form NAME: number.")
+    for key, node in pairs:  # the list grows by the entries of `values`
+        if key.value in _HEADER:
+            if key.value == "values" and isinstance(node, yaml.MappingNode):
+                pairs += node.value
+            header[key.value] = node.value
             continue
-        name, colon, entry = (part.strip() for part in text.partition(":"))
-        if not indented and name in _HEADER and colon:
-            section, header[name] = name, entry
-            continue
-        if not indented:
-            section = ""
-        try:
-            value = decimal_number(entry)
-        except ValueError:
-            value = math.nan
-        if not (colon and name and math.isfinite(value)):
-            faults.append(f"line {number}: {line.strip()!r} is not of the form NAME: number")
-        elif name in lines:
-            faults.append(f"line {number}: {name} was given before, on line {lines[name]}")
+        line, value = key.start_mark.line + 1, math.nan
+        with contextlib.suppress(ValueError, TypeError):
+            value = decimal_number(node.value)
+        if not math.isfinite(value):
+            faults.append(f"line {line}: {key.value}: {node.value!r} is not of the form NAME: number")
+        elif key.value in lines:
+            faults.append(f"line {line}: {key.value} was given before, on line {lines[key.value]}")
         else:
-            lines[name], values[name] = number, value
+            lines[key.value], values[key.value] = line, value
     if faults:
-        raise ValueError(f"{os.fspath(path)}: " + "; ".join(faults) + ".")
-    return _parameterization(os.fspath(path), header.get("parameterization", ""), values), values
+        raise ValueError(f"{name}: " + "; ".join(faults) + ".")
+    return _parameterization(name, header.get("parameterization", ""), values), values
 
 
 def _parameterization(path: str, name: str, values: ParameterValues) -> str:
     kind = _CALLED.get(name, name) or next((kind for kind, own in _SETS.items() if own in values), "")
     if kind not in _SETS:
-        fault = f"the parameterization {name!r}" if name else "no parameterization, and no names of one,"
-        raise ValueError(f"{path}: {fault} cannot be read; {hint([name], list(_SETS), 'those that can')}")
+        fault = f"the parameterization {name!r} is not known" if name else "the file has no known parameterization"
+        raise ValueError(f"{path}: {fault}; {hint([name], list(_SETS), 'the parameterizations are')}")
     return kind
 
 
 def as_meijaard(kind: str, values: Mapping[str, float]) -> tuple[ParameterValues, ParameterValues | None]:
-    """Meijaard's parameters, and those of a rider with a body of its own, with the names of `RigidRider`, or of
-    `LeaningRider` where they hold a hinge. The speed `v` is none of either.
+    """Convert a set of parameters to Meijaard's.
 
-    **Raises:** `ValueError` that names what is missing and what is unknown.
+    **Arguments:**
+
+    - `kind`: the name of the set.
+    - `values`: numbers by name. The speed `v` is ignored.
+
+    **Returns:** Meijaard's parameters, and those of a separate rider or None. The rider's names are those of
+    `RigidRider`, or of `LeaningRider` if the set contains a hinge.
+
+    **Raises:** `ValueError` with the missing and the unknown names.
     """
     parameters = _Parameters(kind, values)
     parameters.pop("v", 0.0)
@@ -89,7 +101,7 @@ def as_meijaard(kind: str, values: Mapping[str, float]) -> tuple[ParameterValues
 
 
 class _Parameters(dict[str, float]):
-    """Parameters by name that are popped, so that all that is missing or left over is reported together."""
+    """Parameters by name. Values are popped, so that all missing and remaining names are reported together."""
 
     def __init__(self, kind: str, values: Mapping[str, float]):
         super().__init__(values)
@@ -111,15 +123,15 @@ class _Parameters(dict[str, float]):
 
 
 def _meijaard(p: _Parameters) -> tuple[ParameterValues, None]:
-    values = dict(p)  # whose names `WhippleBicycle.from_parameters` looks at
+    values = dict(p)  # `WhippleBicycle.from_parameters` checks these names
     p.clear()
     return values, None
 
 
 def _principal(p: _Parameters) -> tuple[ParameterValues, ParameterValues]:
-    """Moore and Hubbard (2019): radii of gyration k about principal axes a and b, a turned by alpha about y."""
+    """Moore and Hubbard (2019): radii of gyration k about principal axes a and b; a is rotated by alpha about y."""
     parameters = p.named("w", "c", "lam", "g", "rR", "rF", "mR", "mF", "mH", "xH", "zH")
-    implied = {}  # what follows from the rest, or is zero by symmetry, and may be written out
+    implied = {}  # implied by the others, or zero by symmetry; these may be in the file
     for wheel in "RF":
         implied[f"k{wheel}bb"], about_axle = p.pop_values(f"k{wheel}aa", f"k{wheel}yy")
         parameters[f"I{wheel}xx"] = parameters[f"m{wheel}"] * implied[f"k{wheel}bb"] ** 2
@@ -135,17 +147,22 @@ def _principal(p: _Parameters) -> tuple[ParameterValues, ParameterValues]:
     implied |= dict.fromkeys(("xR", "alphaR", "alphaF", "yD", "yF", "yH", "yP", "yR"), 0.0)
     for name, value in implied.items():
         if abs(p.pop(name, value) - value) > 1e-9 * max(1.0, abs(value)):
-            raise ValueError(f"the parameters of {p.kind}: the model has {name} = {value:.6g}.")
+            raise ValueError(
+                f"the parameters of {p.kind}: {name} must be {value:.6g}, because the other parameters imply this "
+                "value. Correct or omit it."
+            )
     return parameters, rider
 
 
 def _moore(p: _Parameters) -> tuple[ParameterValues, None]:
-    """Moore (2012): places and inertias of rear and front frame in axes of which the third is the steer axis."""
+    """Moore (2012): positions and inertias of rear and front frame in axes of which the third is the steer axis."""
     d1, d2, d3, rR, rF = p.pop_values("d1", "d2", "d3", "rr", "rf")
-    # The wheels stand on one level: (d1 + d3) sin(lam) - d2 cos(lam) = rF - rR.
+    # Both wheels touch the level ground: (d1 + d3) sin(lam) - d2 cos(lam) = rF - rR.
     apart = math.hypot(d1 + d3, d2)
     if abs(rF - rR) >= apart:
-        raise ValueError(f"the parameters of {p.kind}: the wheels are too near to each other to stand on the ground.")
+        raise ValueError(
+            f"the parameters of {p.kind}: the wheels are too close to touch level ground. Check d1, d2, d3, rr and rf."
+        )
     lam = math.atan2(d2, d1 + d3) + math.asin((rF - rR) / apart)
     parameters = {"lam": lam, "rR": rR, "rF": rF, "g": p.pop_values("g")[0]}
     parameters["w"], _ = _level(lam, d1 + d3, d2)
@@ -164,8 +181,8 @@ def _moore(p: _Parameters) -> tuple[ParameterValues, None]:
 
 
 def _moore_lean(p: _Parameters) -> tuple[ParameterValues, ParameterValues]:
-    """The same with an upper body G: its hinge is level, `d4` below the rear wheel's centre; its mass centre is `l5`
-    before that centre and `l6` below the hinge."""
+    """The same with a leaning upper body G. Its hinge is level, `d4` below the rear wheel's centre. Its mass centre is
+    `l5` before that centre and `l6` below the hinge."""
     parameters, _ = _moore(p)
     d4, l5, l6 = p.pop_values("d4", "l5", "l6")
     hinge = d4 - parameters["rR"]
@@ -176,13 +193,13 @@ def _moore_lean(p: _Parameters) -> tuple[ParameterValues, ParameterValues]:
 
 
 def _level(lam: float, x: float, z: float) -> tuple[float, float]:
-    """Components in level axes of what has these along the axes of a frame that is tilted by `lam`."""
+    """Components in level axes of a vector with components x, z in axes that are tilted by `lam`."""
     cos, sin = math.cos(lam), math.sin(lam)
     return cos * x + sin * z, cos * z - sin * x
 
 
 def _turned(lam: float, Ixx: float, Iyy: float, Izz: float, Ixz: float) -> tuple[float, float, float, float]:
-    """Moments and product in level axes, of an inertia that is known in axes that are tilted by `lam`."""
+    """Moments and product of inertia in level axes, from those in axes that are tilted by `lam`."""
     cos, sin = math.cos(lam), math.sin(lam)
     xx = cos * cos * Ixx + 2 * cos * sin * Ixz + sin * sin * Izz
     zz = sin * sin * Ixx - 2 * cos * sin * Ixz + cos * cos * Izz

@@ -1,7 +1,7 @@
-"""What a bicycle rides on: the level, a slope, a road of given height.
+"""The ground under a bicycle: level ground, a slope, or a road of given height.
 
-The inertial frame N has x and y along the ground and z downwards. On a slope it belongs to the plane of the road, so
-that gravity is tilted; on a road of given height N.z is vertical.
+The inertial frame N has x and y along the ground and z downwards. On a slope, N is aligned with the road's plane, so
+gravity is tilted. On a road of given height N.z is vertical.
 """
 
 from __future__ import annotations
@@ -18,50 +18,68 @@ import numpy as np
 from .._scalarjit.components import Component, Scalar, add, dot, mul, sub
 from .._system.kinematics import Frame, Point, Vector
 from .._system.parameters import learned, parameter
+from .._system.prints import module_text
 from ..catalog.bicycle import TILT
 from ._part import Contact, check_parameters
 
 Pair = tuple[Component, Component]
 TURN = 2.0 * math.pi
-_LOOK = np.outer([-1.0, 1.0], np.linspace(0.05, 1.5, 30)).ravel()  # [rad] from the contact
+_LOOK = np.outer([-1.0, 1.0], np.linspace(0.05, 1.5, 30)).ravel()  # [rad] from the contact along the tread
 
 
 class Ground(eqx.Module):
-    """Level ground, which is the base of all others."""
+    """Level ground; the base class of all others."""
 
     curved = False
-    """Whether its normal depends on the place, as of a `Road`. Then the place of the front contact is a coordinate."""
+    """Whether the normal depends on the position (a `Road`). The position of the front contact is then a coordinate."""
+
+    __repr__ = module_text
 
     def __check_init__(self) -> None:
         check_parameters(self)
 
     def gravity(self, g: Component, N: Frame) -> Vector:
-        """[m/s^2]"""
+        """The acceleration of gravity [m/s^2]."""
         return g * N.z
 
     def place(self, N: Frame, x: Component, y: Component) -> Vector:
-        """From the origin to the point of the ground at x, y [m]."""
+        """The vector from the origin to the point of the ground at x, y [m]."""
         return x * N.x + y * N.y
 
     def normal(self, N: Frame, x: Component, y: Component) -> Vector:
-        """The unit vector square to the ground, downwards."""
+        """The unit normal of the ground, downwards."""
         return N.z
 
     def rates(self, x: Component, y: Component, yaw: Component, forward: Component, aside: Component) -> Pair:
-        """Rates of x and y of a point that moves on the ground along the heading `yaw` and to its right [m/s]."""
+        """Rates of x and y of a point that moves on the ground.
+
+        **Arguments:**
+
+        - `x`, `y` [m], `yaw` [rad]: position and heading.
+        - `forward`, `aside` [m/s]: velocities along the heading and to its right.
+        """
         cos, sin = jnp.cos(yaw), jnp.sin(yaw)
         return add(mul(forward, cos), mul(-1.0, mul(aside, sin))), add(mul(forward, sin), mul(aside, cos))
 
     def tangent(self, N: Frame, x: Component, y: Component, rates: Callable[[], Pair]) -> Frame:
-        """A frame with z square to the ground at a point, its x in a plane with N.x and N.z, as that point moves."""
+        """A frame at a point of the ground, with z along the normal and x in a plane with N.x and N.z.
+
+        **Arguments:**
+
+        - `N`: the inertial frame.
+        - `x`, `y` [m]: the point.
+        - `rates`: () -> the rates of x and y [m/s].
+        """
         return N
 
 
 class Slope(Ground):
-    """A plane that rises.
+    """An inclined plane.
 
-    **Arguments:** `angle` [rad] by which it rises, less than a right angle; `towards` the direction in it [rad] in
-    which it does, as a yaw: 0 along x, pi/2 along y.
+    **Arguments:**
+
+    - `angle` [rad]: the inclination, less than a right angle.
+    - `towards` [rad]: the uphill direction as a yaw angle: 0 along x, pi/2 along y.
     """
 
     angle: Scalar = parameter(within=TILT, unit="rad")
@@ -73,16 +91,18 @@ class Slope(Ground):
 
 
 class Road(Ground):
-    """A road whose height is a smooth function of the place.
+    """A road whose height is a smooth function of the position.
 
         Road(lambda x, y: 0.05 * jnp.exp(-(((x - 3.0) / 0.5) ** 2)))
 
-    A wheel touches it at one point, where it is tangent to it. Where a wheel does not fit, before an edge or in a
-    hollow that is sharper than itself, a motion ends with the reason "wheel touches twice", or "wheel off the road"
-    where a step of the solver went over an edge; a state there is refused.
+    A wheel touches the road at one point, where it is tangent. The wheel cannot do so before an edge, or in a hollow
+    that is sharper than the wheel. A simulation then ends with the reason "wheel touches twice", or "wheel off the
+    road" if a step of the solver passed the edge. An initial state there is refused.
 
-    **Arguments:** `height`: x, y [m] -> upwards [m], by jax.numpy; or a pytree that can be called, whose arrays are
-    parameters, such as an equinox module.
+    **Arguments:**
+
+    - `height`: x, y [m] -> upwards [m], by jax.numpy; or a callable pytree, whose arrays are parameters, e.g. an
+        equinox module.
     """
 
     height: Any = learned()
@@ -90,10 +110,10 @@ class Road(Ground):
     curved = True
 
     def at(self, x: Component, y: Component) -> Any:
-        """The height [m], an array of no dimensions."""
+        """The height [m], an array of shape ()."""
         z = jnp.asarray(self.height(x, y), float)
         if z.shape != ():
-            raise ValueError(f"Road: `height` gives one number [m] for a place x, y; got an array of shape {z.shape}.")
+            raise ValueError(f"Road: `height` must return one number [m] for x, y; got an array of shape {z.shape}.")
         return z
 
     def slopes(self, x: Any, y: Any) -> tuple[Any, Any]:
@@ -104,7 +124,7 @@ class Road(Ground):
         return jax.jvp(self.at, (x, y), along_x)[1], jax.jvp(self.at, (x, y), along_y)[1]
 
     def slope_rates(self, x: Any, y: Any, rates: Pair) -> Pair:
-        """How dh/dx and dh/dy change as the place moves [1/s]; exactly zero where it does not."""
+        """The rates of dh/dx and dh/dy at a moving point [1/s]; exactly zero if it does not move."""
         x, y = jnp.asarray(x, float), jnp.asarray(y, float)
         one = jnp.ones((), x.dtype)
         h_xx, h_xy = jax.jvp(self.slopes, (x, y), (one, 0.0 * one))[1]
@@ -119,7 +139,7 @@ class Road(Ground):
         return dot(self.slopes(x, y), rates)
 
     def velocity(self, N: Frame, x: Component, y: Component, rates: Pair) -> Vector:
-        """Of a point that stays on the road [m/s]."""
+        """The velocity of a point that stays on the road [m/s]."""
         return N.vector(rates[0], rates[1], mul(-1.0, self.climbing(x, y, rates)))
 
     def normal(self, N, x, y):
@@ -127,7 +147,7 @@ class Road(Ground):
         return N.vector(a, b, 1.0).normalize()
 
     def normal_rate(self, N: Frame, x: Component, y: Component, rates: Pair) -> Vector:
-        """How the normal turns as its point moves [1/s]."""
+        """The rate of the normal at a moving point [1/s]."""
         (a, b), (a_dot, b_dot) = self.slopes(x, y), self.slope_rates(x, y, rates)
         shrink = 1.0 / jnp.sqrt(a * a + b * b + 1.0)
         n, change = shrink * N.vector(a, b, 1.0), shrink * N.vector(a_dot, b_dot, 0.0)
@@ -141,7 +161,7 @@ class Road(Ground):
         return sub(along, mul(across, a * b)), mul(across, of_x**2)
 
     def tangent(self, N, x, y, rates):
-        # Its x is turned about N.y by atan(a), then its y about that x by -atan(b / s), s^2 = 1 + a^2.
+        # x is rotated about N.y by atan(a), then y about that x by -atan(b / s), s^2 = 1 + a^2.
         (a, b), (a_dot, b_dot) = self.slopes(x, y), self.slope_rates(x, y, rates())
         s2 = 1.0 + a * a
         s = jnp.sqrt(s2)
@@ -150,9 +170,9 @@ class Road(Ground):
         return turned.rotate(1, -jnp.arctan(b / s), tilt_rate, "tangent")
 
     def clearance(self, N: Frame, contact: Contact, center: Point, radius: Any, crown: Any) -> Component:
-        """How high a wheel is above the road beside its contact, over what it would be above its tangent plane.
+        """The clearance of a wheel near its contact, relative to its clearance from the tangent plane.
 
-        The minimum over some places along its tread; not positive where it does not fit.
+        **Returns:** the minimum over some points of its tread. It is not positive if the wheel does not fit the road.
         """
         inner = radius if crown is None else radius - crown
         middle = center.position if crown is None else center.position + crown * contact.normal

@@ -1,4 +1,4 @@
-"""The motion of a bicycle, and where its wheels meet the ground. Knows kinematics; knows no force."""
+"""The kinematics of a bicycle and of its contacts with the ground. Independent of loads."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import jax.numpy as jnp
 
 from .._scalarjit.components import Component, add
 from .._system.kinematics import Frame, Point, Vector, inertial
-from .._system.motion import Body, Motion
-from ._part import BicycleMotion, Contact
+from .._system.motion import Body
+from .._system.system import NamedVector
+from ._part import BicycleLike, BicycleMotion, Contact
 from ._tyre import Tyre, rolling_speed
 
 REAR, FRONT = "rear", "front"
 
 
-def bicycle_motion(bicycle: Any, q: Any, u: Any) -> BicycleMotion:
-    """Bodies, contacts and velocity residuals of a `Bicycle`, without what its parts add."""
+def bicycle_motion(bicycle: BicycleLike, q: NamedVector, u: NamedVector) -> BicycleMotion:
+    """Bodies, contacts and velocity residuals of a `Bicycle`, without its parts."""
     N, O = inertial()
     forward, contact_aside = contact_rates(bicycle, q, u)
     T = bicycle.road.tangent(
@@ -35,7 +36,7 @@ def bicycle_motion(bicycle: Any, q: Any, u: Any) -> BicycleMotion:
     if bicycle.road.curved:
         place = place - q["rear_height"] * N.z
     r_P_A = -bicycle.rear_tyre.reach(R.z, T.z, bicycle.rR)
-    P = Point(Y.vector(along, across, 0.0), O, place)  # of the tyre
+    P = Point(Y.vector(along, across, 0.0), O, place)  # point of the tyre
     G_A = Point(P.velocity + omega_A.cross(r_P_A), P, r_P_A)
     G_B = G_A.fixed(bicycle.xB * B.x + (bicycle.zB + bicycle.rR) * B.z)
     S = G_A.fixed(xS * B.x + (zS + bicycle.rR) * B.z)
@@ -44,7 +45,7 @@ def bicycle_motion(bicycle: Any, q: Any, u: Any) -> BicycleMotion:
     C = tilted.rotate(3, q["steer"], u["steer_rate"], "C")  # fork, 3 along the steer axis
     H = C.rotate(2, -bicycle.lam, 0.0, "H")  # fork, aligned with B at zero steer
 
-    def from_S(x, z):  # a place measured from P, upright, as a vector fixed in the fork
+    def from_S(x, z):  # measured from P of the upright bicycle, as a vector fixed in the fork
         return ((x - xS) * H.x + (z - zS) * H.z).express(C)
 
     G_C = S.fixed(from_S(bicycle.xH, bicycle.zH))
@@ -64,21 +65,21 @@ def bicycle_motion(bicycle: Any, q: Any, u: Any) -> BicycleMotion:
     return motion.extended((), residuals)
 
 
-def _front_place(bicycle: Any, q: Any) -> tuple[Component, Component]:
+def _front_place(bicycle: BicycleLike, q: NamedVector) -> tuple[Component, Component]:
     return (q["front_x"], q["front_y"]) if bicycle.road.curved else (0.0, 0.0)
 
 
-def _slip(bicycle: Any, end: str, u: Any) -> tuple[Component, Component]:
-    """Velocities of a tyre's contact, along the heading and across it [m/s]; exactly zero where it rolls."""
+def _slip(bicycle: BicycleLike, end: str, u: NamedVector) -> tuple[Component, Component]:
+    """Velocities of a tyre's contact, along the heading and across it [m/s]; exactly zero in rolling."""
     tyre = bicycle.rear_tyre if end == REAR else bicycle.front_tyre
     along = 0.0 if tyre.longitudinal is None else u[f"{end}_longitudinal_slip"]
     return along, 0.0 if tyre.lateral is None else u[f"{end}_lateral_slip"]
 
 
-def contact_rates(bicycle: Any, q: Any, u: Any) -> tuple[Component, Component]:
-    """Velocities of the place of the rear contact on the ground, forward and to the right [m/s].
+def contact_rates(bicycle: BicycleLike, q: NamedVector, u: NamedVector) -> tuple[Component, Component]:
+    """Velocities of the position of the rear contact on the ground, forward and to the right [m/s].
 
-    Of a torus with the crown radius c, that rolls without slip: -(spin) (r - c + c cos(roll)) and c * roll_rate.
+    For a torus with the crown radius c that rolls without slip: -(spin) (r - c + c cos(roll)) and c * roll_rate.
     """
     tyre, (along, across) = bicycle.rear_tyre, _slip(bicycle, REAR, u)
     spin = u["rear_wheel_rate"] + u["pitch_rate"]
@@ -87,13 +88,13 @@ def contact_rates(bicycle: Any, q: Any, u: Any) -> tuple[Component, Component]:
 
 
 def _front_contact(
-    bicycle: Any, Q: Point, C: Frame, down: Vector, normal: Vector, q: Any, u: Any
+    bicycle: BicycleLike, Q: Point, C: Frame, down: Vector, normal: Vector, q: NamedVector, u: NamedVector
 ) -> tuple[Contact, list[Any]]:
-    """The front contact, and what is zero there [m/s].
+    """The front contact and its velocity residuals [m/s].
 
-    The wheel's plane and the ground meet along the heading. As its normal n turns, and the fork with omega, the
-    wheel spins against its contact with the front wheel's rate + (omega . across - heading . n_dot) / cos(camber),
-    and the camber grows with omega . heading + (axle . n_dot) / cos(camber).
+    The heading is the intersection of the wheel's plane and the ground. The normal n changes, and the fork has the
+    angular velocity omega. The wheel's spin relative to its contact is then front_wheel_rate + (omega . across -
+    heading . n_dot) / cos(camber). The rate of the camber is omega . heading + (axle . n_dot) / cos(camber).
     """
     tyre, slip = bicycle.front_tyre, _slip(bicycle, FRONT, u)
     heading = C.y.cross(normal).normalize()
@@ -115,13 +116,13 @@ def _front_contact(
     return contact, [*tyre.residuals(contact), moved.dot(heading) - speed, moved.dot(across) - aside]
 
 
-def wheels(bicycle: Any, motion: Any) -> Iterator[tuple[str, Tyre, Contact, Body, Component]]:
+def wheels(bicycle: BicycleLike, motion: BicycleMotion) -> Iterator[tuple[str, Tyre, Contact, Body, Component]]:
     yield REAR, bicycle.rear_tyre, motion.rear, motion["rear wheel"], bicycle.rR
     yield FRONT, bicycle.front_tyre, motion.front, motion["front wheel"], bicycle.rF
 
 
-def off_road(bicycle: Any, motion: Motion, q: Any) -> list[Component]:
-    """How far the contacts are from the ground [m]."""
+def off_road(bicycle: BicycleLike, motion: BicycleMotion, q: NamedVector) -> list[Component]:
+    """The distances of the contacts from the ground [m]."""
     Q, N = motion["Q"].position, motion.N
     if not bicycle.road.curved:
         return [Q.dot(N.z)]
@@ -129,8 +130,8 @@ def off_road(bicycle: Any, motion: Motion, q: Any) -> list[Component]:
     return [*(front.dot(axis) for axis in (N.x, N.y, N.z)), q["rear_height"] - bicycle.road.at(q["x"], q["y"])]
 
 
-def clearance(bicycle: Any, motion: Any) -> Component:
-    """Of both wheels, see `Road.clearance`."""
+def clearance(bicycle: BicycleLike, motion: BicycleMotion) -> Component:
+    """The smaller clearance of both wheels, see `Road.clearance`."""
     room = [
         bicycle.road.clearance(motion.N, contact, wheel.center, radius, tyre.crown)
         for _, tyre, contact, wheel, radius in wheels(bicycle, motion)

@@ -1,4 +1,4 @@
-"""Bicycles and motorcycles of the literature that take more than Whipple's four bodies."""
+"""Bicycles and motorcycles of the literature with more than Whipple's four bodies."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ._tyre import Tyre
 from ._tyre_laws import LateralSlip
 
 # BicycleParameters 1.5.2, `parameter_dicts.mooreriderlean2012_browser_jason`, with the names of Moore (2012), *Human
-# control of a bicycle*: the measured Batavus Browser, with the legs of a rider in its rear frame C, and his upper body
-# G from a geometric model of the person. Its k9 and c9 are zero.
+# control of a bicycle*: the measured Batavus Browser, with the legs of a rider in its rear frame C. The upper body G is
+# from a geometric model of the person. Its k9 and c9 are zero.
 _BROWSER_JASON = {
     "d1": 0.9631492634872098, "d2": 0.4338396131640938, "d3": 0.0705000000001252, "d4": -0.6704626684911591,
     "g": 9.81, "rf": 0.34352982332, "rr": 0.340958858855,
@@ -31,17 +31,24 @@ _BROWSER_JASON = {
 
 
 def browser_jason(stiffness: float = 0.0, damping: float = 0.0) -> Bicycle:
-    """A measured city bicycle with a rider whose upper body leans: the Batavus Browser with Jason, of Moore (2012).
+    """The measured city bicycle Batavus Browser with the rider Jason, whose upper body leans, of Moore (2012).
 
-    **Arguments:** `stiffness` [N m/rad] and `damping` [N m s/rad] at the rider's hinge, both zero in the source.
+    **Arguments:**
+
+    - `stiffness` [N m/rad], `damping` [N m s/rad]: of the rider's hinge; both are zero in the source.
     """
     parameters, rider = as_meijaard("MooreRiderLean2012", {**_BROWSER_JASON, "k9": stiffness, "c9": damping})
-    assert rider is not None  # the set of names holds one
+    assert rider is not None  # this set of names contains a rider
     return Bicycle.from_parameters({**parameters, "rider": rider_of(rider)})
 
 
 def toroidal(rear_crown: float = 0.02, front_crown: float = 0.02) -> Bicycle:
-    """The benchmark bicycle on tyres with a round cross section, of these radii [m], that roll without slip."""
+    """The benchmark bicycle with tyres of round cross section, which roll without slip.
+
+    **Arguments:**
+
+    - `rear_crown`, `front_crown` [m]: radii of the cross sections.
+    """
     return Bicycle.benchmark().with_parts(rear_tyre=Tyre(crown=rear_crown), front_tyre=Tyre(crown=front_crown))
 
 
@@ -50,12 +57,12 @@ _INERTIA = SLUG * FOOT**2
 
 # Sharp (1971), The stability and control of motorcycles, J. Mech. Eng. Sci. 13(5), appendix 3: slug, foot, pound.
 _EPSILON = 0.4715  # steer axis from the vertical [rad]
-_A, _B, _H = 3.112, 1.574, 2.02  # from below the rear mass centre: square to the steer axis, to the rear axle, up
-_E, _F, _TRAIL = 0.08, 0.093, 0.38  # front mass centre before the steer axis and up along it; trail square to the axis
+_A, _B, _H = 3.112, 1.574, 2.02  # from below the rear mass centre: normal to the steer axis, to the rear axle, up
+_E, _F, _TRAIL = 0.08, 0.093, 0.38  # front mass centre before the steer axis and up along it; trail normal to the axis
 _REAR_MASS, _FRONT_MASS = 14.9, 2.1  # with their wheels
 _REAR_ROLL, _REAR_YAW, _REAR_PRODUCT = 23.0, 15.54, 1.28
-_FRONT_ACROSS, _FRONT_ALONG = 0.91, 0.326  # about axes square to the steer axis and along it
-_FRONT_POLAR, _REAR_POLAR = 0.53, 0.775  # of the wheels, the engine's flywheel in the rear one's
+_FRONT_ACROSS, _FRONT_ALONG = 0.91, 0.326  # about axes normal to the steer axis and along it
+_FRONT_POLAR, _REAR_POLAR = 0.53, 0.775  # of the wheels; the rear one includes the engine's flywheel
 
 
 def sharp_motorcycle() -> Bicycle:
@@ -63,14 +70,14 @@ def sharp_motorcycle() -> Bicycle:
 
     Its tyres: (0.8 ft / speed) dY/dt + Y = C1 slip angle + C2 camber. Gravity is 32.2 ft/s^2.
 
-    Sharp has frames that hold their wheels, and nothing about pitch. Here the wheels are bodies with masses and
-    diametral inertias of likely size, taken out of the frames, and so are the inertias in pitch; the lateral linear
-    model does not see how that is done. His table of eigenvalues follows from a load of the front wheel that is rounded
-    to 226 lb; from his figures it is 226.5 lb, so that slow eigenvalues differ by some units of the last printed digit.
+    Sharp's frames include their wheels, and he gives no pitch inertias. Here the wheels are bodies with assumed masses
+    and diametral inertias, which are subtracted from the frames; pitch inertias are also assumed. The lateral linear
+    model does not depend on these assumptions. His table of eigenvalues uses a front wheel load rounded to 226 lb. His
+    parameters give 226.5 lb, so slow eigenvalues differ by some units of the last printed digit.
     """
     cos, sin = math.cos(_EPSILON), math.sin(_EPSILON)
     wheelbase = _B + (_A - _TRAIL) / cos
-    # x forward, z down, from the rear contact; the directions of the front frame's inertias are turned by epsilon
+    # x forward, z down, from the rear contact; the axes of the front frame's inertias are rotated by epsilon
     rear = _Mass(_REAR_MASS, _B, -_H, _symmetric(_REAR_ROLL, 21.0, _REAR_YAW, -_REAR_PRODUCT))
     front_x = _B + (_A + _E) * cos - _F * sin
     front_z = -(_A + _E) * sin - _F * cos
@@ -96,13 +103,14 @@ def sharp_motorcycle() -> Bicycle:
 
 
 def _tyre(cornering: float, camber: float) -> Tyre:
-    """From stiffnesses in lb/rad."""
+    """A tyre from stiffnesses in lb/rad."""
     stiffness = {"cornering_stiffness": cornering * POUND, "camber_stiffness": camber * POUND}
     return Tyre(lateral=LateralSlip(**stiffness, relaxation_length=0.8 * FOOT))
 
 
 class _Mass(NamedTuple):
-    """A body in the plane of symmetry: its mass, the place x, z of its mass centre, and its inertia (3, 3) about it."""
+    """A body in the plane of symmetry: its mass, the position x, z of its mass centre, and its inertia (3, 3) about
+    it."""
 
     mass: float
     x: float
@@ -110,12 +118,12 @@ class _Mass(NamedTuple):
     inertia: np.ndarray
 
     def about(self, x: float, z: float) -> np.ndarray:
-        """Its inertia about another point (parallel axes)."""
+        """The inertia about another point (parallel axis theorem)."""
         r = np.array([self.x - x, 0.0, self.z - z])
         return self.inertia + self.mass * (r @ r * np.eye(3) - np.outer(r, r))
 
     def without(self, part: _Mass) -> _Mass:
-        """What remains when a part is taken out."""
+        """The remaining body if a part is removed."""
         mass = self.mass - part.mass
         x, z = ((self.mass * a - part.mass * b) / mass for a, b in ((self.x, part.x), (self.z, part.z)))
         rest = self.about(x, z) - part.about(x, z)

@@ -1,10 +1,10 @@
-"""A part of a bicycle, and what it sees of the bicycle's motion. A part of your own begins with `Part`."""
+"""The base class `Part` of a bicycle's parts, and the motion that parts receive. Derive your own parts from `Part`."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
 
@@ -12,15 +12,20 @@ from .._scalarjit.components import Component
 from .._system.kinematics import Point, Vector
 from .._system.motion import Motion
 from .._system.parameters import check_parameter, parameter_info
+from .._system.prints import module_text
+from .._system.system import NamedVector
+
+BicycleLike: TypeAlias = Any
+"""A `Bicycle`. Its file imports this one, so the class itself cannot be named here."""
 
 NAMES = ("coordinates", "speeds", "dependent_speeds", "dependent_coordinates", "inputs", "states")
 
 
 def check_parameters(part: Any) -> None:
-    """Refuse numbers that no parameter can be; None stands for one that may be left out by default."""
+    """Refuse impossible parameters. None is allowed where it is the default."""
     factories = {field.name: field.default_factory for field in dataclasses.fields(part)}
     infos = parameter_info(part)
-    for name in sorted(infos, key=lambda name: getattr(part, name) is not None):  # what is left out is told first
+    for name in sorted(infos, key=lambda name: getattr(part, name) is not None):  # report missing parameters first
         default, info = factories[name], infos[name]
         if getattr(part, name) is None and default is not dataclasses.MISSING and default() is None:
             continue
@@ -28,17 +33,19 @@ def check_parameters(part: Any) -> None:
 
 
 def called(value: Any) -> str:
-    """What was given, in the words of an error: a module by its class, which is shorter than its numbers."""
+    """A value as text for an error message: a module by its class, because its numbers would be long."""
     return f"a {type(value).__name__}" if isinstance(value, eqx.Module) else repr(value)
 
 
 class Contact(NamedTuple):
-    """Where a wheel meets the ground at an instant.
+    """The contact of a wheel with the ground at one instant.
 
-    - `point`: of the tyre, at the contact; its velocity is that of slip.
-    - `heading`, `across`, `normal`: unit vectors; along the wheel's plane and across it in the ground, and downwards.
-        `down`: in the wheel's plane, from its centre towards the ground.
-    - `camber` [rad]: the wheel's inclination, positive to the right. `speed` [m/s]: of the contact along `heading`.
+    - `point`: the material point of the tyre at the contact; its velocity is the slip velocity.
+    - `heading`, `across`: unit vectors in the ground, along the wheel's plane and across it.
+    - `normal`: the unit normal of the ground, downwards.
+    - `down`: the unit vector in the wheel's plane, from its centre towards the ground.
+    - `camber` [rad]: the wheel's inclination, positive to the right.
+    - `speed` [m/s]: of the contact along `heading`.
     - `slip` [m/s]: the velocity of `point` along `heading` and `across`.
     """
 
@@ -62,7 +69,7 @@ class BicycleMotion(Motion):
 
 
 class Part(eqx.Module):
-    """A part of a `Bicycle`: its array leaves are parameters, its methods add to the bicycle's description.
+    """A part of a `Bicycle`: its arrays are parameters, its methods add to the bicycle's model.
 
         class Basket(Part):
             load: Scalar = parameter(5.0, positive=True, unit="kg")
@@ -73,10 +80,10 @@ class Part(eqx.Module):
 
         bicycle = Bicycle.benchmark().with_parts(extra=[Basket()])
 
-    A subclass names what it adds: `coordinates`, `speeds`, `dependent_speeds`, `dependent_coordinates`, `inputs`,
-    `states` and `units`, as a `System` does; and overrides those methods that it needs. `q`, `u` and `x` hold all
-    values of the bicycle, read by name. `resists = True` says that riding straight on takes a drive because of it:
-    linear models over speeds then have the "drive_torque" that this takes.
+    A subclass declares the names that it adds, as a `System` does: `coordinates`, `speeds`, `dependent_speeds`,
+    `dependent_coordinates`, `inputs`, `states` and `units`. It overrides the methods that it needs. `q`, `u` and `x`
+    contain all values of the bicycle by name. Set `resists = True` if the part makes straight riding need a drive
+    torque. Linear models over speeds then include this "drive_torque".
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ()
@@ -88,65 +95,98 @@ class Part(eqx.Module):
     units: ClassVar[Mapping[str, str]] = {}
     resists: ClassVar[bool] = False
 
+    __repr__ = module_text
+
     def __check_init__(self) -> None:
         check_parameters(self)
         for kind in NAMES:
             if isinstance(names := getattr(self, kind), str):
-                raise TypeError(f"{type(self).__name__}.{kind} is a tuple of names, got {names!r}: ({names!r},).")
+                raise TypeError(
+                    f"{type(self).__name__}.{kind} must be a tuple of names, e.g. ({names!r},); got {names!r}."
+                )
 
-    def check(self, bicycle: Any) -> None:
-        """Refuse, by an error, a bicycle that this part does not fit."""
+    def check(self, bicycle: BicycleLike) -> None:
+        """Raise an exception if this part does not fit the bicycle."""
 
-    def q_dot(self, bicycle: Any, t: Component, q: Any, u: Any) -> Sequence[Component]:
-        """Rates of the part's coordinates. By default those speeds that have the coordinates' names and "_rate"."""
+    def q_dot(self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector) -> Sequence[Component]:
+        """Rates of the part's coordinates. Default: the speeds with the coordinates' names and "_rate"."""
         return [u[f"{name}_rate"] for name in self.coordinates]
 
-    def motion(self, bicycle: Any, motion: BicycleMotion, t: Component, q: Any, u: Any) -> BicycleMotion:
-        """The motion of the bicycle with what the part adds: bodies, velocity residuals, points and frames.
+    def motion(
+        self, bicycle: BicycleLike, motion: BicycleMotion, t: Component, q: NamedVector, u: NamedVector
+    ) -> BicycleMotion:
+        """The motion of the bicycle including this part: bodies, velocity residuals, points and frames.
 
-        `motion` is that of the bicycle and the parts before this one: `motion.extended([...])`.
+        **Arguments:**
+
+        - `motion`: of the bicycle and the parts before this one.
+
+        **Returns:** `motion.extended([...])`.
         """
         return motion
 
     def commands(
-        self, bicycle: Any, t: Component, q: Any, u: Any, motion: BicycleMotion, values: Mapping[str, Component]
+        self,
+        bicycle: BicycleLike,
+        t: Component,
+        q: NamedVector,
+        u: NamedVector,
+        motion: BicycleMotion,
+        values: Mapping[str, Component],
     ) -> Mapping[str, Component]:
-        """What the part adds to inputs of the bicycle, by name: `{"steer_torque": -self.gain * q["roll"]}`.
+        """Values that the part adds to inputs of the bicycle, by name: `{"steer_torque": -self.gain * q["roll"]}`.
 
-        `values` holds inputs and states by name, those with what the parts before this one have added. A part that
-        adds to an input of another part, which has read it here, must stand before that part.
+        **Arguments:**
+
+        - `values`: inputs and states by name, including what the parts before this one have added. A part that reads an
+            input here must be placed after the parts that add to it.
         """
         return {}
 
     def loads(
-        self, bicycle: Any, t: Component, q: Any, u: Any, motion: BicycleMotion, values: Mapping[str, Component]
+        self,
+        bicycle: BicycleLike,
+        t: Component,
+        q: NamedVector,
+        u: NamedVector,
+        motion: BicycleMotion,
+        values: Mapping[str, Component],
     ) -> Any:
-        """Forces and torques; `values` holds inputs, with all that was added to them, and states by name."""
+        """Forces and torques. `values` contains inputs, with all additions of parts, and states by name."""
         return ()
 
     def state_rates(
-        self, bicycle: Any, t: Component, q: Any, u: Any, x: Any, motion: BicycleMotion, now: Any
+        self,
+        bicycle: BicycleLike,
+        t: Component,
+        q: NamedVector,
+        u: NamedVector,
+        x: Any,
+        motion: BicycleMotion,
+        now: Any,
     ) -> Sequence[Component] | Mapping[str, Component]:
-        """Rates of the part's states of the first order, in their order or by name; `now` as in `System.state_rates`,
-        its inputs with all that was added to them."""
+        """Rates of the part's states of the first order, in their order or by name. `now` as in `System.state_rates`;
+        its inputs include all additions of parts."""
         return ()
 
-    def outputs(self, bicycle: Any, t: Component, q: Any, u: Any, motion: BicycleMotion, now: Any) -> Mapping[str, Any]:
-        """What the part's sensors say, by name."""
+    def outputs(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, now: Any
+    ) -> Mapping[str, Any]:
+        """The measurements of the part's sensors, by name."""
         return {}
 
     def configuration_constraints(
-        self, bicycle: Any, t: Component, q: Any, motion: BicycleMotion
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, motion: BicycleMotion
     ) -> Sequence[Component]:
-        """Residuals that are zero in every possible configuration; `motion` is that of rest."""
+        """Residuals that are zero in every possible configuration. `motion` has zero speeds."""
         return ()
 
-    def draw(self, bicycle: Any, motion: BicycleMotion, sketch: Any) -> None:
+    def draw(self, bicycle: BicycleLike, motion: BicycleMotion, sketch: Any) -> None:
         """Add the part to the picture of the bicycle: `sketch.line("green", motion["O"], motion["A"])`, see
         `jaxkane.animate`."""
 
     def lateral(self) -> tuple[str, ...]:
-        """Names of the part's coordinates, speeds and states that move when the bicycle leaves the upright plane: those
-        of its linear models. By default all but the dependent ones."""
+        """Names of the part's coordinates, speeds and states that change when the bicycle leaves the upright plane. Its
+        linear models contain these. Default: all except the dependent ones."""
         coordinates = [name for name in self.coordinates if name not in self.dependent_coordinates]
         return (*coordinates, *self.speeds, *self.states)

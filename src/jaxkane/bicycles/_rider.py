@@ -1,4 +1,4 @@
-"""Riders on the frame, rigid or leaning on a hinge, and arms from their shoulders to the handlebar."""
+"""Riders on the frame, rigid or leaning on a hinge, and arms from the shoulders to the handlebar."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from .._kane.arguments import is_concrete
 from .._kane.checks import why_no_body
 from .._scalarjit.components import Component, Scalar, add
 from .._system.kinematics import Frame, Point
-from .._system.motion import Body, Torque
+from .._system.motion import Body, Motion, Torque
 from .._system.parameters import in_batches, parameter
+from .._system.system import NamedVector
 from ..catalog import read_bicycle_file
 from ..catalog.bicycle import ABOVE_GROUND, FAR, TILT
-from ._part import Part
+from ._part import BicycleLike, Part
 
 _IN_A_FILE = {"mB": "mass", "xB": "x", "zB": "z", "IBxx": "Ixx", "IByy": "Iyy", "IBzz": "Izz", "IBxz": "Ixz"}
 
 
 class Rider(Part):
-    """A rider with one body above the saddle, in places and directions as Meijaard's: from the rear contact of the
-    upright bicycle, x forward and z down, with the rider upright.
+    """A rider with one body above the saddle.
 
-    Its motion names the body "rider", its frame "U" and, where the rider has them, the points "left_shoulder" and
-    "right_shoulder". A rider of your own gives `carried`.
+    Positions and axes follow Meijaard: from the rear contact of the upright bicycle, x forward and z down, with the
+    rider upright. The motion contains the body "rider", its frame "U" and, if the rider has shoulders, the points
+    "left_shoulder" and "right_shoulder". A subclass defines `carried`.
     """
 
     mass: Scalar = parameter(positive=True, within=(0.0, 300.0), unit="kg")
@@ -43,27 +44,32 @@ class Rider(Part):
 
     @property
     def right_shoulder(self) -> Float[Array, 3] | None:
-        """Where the right shoulder is, or None."""
+        """The position of the right shoulder, or None."""
         return getattr(self, "shoulder", None)
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str], **parameters: Any) -> Self:
-        """A rider whose body is that of a rider's text file of BicycleParameters (`mB = value`, to `IBxz`).
+        """A rider from a rider's text file of BicycleParameters (`mB = value`, to `IBxz`).
 
-        **Arguments:** `parameters`: the other parameters, as the hinge of one who leans.
+        **Arguments:**
 
-        **Raises:** `ValueError` that names the lines that are unknown, repeated or malformed, and what is missing.
+        - `path`: the file.
+        - `parameters`: the other parameters, e.g. the hinge of a leaning rider.
+
+        **Raises:** `ValueError` with the lines that are unknown, repeated or malformed, and the missing names.
         """
         values, _ = read_bicycle_file(path, known=(*_IN_A_FILE, "yB"))
         missing = [name for name in _IN_A_FILE if name not in values]
         if missing or abs(values.get("yB", 0.0)) > 1e-3:
-            why = f"missing: {', '.join(missing)}" if missing else f"the rider sits aside, yB = {values['yB']:.4g} m"
+            why = f"missing: {', '.join(missing)}" if missing else f"yB = {values['yB']:.4g} m must be zero"
             raise ValueError(f"{os.fspath(path)}: {why}.")
         return cls(**{_IN_A_FILE[name]: values[name] for name in _IN_A_FILE}, **parameters)
 
     @abc.abstractmethod
-    def carried(self, bicycle: Any, motion: Any, q: Any, u: Any) -> tuple[Frame, Point, Scalar, Scalar]:
-        """The rider's frame, a point that is fixed in it, and where that point is, x and z, with the rider upright."""
+    def carried(
+        self, bicycle: BicycleLike, motion: Motion, q: NamedVector, u: NamedVector
+    ) -> tuple[Frame, Point, Scalar, Scalar]:
+        """The rider's frame, a point that is fixed in it, and x and z of this point for an upright rider."""
 
     def motion(self, bicycle, motion, t, q, u):
         U, hinge, x, z = self.carried(bicycle, motion, q, u)
@@ -80,10 +86,14 @@ class Rider(Part):
 
 
 class RigidRider(Rider):
-    """A rider who is fixed to the frame: a body of its own, where that of the frame does not count it already.
+    """A rider who is fixed to the frame, as a separate body that the frame's inertia does not include.
 
-    **Arguments:** `mass` [kg]; `x`, `z` [m]: mass centre; `Ixx`, `Iyy`, `Izz`, `Ixz` [kg m^2] about it; `shoulder`
-    [m]: x, y and z of the right shoulder, for `Arms`; the left one is its mirror image.
+    **Arguments:**
+
+    - `mass` [kg]: of the rider.
+    - `x`, `z` [m]: mass centre.
+    - `Ixx`, `Iyy`, `Izz`, `Ixz` [kg m^2]: inertia about the mass centre.
+    - `shoulder` (3,) [m]: x, y and z of the right shoulder, for `Arms`; the left one is its mirror image.
     """
 
     shoulder: Float[Array, 3] | None = parameter(None, within=(-FAR, FAR), shape=(3,), unit="m")
@@ -101,16 +111,21 @@ class LeaningRider(Rider):
             hinge_x=0.1, hinge_z=-1.01, stiffness=128.0, damping=50.0,
         )
 
-    Its mass is none of the frame's: `mB`, `xB`, ..., `IBxz` of the bicycle are those of the frame and what sits still
-    on it, as the legs. Where B counts the whole rider, `separate_rider` takes the upper body out of it.
+    The bicycle's `mB`, `xB`, ..., `IBxz` do not include the upper body. They include the frame and the fixed parts of
+    the rider, e.g. the legs. If B includes the whole rider, subtract the upper body with `separate_rider`.
 
     The angle "rider_lean" [rad] is that of the upper body relative to the frame, positive to the right. The input
     "rider_lean_torque" [N m] turns the upper body to the right, and the frame to the left.
 
-    **Arguments:** `mass` [kg]; `x`, `z` [m]: mass centre of the upright upper body; `Ixx`, `Iyy`, `Izz`, `Ixz`
-    [kg m^2] about it; `hinge_x`, `hinge_z` [m]: a point of the hinge; `hinge_tilt` [rad]: how far the hinge points
-    upwards in front, None: level with the upright frame; `stiffness` [N m/rad]; `damping` [N m s/rad]; `shoulder` [m]:
-    x, y and z of the right shoulder, for `Arms`; the left one is its mirror image.
+    **Arguments:**
+
+    - `mass` [kg]: of the upper body.
+    - `x`, `z` [m]: mass centre of the upright upper body.
+    - `Ixx`, `Iyy`, `Izz`, `Ixz` [kg m^2]: inertia about the mass centre.
+    - `hinge_x`, `hinge_z` [m]: a point of the hinge.
+    - `hinge_tilt` [rad]: the upward inclination of the hinge towards the front. None: level when the frame is upright.
+    - `stiffness` [N m/rad], `damping` [N m s/rad]: of the hinge.
+    - `shoulder` (3,) [m]: x, y and z of the right shoulder, for `Arms`; the left one is its mirror image.
     """
 
     hinge_x: Scalar = parameter(within=(-FAR, FAR), unit="m")
@@ -143,22 +158,30 @@ class LeaningRider(Rider):
 
 
 def rider_of(values: Mapping[str, Any]) -> Rider:
-    """A rider with these parameters, who leans where they hold a hinge."""
+    """A rider with these parameters: a `LeaningRider` if they include a hinge, else a `RigidRider`."""
     return (LeaningRider if "hinge_z" in values else RigidRider)(**values)
 
 
-def separate_rider(bicycle: Any, rider: Rider) -> Any:
-    """The bicycle with this rider, whose body its frame B counts already: B is what is left of it.
+def separate_rider(bicycle: BicycleLike, rider: Rider) -> Any:
+    """The bicycle with this rider as a separate body, which is subtracted from the frame B.
 
         bicycle = separate_rider(Bicycle.benchmark(), LeaningRider(mass=49.0, ...))
 
-    With a rider who does not lean its motion is that of the bicycle before.
+    If the rider does not lean, the motion is the same as before.
 
-    **Raises:** `ValueError` where what is left of B is no body: without mass, or with moments of inertia that no body
-    has; and for a bicycle that has a rider already, who is none of B.
+    **Arguments:**
+
+    - `bicycle`: its frame B includes the rider's body.
+    - `rider`: the rider to separate.
+
+    **Raises:** `ValueError` if the remaining B is impossible: no mass, or moments of inertia that no body can have; and
+    for a bicycle that already has a separate rider.
     """
     if bicycle.rider is not None:
-        raise ValueError("separate_rider: the bicycle has a rider already, whom its frame B does not count.")
+        raise ValueError(
+            "separate_rider: the bicycle already has a separate rider, so its frame B does not include the rider's "
+            "body. To replace the rider, use bicycle.with_parts(rider=...)."
+        )
     m = bicycle.mB - rider.mass
     x = (bicycle.mB * bicycle.xB - rider.mass * rider.x) / m
     z = (bicycle.mB * bicycle.zB - rider.mass * rider.z) / m
@@ -169,21 +192,22 @@ def separate_rider(bicycle: Any, rider: Rider) -> Any:
     if is_concrete(bicycle, rider) and not (in_batches(bicycle) or in_batches(rider)):
         if not m > 0:
             raise ValueError(
-                f"separate_rider: the rider is as heavy as the frame B that should count it; {m:.4g} kg left."
+                f"separate_rider: the rider is too heavy for the frame B. Without the rider, its mass would be {m:.4g} "
+                "kg. The rider's mass must be less than mB, which includes it."
             )
         inertia = np.array([(Ixx, 0.0, Ixz), (0.0, Iyy, 0.0), (Ixz, 0.0, Izz)], dtype=float)
         fault = why_no_body(float(m), inertia, bicycle.check_inertia)
         if fault:
             raise ValueError(
-                f"separate_rider: the frame B does not hold the rider's body. Without it: {fault} Is the rider's mass "
-                "counted in B at all? If not: bicycle.with_parts(rider=...)."
+                f"separate_rider: the frame B cannot include the rider's body. Without it: {fault} If mB does not "
+                "include the rider's mass, use bicycle.with_parts(rider=...)."
             )
     B = {"mB": m, "xB": x, "zB": z, "IBxx": Ixx, "IByy": Iyy, "IBzz": Izz, "IBxz": Ixz}
     return bicycle.with_parts(**B, rider=rider)
 
 
 def _about(m: Scalar, x: Scalar, z: Scalar, Ixx: Any, Iyy: Any, Izz: Any, Ixz: Any) -> tuple[Any, Any, Any, Any]:
-    """Central moments and the product of a body, about the point from which x and z are measured."""
+    """Moments and product of inertia about the origin of x and z, from the central ones."""
     return Ixx + m * z * z, Iyy + m * (x * x + z * z), Izz + m * x * x, Ixz - m * x * z
 
 
@@ -198,28 +222,31 @@ class _Arm(NamedTuple):
 
 
 class Arms(Part):
-    """Two arms, each with an upper arm and a forearm, whose hands stay at the grips of the handlebar.
+    """Two arms, each with an upper arm and a forearm, whose hands remain at the grips of the handlebar.
 
-    A shoulder turns by flexion about the rider's axis to the right, then by rotation about the upper arm; an elbow by
-    flexion. Three angles place a hand, so that steering and leaning determine both arms: "left_shoulder_flexion",
-    "left_shoulder_rotation", "left_elbow" and the same of the right are dependent coordinates. All [rad] are counted
-    from the posture in which the hands hold the grips of the upright bicycle: zeros are always a start, and `assemble`
-    finds the rest. Flexion raises the hand forwards; rotation turns the flexed forearm outwards.
+    A shoulder rotates by flexion about the rider's axis to the right, then by rotation about the upper arm. An elbow
+    rotates by flexion. Three angles determine the position of a hand, so steering and leaning determine both arms.
+    "left_shoulder_flexion", "left_shoulder_rotation", "left_elbow" and those of the right arm are therefore dependent
+    coordinates. All angles [rad] are measured from the posture in which the hands are at the grips of the upright
+    bicycle. Zeros are always a valid initial guess; `assemble` computes the others. Flexion raises the hand forwards;
+    rotation turns the flexed forearm outwards.
 
-    The arms need a rider with shoulders: `LeaningRider(..., shoulder=(x, y, z))`. Their masses are none of the rider's
-    or the fork's. The inputs "left_elbow_torque" and "right_elbow_torque" [N m] bend the elbows.
+    The arms need a rider with shoulders: `LeaningRider(..., shoulder=(x, y, z))`. Neither the rider's nor the fork's
+    mass includes the arms. The inputs "left_elbow_torque" and "right_elbow_torque" [N m] bend the elbows.
 
-    **Arguments**, the same of both arms:
+    **Arguments**, equal for both arms:
 
-    - `grip` (3,) [m]: x, y and z of the right grip at zero steer, in Meijaard's measures; the left is its mirror image.
+    - `grip` (3,) [m]: x, y and z of the right grip at zero steer, in Meijaard's axes; the left is its mirror image.
     - `upper_length`, `fore_length` [m]: from shoulder to elbow and from elbow to hand.
-    - `upper_mass`, `fore_mass` [kg]; `upper_center`, `fore_center` [m]: of the mass centres from shoulder and elbow;
-        `upper_inertia`, `fore_inertia` (3,) [kg m^2] about them: forwards, sideways and along the arm as it hangs down.
-    - `shoulder_stiffness`, `shoulder_damping`, `elbow_stiffness`, `elbow_damping` [N m/rad, N m s/rad], of each angle
-        from that posture; by default none.
+    - `upper_mass`, `fore_mass` [kg]: masses.
+    - `upper_center`, `fore_center` [m]: distances of the mass centres from shoulder and elbow.
+    - `upper_inertia`, `fore_inertia` (3,) [kg m^2]: about the mass centres; forwards, sideways and along the hanging
+        arm.
+    - `shoulder_stiffness`, `shoulder_damping`, `elbow_stiffness`, `elbow_damping` [N m/rad, N m s/rad]: of each angle
+        from that posture; none by default.
 
-    **Raises:** `ValueError` for a bicycle without a rider who has shoulders, and for arms too short or too long for
-    the grips. Where numbers are traced the coordinates become NaN instead.
+    **Raises:** `ValueError` for a bicycle without a rider with shoulders, and for arms too short or too long for the
+    grips. For traced numbers the coordinates become NaN instead.
     """
 
     grip: Float[Array, 3] = parameter(within=(-FAR, FAR), shape=(3,), unit="m")
@@ -249,32 +276,38 @@ class Arms(Part):
         rider = _with_shoulders(takewhile(lambda part: part is not self, bicycle.parts))
         if rider is None:
             raise ValueError(
-                f"Arms need a rider with shoulders, whom this {type(bicycle).__name__} does not have before them: "
-                "with_parts(rider=LeaningRider(..., shoulder=(x, y, z))) or RigidRider."
+                f"Arms need a rider with shoulders, but no part of this {type(bicycle).__name__} before them has "
+                "shoulders. Use with_parts(rider=LeaningRider(..., shoulder=(x, y, z))), or a RigidRider."
             )
         if not is_concrete(self, rider) or in_batches(self) or in_batches(rider):
-            return  # members that cannot be have NaN
+            return  # impossible members become NaN
         shoulder: Any = rider.right_shoulder
         reach, longest = self.grip - shoulder, self.upper_length + self.fore_length
         distance, shortest = jnp.sqrt(reach @ reach), abs(self.upper_length - self.fore_length)
         if not shortest < distance < longest:
             raise ValueError(
-                f"Arms: from the shoulder to the grip it is {float(distance):.4g} m, and these arms reach from "
-                f"{float(shortest):.4g} to {float(longest):.4g} m. Change their lengths, the grips or the shoulders."
+                f"Arms: the distance from the shoulder to the grip is {float(distance):.4g} m, but these arms reach "
+                f"from {float(shortest):.4g} to {float(longest):.4g} m. Change the lengths, grips or shoulders."
             )
         if not np.all(np.isfinite(self.posture(shoulder))):
             raise ValueError(
-                "Arms: a hand is too far aside for an elbow that bends forwards: bring `grip` and the rider's "
+                "Arms: a hand is too far to the side for an elbow that bends forwards. Move `grip` and the rider's "
                 "`shoulder` closer to each other across the bicycle, or lengthen the forearm."
             )
 
     @classmethod
     def of_person(cls, mass: float, height: float, grip: Any, **parameters: Any) -> Self:
-        """The arms of a person of this mass [kg] and height [m], by the means of Winter (2009), *Biomechanics and Motor
-        Control of Human Movement*, Table 4.1 and Figure 4.1: lengths in parts of the height, masses of the mass.
+        """The arms of a person, by the means of Winter (2009), *Biomechanics and Motor Control of Human Movement*,
+        Table 4.1 and Figure 4.1.
 
-        The hand is counted to the forearm and holds the grip in its middle. About its length a part has a tenth of the
-        moment of inertia across it, which has little effect. `parameters`: stiffness and damping.
+        Lengths are proportional to the height, and masses to the mass. The forearm includes the hand, whose middle is
+        at the grip. The moment of inertia along a segment is assumed as a tenth of that across it; its effect is small.
+
+        **Arguments:**
+
+        - `mass` [kg], `height` [m]: of the person.
+        - `grip` (3,) [m]: as for `Arms`.
+        - `parameters`: stiffness and damping.
         """
         upper, fore, hand = 0.186 * height, 0.146 * height, 0.108 * height
         across = {"upper": 0.028 * mass * (0.322 * upper) ** 2, "fore": 0.022 * mass * (0.468 * fore) ** 2}
@@ -285,8 +318,12 @@ class Arms(Part):
         return cls(grip=grip, **masses, **lengths, **centers, **inertia, **parameters)
 
     def posture(self, shoulder: Any) -> tuple[Component, Component, Component]:
-        """Flexion and rotation of the shoulder, and flexion of the elbow [rad]: from an arm that hangs down to one
-        whose hand is at the grip of the upright bicycle. NaN where it does not reach it. `shoulder` (3,) [m]: right.
+        """Flexion and rotation of the shoulder, and flexion of the elbow [rad], from a hanging arm to the grip of the
+        upright bicycle. NaN if the arm does not reach it.
+
+        **Arguments:**
+
+        - `shoulder` (3,) [m]: the right shoulder.
         """
         upper, fore = self.upper_length, self.fore_length
         reach = self.grip - shoulder
@@ -299,7 +336,7 @@ class Arms(Part):
         flexion = jnp.arctan2(forwards, down) - jnp.arctan2(across * jnp.cos(rotation), upper + fore * cos_elbow)
         return flexion, rotation, elbow
 
-    def _arms(self, bicycle: Any, motion: Any, q: Any, u: Any) -> Iterator[tuple[str, _Arm]]:
+    def _arms(self, bicycle: BicycleLike, motion: Motion, q: NamedVector, u: NamedVector) -> Iterator[tuple[str, _Arm]]:
         U, angles = motion["U"], self.posture(_with_shoulders(bicycle.parts).right_shoulder)  # type: ignore[union-attr]
         for side, sign in _SIDES.items():
             names = [f"{side}_{joint}" for joint in _JOINTS]
@@ -347,7 +384,9 @@ class Arms(Part):
                 torques.append(Torque(sign * turn * upper.z, upper, reaction_on=shoulder))
         return torques
 
-    def _torque(self, name: str, stiffness: Scalar | None, damping: Scalar | None, q: Any, u: Any) -> Component:
+    def _torque(
+        self, name: str, stiffness: Scalar | None, damping: Scalar | None, q: NamedVector, u: NamedVector
+    ) -> Component:
         torque: Component = 0.0
         if stiffness is not None:
             torque = torque - stiffness * q[name]
@@ -357,5 +396,5 @@ class Arms(Part):
 
 
 def _with_shoulders(parts: Iterable[Any]) -> Rider | None:
-    """The rider whose arms they are, in whichever field he is."""
+    """The rider with shoulders, in any field."""
     return next((part for part in parts if isinstance(part, Rider) and part.right_shoulder is not None), None)

@@ -1,8 +1,6 @@
-"""What acts at the steering head: friction, a motor, torsion of the head, and steering by wire."""
+"""Elements at the steering head: friction, a motor, torsion of the head, and steering by wire."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,20 +9,25 @@ from .._scalarjit.components import Component, Scalar, mul
 from .._system.kinematics import Frame, Point
 from .._system.motion import Body, Torque
 from .._system.parameters import parameter
+from .._system.system import NamedVector
 from ..catalog.bicycle import ABOVE_GROUND, FAR
 from ..loads import coulomb, rotor
 from ._part import Part
 
 
 class HeadTwist(Part):
-    """Torsion of the frame at the steering head: one joint with a spring and a damper, before the steer axis.
+    """Torsional compliance of the frame at the steering head: one joint with a spring and a damper, before the steer
+    axis.
 
-    The front assembly turns by "head_twist" [rad] about an axis through the steer axis, across it and in the plane of
-    the frame, as in Sharp and Alstead (1980), *The influence of structural flexibilities on the straight-running
-    stability of motorcycles*.
+    The front assembly turns by "head_twist" [rad]. The axis of torsion intersects the steer axis at a right angle, in
+    the plane of the frame. See Sharp and Alstead (1980), *The influence of structural flexibilities on the
+    straight-running stability of motorcycles*.
 
-    **Arguments:** `stiffness` [N m/rad], `damping` [N m s/rad]; `height` [m] of the axis of torsion, upwards along the
-    steer axis from its point that is nearest to the rear wheel's centre.
+    **Arguments:**
+
+    - `stiffness` [N m/rad], `damping` [N m s/rad]: of the joint.
+    - `height` [m]: of the axis of torsion, upwards along the steer axis from its point nearest to the rear wheel's
+        centre.
     """
 
     stiffness: Scalar = parameter(positive=True, unit="N m/rad")
@@ -37,10 +40,10 @@ class HeadTwist(Part):
 
     def check(self, bicycle):
         if bicycle.head is not self:
-            raise ValueError("A HeadTwist stands between frame and fork: with_parts(head=HeadTwist(...)).")
+            raise ValueError("A HeadTwist belongs between frame and fork: use with_parts(head=HeadTwist(...)).")
 
-    def turned(self, tilted: Frame, S: Point, q: Any, u: Any) -> tuple[Frame, Point]:
-        """The frame along the steer axis and the point on it, as they carry the front assembly."""
+    def turned(self, tilted: Frame, S: Point, q: NamedVector, u: NamedVector) -> tuple[Frame, Point]:
+        """The frame along the steer axis and the point on it, after the torsion."""
         axis = S.fixed(-self.height * tilted.z)
         twisted = tilted.rotate(1, q["head_twist"], u["head_twist_rate"], "head")
         return twisted, axis.fixed(self.height * twisted.z)
@@ -55,10 +58,13 @@ class HeadTwist(Part):
 
 
 class SteeringFriction(Part):
-    """Dry friction of the steering head, by `jaxkane.loads.coulomb`; viscous is the bicycle's own `steer_damping`.
+    """Dry friction of the steering head, by `jaxkane.loads.coulomb`. Viscous friction is the bicycle's `steer_damping`.
 
-    **Arguments:** `level` [N m]; `width` [rad/s] of the smoothing: at slower rates the friction is viscous, level /
-    width times the rate, so that a steady torque below `level` makes the fork creep.
+    **Arguments:**
+
+    - `level` [N m]: the friction torque.
+    - `width` [rad/s]: of the smoothing. At slower rates the torque is level / width times the rate, so that a steady
+        torque below `level` makes the fork creep.
     """
 
     level: Scalar = parameter(positive=True, unit="N m")
@@ -70,22 +76,24 @@ class SteeringFriction(Part):
 
 
 class SteeringMotor(Part):
-    """A geared motor between frame and fork: what is commanded comes later, slower, and no larger than it can.
+    """A geared motor between frame and fork, with a delay, a torque limit and a lag.
 
         command -> delay -> limit -> lag -> torque on the fork, with its reaction on the frame
 
-    It has the input "steer_command" [N m], of the torque at the steer axis; a controller writes to it with
-    `command="steer_command"`. What the motor gives is added to "steer_torque".
+    It adds the input "steer_command" [N m], the commanded torque at the steer axis. Use `command="steer_command"` in a
+    controller. The motor's torque is added to "steer_torque".
 
-    **Arguments**, None for what is not there:
+    **Arguments**, None for an absent element:
 
-    - `lag` [s] of the first order: d(torque)/dt = (limited command - torque) / lag, the state "steer_motor_torque".
-    - `delay` [s], by the Pade approximation (1 - s T / 3) / (1 + 2 s T / 3 + (s T)^2 / 6), which is right to the third
-        order in s T and gives nothing at once: the states "steer_delayed" and "steer_delayed_slope" [N m]. A delay of
-        torques that do not depend on the motion is exact as moved times of their samples, `jk.Samples(t + delay, ...)`.
+    - `lag` [s]: of the first order: d(torque)/dt = (limited command - torque) / lag, with the state
+        "steer_motor_torque".
+    - `delay` [s]: by the Pade approximation (1 - s T / 3) / (1 + 2 s T / 3 + (s T)^2 / 6), which is exact to the third
+        order in s T and has no direct feedthrough. Its states are "steer_delayed" and "steer_delayed_slope" [N m]. If
+        the torque does not depend on the motion, shift the times of its samples instead, which is exact: `jk.Samples(t
+        + delay, ...)`.
     - `limit` [N m]: the largest torque, by limit * tanh(command / limit).
-    - `rotor_inertia` [kg m^2] and `ratio`, the rotor's rate over that of the steer: a body of its own, of which the
-        steer feels ratio^2 * rotor_inertia, and the frame the gyroscopic moment.
+    - `rotor_inertia` [kg m^2], `ratio`: a rotor as a separate body; `ratio` is its rate over that of the steer. The
+        steer has the additional inertia ratio^2 * rotor_inertia, and the gyroscopic moment acts on the frame.
     """
 
     lag: Scalar | None = parameter(None, positive=True, within=(0.0, 5.0), unit="s")
@@ -124,7 +132,7 @@ class SteeringMotor(Part):
 
     def state_rates(self, bicycle, t, q, u, x, motion, now):
         rates = []
-        if self.delay is not None:  # of w in w + 2/3 T w' + T^2 w'' / 6 = command, and of T w'
+        if self.delay is not None:  # w and T w', with w + 2/3 T w' + T^2 w'' / 6 = command
             w, slope = now["steer_delayed"], now["steer_delayed_slope"]
             rates += [slope / self.delay, (6.0 * (now["steer_command"] - w) - 4.0 * slope) / self.delay]
         if self.lag is not None:
@@ -133,23 +141,26 @@ class SteeringMotor(Part):
 
 
 class SteerByWire(Part):
-    """A handlebar that turns about the steer axis apart from the fork, and motors that couple them.
+    """A handlebar that turns about the steer axis independently of the fork, and motors that couple them.
 
         torque on the fork = stiffness * (ratio * handlebar - steer) + damping * (ratio * handlebar_rate - steer_rate)
         torque on the handlebar = handlebar_torque - feedback * ratio * torque on the fork
 
-    each with its reaction on the frame. The coordinate "handlebar" [rad] is the handlebar's angle, "handlebar_torque"
-    [N m] what the rider does to it. The bicycle's mH, xH, zH and IH.. are then those of the fork alone, S in the
-    files of BicycleParameters, and the handlebar's are given here, G in those files.
+    Each torque has its reaction on the frame. The coordinate "handlebar" [rad] is the handlebar's angle,
+    "handlebar_torque" [N m] the rider's torque on it. The bicycle's mH, xH, zH and IH.. are then those of the fork
+    without the handlebar (S in the files of BicycleParameters). The handlebar's parameters (G in those files) are
+    passed here.
 
     **Arguments:**
 
-    - `mass` [kg]; `x`, `z` [m] of the mass centre, of the upright bicycle and from the rear contact; `Ixx`, `Iyy`,
-        `Izz`, `Ixz` [kg m^2] in the axes of the frame: of the handlebar.
-    - `stiffness` [N m/rad], `damping` [N m s/rad] of the coupling; `ratio`: the fork's angle over the handlebar's;
-        `feedback`: the share of the fork's torque that the rider feels, 1 for a coupling that takes and gives no work
-        but by its damping.
-    - `command`: the input that has the torque on the fork, "steer_command" where it goes through a `SteeringMotor`:
+    - `mass` [kg]: of the handlebar.
+    - `x`, `z` [m]: mass centre of the handlebar, from the rear contact of the upright bicycle.
+    - `Ixx`, `Iyy`, `Izz`, `Ixz` [kg m^2]: inertia of the handlebar in the axes of the frame.
+    - `stiffness` [N m/rad], `damping` [N m s/rad]: of the coupling.
+    - `ratio`: the fork's angle over the handlebar's.
+    - `feedback`: the share of the fork's torque that acts on the rider. With 1 the coupling is passive; only its
+        damping dissipates.
+    - `command`: the input to which the torque on the fork is added. Use "steer_command" with a `SteeringMotor`:
         `steering=(SteerByWire(..., command="steer_command"), SteeringMotor(...))`.
     """
 

@@ -1,4 +1,4 @@
-"""A trailer on a ball at the frame."""
+"""A trailer on a ball hitch at the frame."""
 
 from __future__ import annotations
 
@@ -10,15 +10,20 @@ from ._part import Part
 
 
 class Trailer(Part):
-    """A trailer on a ball at the frame: it rolls without slipping sideways, on an axle that stays level.
+    """A trailer on a ball hitch at the frame. It rolls without lateral slip, and its axle remains level.
 
-    Its frame, "trailer", turns from the bicycle's heading by "trailer_angle" [rad], positive to the right, and tips by
-    the dependent "trailer_pitch" [rad] as the hitch rises and sinks. Neither is a new degree of freedom of the speeds:
-    what the bicycle does determines both rates. Its wheels count as mass, and not as rotors.
+    Its frame, "trailer", is rotated from the bicycle's heading by "trailer_angle" [rad], positive to the right. The
+    dependent coordinate "trailer_pitch" [rad] follows the height of the hitch. The bicycle's speeds determine both
+    rates, so the trailer adds no independent speed. The rotation of its wheels is neglected; their mass is included.
 
-    **Arguments:** `hitch_x`, `hitch_z` [m] in Meijaard's measures; `length` [m] from the hitch to the axle;
-    `wheel_radius`, `track` [m]: of the wheels, and between them (which is only drawn); `mass` [kg]; `center`, `height`
-    [m]: of the mass centre, before the axle and above it; `Ixx`, `Iyy`, `Izz` [kg m^2] about it.
+    **Arguments:**
+
+    - `hitch_x`, `hitch_z` [m]: the hitch, in Meijaard's axes.
+    - `length` [m]: from the hitch to the axle.
+    - `wheel_radius`, `track` [m]: of the wheels, and the distance between them (used for drawing only).
+    - `mass` [kg]: of the trailer.
+    - `center`, `height` [m]: of the mass centre, before the axle and above it.
+    - `Ixx`, `Iyy`, `Izz` [kg m^2]: inertia about the mass centre.
     """
 
     hitch_x: Scalar = parameter(within=(-FAR, FAR), unit="m")
@@ -45,7 +50,7 @@ class Trailer(Part):
 
     def check(self, bicycle):
         if bicycle.road.curved:
-            raise ValueError("A Trailer rolls on level ground or a Slope, not on a Road of given height.")
+            raise ValueError("A Trailer needs level ground or a Slope; it cannot be used on a Road of given height.")
 
     def motion(self, bicycle, motion, t, q, u):
         heading = motion["Y"].rotate(3, q["trailer_angle"], u["trailer_angle_rate"])

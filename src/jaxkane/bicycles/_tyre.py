@@ -1,4 +1,4 @@
-"""Where a wheel meets the ground: the tyre's shape, rolling with or without slip, and its forces. Knows one wheel."""
+"""The contact of one wheel with the ground: the tyre's shape, rolling with or without slip, and its forces."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from .._scalarjit.components import Component, Scalar, is_zero, mul, sub
 from .._system.kinematics import Vector
 from .._system.motion import Body, Force, Torque
 from .._system.parameters import parameter
+from .._system.prints import module_text
 from ._part import Contact, called, check_parameters
 from ._tyre_laws import LongitudinalSlip, TyreForceLaw
 
@@ -26,11 +27,11 @@ class Tyre(eqx.Module):
     - `crown` [m]: radius of the cross section of a torus, whose outer radius is the wheel's. None: a knife edge.
     - `lateral`: law of the lateral force. None: the tyre does not slip sideways.
     - `longitudinal`: law of the longitudinal force. None: it rolls without slip.
-    - `rolling_resistance`: resisting torque over load times radius, of a bicycle 0.003 to 0.01. Without slip the
-        force follows from the constraint.
-    - `load_lag` [s]: the load that laws and rolling resistance feel is the one that the ground carries, with a lag of
-        the first order: a state "front_load_transfer", by which it differs from the load at rest, over the bicycle's
-        weight. None: the load at rest.
+    - `rolling_resistance`: resisting torque over load times radius; 0.003 to 0.01 for a bicycle. Without slip the force
+        follows from the constraint.
+    - `load_lag` [s]: time constant of a first-order lag. Laws and rolling resistance then use the ground's normal force
+        with this lag. The state, e.g. "front_load_transfer", is its deviation from the static load, over the bicycle's
+        weight. None: the static load is used.
     """
 
     crown: Scalar | None = parameter(None, positive=True, unit="m")
@@ -39,49 +40,52 @@ class Tyre(eqx.Module):
     rolling_resistance: Scalar | None = parameter(None, within=(0.0, 1.0))
     load_lag: Scalar | None = parameter(None, positive=True, within=(0.0, 5.0), unit="s")
 
+    __repr__ = module_text
+
     def __check_init__(self) -> None:
         check_parameters(self)
         along, across = self.longitudinal, self.lateral
         if not (along is None or isinstance(along, LongitudinalSlip)):
-            raise TypeError(f"Tyre: `longitudinal` is a LongitudinalSlip or None, got {called(along)}.")
+            raise TypeError(f"Tyre: `longitudinal` must be a LongitudinalSlip or None, got {called(along)}.")
         if isinstance(across, LongitudinalSlip) or not (across is None or isinstance(across, TyreForceLaw)):
-            raise TypeError(f"Tyre: `lateral` is a law of lateral slip or None, got {called(across)}.")
+            raise TypeError(f"Tyre: `lateral` must be a law of lateral slip or None, got {called(across)}.")
 
     @property
     def rolls(self) -> bool:
-        """Whether it does not slip at all."""
+        """Whether the tyre rolls without any slip."""
         return self.lateral is None and self.longitudinal is None
 
     @property
     def laws(self) -> tuple[tuple[str, TyreForceLaw], ...]:
-        """Those directions in which it slips."""
+        """The directions in which it slips, with their laws."""
         laws = (("longitudinal", self.longitudinal), ("lateral", self.lateral))
         return tuple((name, law) for name, law in laws if law is not None)
 
     @property
     def deflects(self) -> tuple[str, ...]:
-        """Those directions in which its slip follows with a relaxation length."""
+        """The directions in which its slip has a relaxation length."""
         return tuple(name for name, law in self.laws if law.relaxation_length is not None)
 
     def reach(self, down: Vector, normal: Vector, radius: Component) -> Vector:
-        """From the wheel's centre to the contact; `down` is the unit vector in the wheel's plane towards the ground."""
+        """The vector from the wheel's centre to the contact. `down` is the unit vector in the wheel's plane towards the
+        ground."""
         if self.crown is None:
             return radius * down
         return (radius - self.crown) * down + self.crown * normal
 
     def rolled(self, cos_camber: Component, radius: Component) -> Component:
-        """What a wheel rolls over its angle [m]: smaller where it is inclined."""
+        """The rolled length per angle [m]; smaller for an inclined wheel."""
         return radius if self.crown is None else radius - self.crown + self.crown * cos_camber
 
     def residuals(self, contact: Contact) -> list[Any]:
-        """What is zero [m/s]: the velocity of the contact, less its slip."""
+        """Velocity residuals [m/s]: the velocity of the contact minus its slip."""
         v, (along, across) = contact.point.velocity, contact.slip
         if self.rolls:
             return [v]
         return [v.dot(contact.heading) - along, v.dot(contact.across) - across, v.dot(contact.normal)]
 
     def forces(self, contact: Contact, load: Component, deflection: dict[str, Component]) -> dict[str, Component]:
-        """Of the ground on the tyre [N], by direction. `load` [N]; `deflection` [m] by direction."""
+        """Forces of the ground on the tyre [N], by direction. `load` is in N; `deflection` in m, by direction."""
         return {name: law.force(slip, load, contact.camber) for name, law, slip in self._slips(contact, deflection)}
 
     def _slips(
@@ -98,7 +102,7 @@ class Tyre(eqx.Module):
     def loads(
         self, contact: Contact, wheel: Body, radius: Component, load: Component, deflection: dict[str, Component]
     ) -> Iterator[Force | Torque]:
-        """What the ground does to the wheel, the force of ideal rolling apart."""
+        """Loads of the ground on the wheel, without the constraint force of ideal rolling."""
         for name, law, slip in self._slips(contact, deflection):
             force = law.force(slip, load, contact.camber)
             yield Force(force * _direction(name, contact), contact.point)
@@ -106,7 +110,7 @@ class Tyre(eqx.Module):
             if not is_zero(moment):
                 yield Torque(moment * contact.normal, wheel)
         if self.rolling_resistance is not None:
-            # Over a tenth of a metre a second, so that a wheel at rest stays there.
+            # Smoothed over 0.1 m/s: a wheel at rest then remains at rest.
             size = self.rolling_resistance * jnp.maximum(load, 0.0) * radius * jnp.tanh(contact.speed / 0.1)
             yield Torque(size * contact.across, wheel)
 
@@ -116,10 +120,10 @@ def _direction(name: str, contact: Contact) -> Vector:
 
 
 def _moving(name: str, contact: Contact) -> tuple[Component, Component, Component]:
-    """Slip velocity [m/s], speed and camber, as a law asks for them."""
+    """Slip velocity [m/s], speed and camber: the arguments of a law."""
     return contact.slip[name == "lateral"], contact.speed, contact.camber
 
 
 def rolling_speed(tyre: Tyre, spin: Component, cos_camber: Component, radius: Component, slip: Component) -> Component:
-    """The speed of a contact along the wheel's heading [m/s]: -spin r + slip, of a wheel whose axle points right."""
+    """The speed of a contact along the wheel's heading [m/s]: -spin r + slip, for a wheel whose axle points right."""
     return sub(slip, mul(spin, tyre.rolled(cos_camber, radius)))

@@ -1,6 +1,6 @@
-"""Laws of tyres: forces and moments from slip, linear, by the Magic Formula, and measured.
+"""Tyre laws: forces and moments from slip, linear, by the Magic Formula, and measured.
 
-Knows numbers; knows no wheel.
+Laws are functions of numbers; they do not depend on a wheel.
 """
 
 from __future__ import annotations
@@ -15,36 +15,46 @@ from jaxtyping import Array, Float
 
 from .._scalarjit.components import Component, Scalar
 from .._system.parameters import parameter
+from .._system.prints import module_text
 from ..catalog.bicycle import FAR, TILT
 from ._part import check_parameters
 
 CREEPING = 0.01
-"""[m/s]: below this speed the law of a tyre without relaxation length is smoothed, so that it stays finite."""
+"""[m/s]: the law of a tyre without relaxation length is smoothed below this speed, so that the force is finite."""
 
 
 class TyreForceLaw(eqx.Module):
-    """How a tyre's slip gives a force. A law of your own gives `force`; and `equivalent`, where camber counts."""
+    """The force of a tyre as a function of its slip. A subclass defines `force`, and `equivalent` if camber has an
+    effect."""
 
     if TYPE_CHECKING:
         relaxation_length: Scalar | None
         largest_load: float
     else:
-        largest_load = math.inf  # [N], beyond which `force` is NaN
+        largest_load = math.inf  # [N]; above it `force` is NaN
+
+    __repr__ = module_text
 
     def __check_init__(self) -> None:
         check_parameters(self)
 
     @abc.abstractmethod
     def force(self, slip: Component, load: Component, camber: Component) -> Component:
-        """[N] of the ground on the tyre; `slip`: positive where the contact moves to the negative side; `load` [N];
-        `camber` [rad], of which `slip` has the `equivalent`."""
+        """The force of the ground on the tyre [N].
+
+        **Arguments:**
+
+        - `slip`: positive if the contact moves to the negative side; it includes the `equivalent` of the camber.
+        - `load` [N]: normal load.
+        - `camber` [rad]: inclination of the wheel.
+        """
 
     def equivalent(self, camber: Component) -> Component:
-        """The slip that would give the force of a camber angle [rad]."""
+        """The slip that has the same force as a camber angle [rad]."""
         return 0.0
 
     def moment(self, force: Component, slip: Component, load: Component, camber: Component) -> Component:
-        """[N m] about the ground's normal, downwards; `force` [N] is that of these arguments."""
+        """The moment about the ground's normal, downwards [N m]; `force` [N] is the force for the same arguments."""
         return 0.0
 
     def slip(self, velocity: Component, speed: Component, camber: Component, deflection: Component | None) -> Component:
@@ -55,13 +65,13 @@ class TyreForceLaw(eqx.Module):
     def deflection_rate(
         self, velocity: Component, speed: Component, camber: Component, deflection: Component
     ) -> Component:
-        """[m/s], see above."""
+        """The rate of the deflection [m/s], for a law with a relaxation length."""
         lag = deflection / self.relaxation_length - self.equivalent(camber)
         return -velocity - jnp.abs(speed) * lag
 
 
 class _AligningLaw(TyreForceLaw):
-    """A law whose lateral force acts behind the contact, and whose camber twists the tyre."""
+    """A law whose lateral force acts behind the contact, and whose camber causes a twisting moment."""
 
     if TYPE_CHECKING:
         pneumatic_trail: Scalar | None
@@ -77,13 +87,16 @@ class _AligningLaw(TyreForceLaw):
 
 
 class LateralSlip(_AligningLaw):
-    """Lateral force in proportion to slip and camber, as in Sharp (1971).
+    """Lateral force proportional to slip and camber, as in Sharp (1971).
 
         sigma / |V| dF/dt + F = cornering_stiffness * slip + camber_stiffness * camber
 
-    **Arguments:** `cornering_stiffness` [N/rad]; `camber_stiffness` [N/rad]; `relaxation_length` sigma [m], None for
-    a force that follows at once; `pneumatic_trail` [m] behind the contact at which the force acts; `twisting_stiffness`
-    [N m/rad], the moment of camber.
+    **Arguments:**
+
+    - `cornering_stiffness`, `camber_stiffness` [N/rad].
+    - `relaxation_length` sigma [m]: None for a force without lag.
+    - `pneumatic_trail` [m]: distance behind the contact at which the force acts.
+    - `twisting_stiffness` [N m/rad]: moment per camber.
     """
 
     cornering_stiffness: Scalar = parameter(positive=True, unit="N/rad")
@@ -102,14 +115,18 @@ class LateralSlip(_AligningLaw):
 
 
 class MagicFormula(_AligningLaw):
-    """Lateral force by the Magic Formula, in proportion to the load (Pacejka 2012, eq. 4.1 to 4.6).
+    """Lateral force by the Magic Formula, proportional to the load (Pacejka 2012, eq. 4.1 to 4.6).
 
         F = load * friction * sin(shape * atan(b - curvature * (b - atan(b)))),
         b = stiffness / (shape * friction) * (slip + camber_ratio * camber)
 
-    **Arguments:** `stiffness` [1/rad]: cornering stiffness over load; `friction`: largest force over load; `shape` and
-    `curvature`: C and E of the formula; `camber_ratio`: stiffness by camber over that by slip; the rest as in
-    `LateralSlip`.
+    **Arguments:**
+
+    - `stiffness` [1/rad]: cornering stiffness over load.
+    - `friction`: largest force over load.
+    - `shape`, `curvature`: C and E of the formula.
+    - `camber_ratio`: camber stiffness over cornering stiffness.
+    - the others as in `LateralSlip`.
     """
 
     stiffness: Scalar = parameter(positive=True, unit="1/rad")
@@ -124,7 +141,7 @@ class MagicFormula(_AligningLaw):
     def force(self, slip, load, camber):
         b = self.stiffness / (self.shape * self.friction) * slip
         b = b - self.curvature * (b - jnp.arctan(b))
-        carried = jnp.maximum(load, 0.0)  # a wheel that would lift does not pull
+        carried = jnp.maximum(load, 0.0)  # the load of a lifting wheel is zero, not negative
         return carried * self.friction * jnp.sin(self.shape * jnp.arctan(b))
 
     def equivalent(self, camber):
@@ -132,9 +149,12 @@ class MagicFormula(_AligningLaw):
 
 
 class LongitudinalSlip(TyreForceLaw):
-    """Longitudinal force in proportion to the slip ratio.
+    """Longitudinal force proportional to the slip ratio.
 
-    **Arguments:** `stiffness` [N]: force over slip ratio; `relaxation_length` [m] as in `LateralSlip`.
+    **Arguments:**
+
+    - `stiffness` [N]: force over slip ratio.
+    - `relaxation_length` [m]: as in `LateralSlip`.
     """
 
     stiffness: Scalar = parameter(positive=True, unit="N")
@@ -159,13 +179,17 @@ class MagicFormula89(TyreForceLaw):
         E = (c7 Fz^2 + c8 Fz + c9) (1 - c10 |camber|),
         Sh = c11 camber + c12 Fz + c13,   Sv = (c14 Fz^2 + c15 Fz) camber + c16 Fz + c17
 
-    with Fz in kN and angles in degrees. Coefficients are those of axes in which slip and camber give forces of the same
-    sign, and a moment of the opposite one: a tyre pulls against its slip, towards its lean, and turns out of its slip.
+    with Fz in kN and angles in degrees. In the axes of the coefficients, slip and camber give forces of the same sign,
+    and a moment of the opposite sign. The force opposes the slip and acts towards the lean; the moment turns the tyre
+    out of its slip.
 
-    **Arguments:** `force_coefficients` (14,): a0 to a13; `moment_coefficients` (18,): c0 to c17, None for no moment;
-    `relaxation_length` [m] as in `LateralSlip`: the slip angle follows with it, camber acts at once; `largest_slip`
-    [rad] and `largest_load` [N] of the formula, numbers that no fit moves. A larger slip angle counts as the largest. A
-    larger load gives NaN, with which a motion ends.
+    **Arguments:**
+
+    - `force_coefficients` (14,): a0 to a13.
+    - `moment_coefficients` (18,): c0 to c17. None: no moment.
+    - `relaxation_length` [m]: as in `LateralSlip`. The slip angle has this lag; camber acts without lag.
+    - `largest_slip` [rad]: slip is clipped to this value. Static, not a parameter of a fit.
+    - `largest_load` [N]: above it the force is NaN and the simulation stops. Static, not a parameter of a fit.
     """
 
     force_coefficients: Float[Array, 14] = parameter(shape=(14,))
@@ -179,11 +203,13 @@ class MagicFormula89(TyreForceLaw):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"MagicFormula89.{name} = {getattr(self, name)} must be positive.")
         if self.largest_slip > TILT[1]:
-            raise ValueError(f"MagicFormula89.largest_slip = {self.largest_slip} rad is a right angle. In degrees?")
+            raise ValueError(
+                f"MagicFormula89.largest_slip = {self.largest_slip} rad must be less than a right angle. In degrees?"
+            )
 
     def force(self, slip, load, camber):
         a, alpha, Fz, gamma = self.force_coefficients, *self._in_degrees(slip, load, camber)
-        # B C D / Fz, by sin(2 atan x) = 2 x / (1 + x^2), so that a wheel without load has a stiffness factor too
+        # B C D / Fz, with sin(2 atan x) = 2 x / (1 + x^2): a wheel without load then has a finite stiffness factor
         slope = 2.0 * a[3] / a[4] / (1.0 + (Fz / a[4]) ** 2) * (1.0 - a[5] * jnp.abs(gamma))
         shift = _Shift(a[8] * gamma + a[9] * Fz + a[10], a[11] * Fz * gamma + a[12] * Fz + a[13])
         return self._carried(_magic(alpha, Fz, a[0], a[1] * Fz + a[2], slope, a[6] * Fz + a[7], shift), load)
@@ -205,7 +231,7 @@ class MagicFormula89(TyreForceLaw):
         return angle / _DEGREE, 1e-3 * jnp.maximum(load, 0.0), camber / _DEGREE
 
     def _carried(self, value: Component, load: Component) -> Component:
-        """Nothing of a wheel that would lift; above the largest load NaN, with its derivatives."""
+        """Zero for a lifting wheel; above the largest load NaN with NaN derivatives."""
         return jnp.where(load > self.largest_load, jnp.nan, 1.0) * jnp.where(load > 0.0, value, 0.0)
 
 
@@ -268,7 +294,7 @@ _ENERGIZER = {
     ),
 }  # fmt: skip
 _OFFSETS = ((9, 10, 12, 13), (12, 13, 16, 17))
-"""Coefficients of what the tyre does without slip and camber."""
+"""Indices of the coefficients of forces and moments at zero slip and camber."""
 
 
 def schwalbe_energizer(
@@ -278,21 +304,24 @@ def schwalbe_energizer(
 
         tyre = Tyre(crown=0.022, lateral=schwalbe_energizer(300e3, relaxation_length=0.1))
 
-    Dell'Orto et al. (2024) measured it on a flat track, with loads of some 340 to 530 N and cambers up to 5 deg; their
-    formula is given for loads up to 1000 N, above which it is NaN here. Beyond 5 deg of camber it continues nearly as
-    a line. Slip angles beyond 10 deg, where its peak is passed, count as 10 deg. The friction is that of their track.
-    They give no relaxation length for it.
+    Dell'Orto et al. (2024) measured it on a flat track, with loads of about 340 to 530 N and cambers up to 5 deg. Their
+    formula is valid for loads up to 1000 N; above that the force is NaN. Above 5 deg of camber it is nearly linear.
+    Slip angles are clipped to 10 deg, which is beyond the peak. The friction is that of their track. They do not give a
+    relaxation length.
 
-    **Arguments:** `pressure` [Pa]: 300e3, 400e3 or 500e3; `relaxation_length` [m]; `offsets`: with the forces and
-    moments that the formula has without slip and camber. By default they are zero, so that left and right are alike:
-    they belong to one tyre as it was mounted, and no bicycle rides straight on with them, hands off.
+    **Arguments:**
+
+    - `pressure` [Pa]: 300e3, 400e3 or 500e3.
+    - `relaxation_length` [m]: as in `LateralSlip`.
+    - `offsets`: include the measured forces and moments at zero slip and camber. Default: zero, so that left and right
+        are symmetric. They belong to one tyre as it was mounted; with them no bicycle rides straight, hands off.
 
     **Raises:** `ValueError` for a pressure that was not measured.
     """
     known = {1e3 * kPa: coefficients for kPa, coefficients in _ENERGIZER.items()}
     if pressure not in known:
         raise ValueError(
-            f"schwalbe_energizer: pressure = {pressure!r} Pa was not measured; there are {', '.join(map(str, known))}."
+            f"schwalbe_energizer: pressure = {pressure!r} Pa was not measured. Use one of {', '.join(map(str, known))}."
         )
     force, moment = (
         jnp.array([0.0 if i in own and not offsets else x for i, x in enumerate(coefficients)])

@@ -1,8 +1,8 @@
-"""The systems of Kamman, Volume II, Unit 5: Examples 1 to 7 and Exercises 5.1 to 5.8, one file a mechanism.
+"""The systems of Kamman, Volume II, Unit 5: Examples 1 to 7 and Exercises 5.1 to 5.8, one file for each mechanism.
 
-`CATALOG` lists them all, each with an example instance and a consistent state. A new mechanism is a file here, with
-`@entry(...)` above its class, and its line below; the laws in `tests/catalog/test_laws.py` then test it, and
-the site's catalogue shows it.
+`CATALOG` lists all systems, each with an example instance and a consistent state. To add a mechanism, add a file with
+`@entry(...)` above its class, and import the class below. It is then tested by `tests/catalog/test_laws.py` and shown
+in the catalogue of the website.
 """
 
 from ._entry import CATALOG as CATALOG

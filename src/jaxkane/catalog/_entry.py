@@ -1,4 +1,4 @@
-"""The table of the catalogue, and files of parameters of a bicycle."""
+"""The table of the catalogue, and files with the parameters of a bicycle."""
 
 from __future__ import annotations
 
@@ -17,14 +17,18 @@ _Class = TypeVar("_Class", bound=type[System])
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """One line of `CATALOG`.
+    """One entry of `CATALOG`.
 
-    - `book`: its place in Kamman, Volume II, Unit 5. `shows`: what it is an example of.
-    - `example`: makes an instance; a function, so that importing the catalogue makes no array.
-    - `q`, `u`: a generic state, consistent with the constraints, in the order of `coordinates` and `speeds`; left to
-        itself from there, the system moves for at least 10 s without meeting one of its `events`.
-    - `operations`: of the traced (q_dot, u_dot), each common one once; counted, with five per cent to spare.
-    - `conservative`: whether mechanical energy is constant when no input acts.
+    - `book`: the example or exercise in Kamman, Volume II, Unit 5.
+    - `shows`: the topic of the example.
+    - `example`: a function that returns an instance. It is a function, so that importing the catalogue creates no
+        array.
+    - `q`: generic coordinates that satisfy the constraints, in the order of `coordinates`. Without inputs, a simulation
+        from this state reaches no event for at least 10 s.
+    - `u`: generic speeds, in the order of `speeds`.
+    - `operations`: an upper limit for the number of operations of the traced (q_dot, u_dot). Common
+        subexpressions are counted once. The limit is five per cent above the actual number.
+    - `conservative`: whether the mechanical energy is constant without inputs.
     """
 
     book: str
@@ -37,7 +41,7 @@ class Entry:
 
 
 CATALOG: dict[str, Entry] = {}
-"""Every system of the textbook by name, in the textbook's order."""
+"""Every system of the textbook by name, in the order of the textbook."""
 
 
 def entry(
@@ -50,7 +54,7 @@ def entry(
     example: Callable[[], System] | None = None,
     conservative: bool = True,
 ) -> Callable[[_Class], _Class]:
-    """Put the class that follows into `CATALOG`, with the arguments of `Entry`; its example is `cls()` by default."""
+    """A decorator that adds a class to `CATALOG`. Arguments as `Entry`; the default example is `cls()`."""
 
     def enter(cls: _Class) -> _Class:
         entries = {**CATALOG, cls.__name__: Entry(book, shows, example or cls, q, u, operations, conservative)}
@@ -61,31 +65,36 @@ def entry(
     return enter
 
 
-def lines_of(path: str | os.PathLike[str]) -> list[str]:
-    """The lines of a text file; the mark at its beginning that some editors write is none of its text.
+def text_of(path: str | os.PathLike[str]) -> str:
+    """The text of a file, without the byte-order mark that some editors write.
 
-    **Raises:** `ValueError` for a file that is no text.
+    **Raises:** `ValueError` for a file that does not contain UTF-8 text.
     """
     try:
-        return Path(path).read_text(encoding="utf-8-sig").splitlines()
+        return Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        raise ValueError(f"{os.fspath(path)} is no text file in UTF-8.") from None
+        raise ValueError(f"{os.fspath(path)} is not a text file in UTF-8. Save it with this encoding.") from None
 
 
 def read_bicycle_file(
     path: str | os.PathLike[str], known: Sequence[str] | None = None
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Values and standard deviations by name, from a text file of BicycleParameters.
+    """Read values and standard deviations from a text file of BicycleParameters.
 
-    **Arguments:** `path`; `known`: names to accept, by default all.
+    **Arguments:**
 
-    **Raises:** `ValueError` with one line for every entry that is malformed, unknown or repeated.
+    - `path`: path of the file.
+    - `known`: names to accept. The default is all names.
+
+    **Returns:** two dicts by name: the values, and their standard deviations (zero if not given).
+
+    **Raises:** `ValueError` that lists every malformed, unknown or repeated entry with its line number.
     """
     values: dict[str, float] = {}
     deviations: dict[str, float] = {}
     lines: dict[str, int] = {}
     faults: list[str] = []
-    for number, line in enumerate(lines_of(path), start=1):
+    for number, line in enumerate(text_of(path).splitlines(), start=1):
         line = line.strip()
         if not line or line.startswith("#"):
             continue
@@ -100,7 +109,7 @@ def read_bicycle_file(
         elif name in lines:
             faults.append(f"line {number}: {name} was given before, on line {lines[name]}")
         elif known is not None and name not in known:
-            faults.append(f"line {number}: {name} is no parameter of this model")
+            faults.append(f"line {number}: {name} is not a parameter of this model")
         else:
             lines[name] = number
             values[name], deviations[name] = pair

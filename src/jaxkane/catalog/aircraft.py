@@ -1,4 +1,4 @@
-"""Example 5: an aircraft whose two engines turn at prescribed speeds; by orientation angles or Euler parameters."""
+"""Example 5: an aircraft whose two engines rotate at prescribed speeds; with angles or Euler parameters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .._system.parameters import parameter
 from .._system.system import System
 from ._entry import entry
 
-_EULER = (0.1, -0.3, 0.5, 0.65**0.5)  # of unit norm, the scalar last
+_EULER = (0.1, -0.3, 0.5, 0.65**0.5)  # unit norm, scalar last
 _ENGINES = {
     "engine1_speed": 400.0,
     "engine1_acceleration": 15.0,
@@ -24,7 +24,7 @@ _ENGINES = {
 
 
 class _Aircraft(System):
-    # How the airframe is oriented is left to the two classes below: `_airframe` and `_orientation_rates`.
+    # The two subclasses below define the orientation of the airframe: `_airframe` and `_orientation_rates`.
     airframe_mass: Scalar = parameter(6000.0, positive=True, unit="kg")
     airframe_Ixx: Scalar = parameter(12000.0, positive=True, unit="kg m^2")
     airframe_Iyy: Scalar = parameter(30000.0, positive=True, unit="kg m^2")
@@ -76,7 +76,7 @@ class _Aircraft(System):
             (Ixz, 0.0, self.airframe_Izz),
         )
         I_E = (self.engine_axial_inertia, self.engine_transverse_inertia, self.engine_transverse_inertia)
-        # The engines are solids of revolution: they stand in the airframe's frame, and turn at their own rate.
+        # The engines are axisymmetric, so their inertia is constant in the frame of the airframe although they spin.
         w_E1 = A.angular_velocity + (self.engine1_speed + self.engine1_acceleration * t) * A.x
         w_E2 = A.angular_velocity + (self.engine2_speed + self.engine2_acceleration * t) * A.x
         bodies = (
@@ -95,15 +95,15 @@ class _Aircraft(System):
 
 @entry(
     "Example 5",
-    "rotors with prescribed speeds: terms in time",
+    "rotors with prescribed speeds; explicit time dependence",
     q=(100.0, -50.0, -1000.0, 0.4, 0.2, -0.3),
     u=(120.0, 4.0, 7.0, 0.3, -0.2, 0.15),
     operations=648,
     example=lambda: Aircraft(**_ENGINES),
-    conservative=False,  # the motors that hold the engines' prescribed speeds do work
+    conservative=False,  # the motors that maintain the prescribed speeds of the engines do work
 )
 class Aircraft(_Aircraft):
-    """An airframe with two engines that turn at prescribed speeds; 3-2-1 angles (Kamman, Unit 5, Example 5).
+    """An airframe with two engines that rotate at prescribed speeds; 3-2-1 angles (Kamman, Unit 5, Example 5).
 
     | parameter | book | meaning |
     |---|---|---|
@@ -116,13 +116,13 @@ class Aircraft(_Aircraft):
     | `engine1_speed`, `engine2_speed` | omega_E1, omega_E2 | about A.x, relative to the airframe, at t = 0 [rad/s] |
     | `engine1_acceleration`, `engine2_acceleration` | their rates | constant [rad/s^2] |
 
-    The airframe's mass centre follows from G: x_A = -2 m_E x_E / m_A, and so for z_A.
+    The mass centre of the airframe follows from G: x_A = -2 m_E x_E / m_A, z_A = -2 m_E z_E / m_A.
 
     - Coordinates `x`, `y`, `z`: G in N [m]; `psi`, `theta`, `phi`: yaw, pitch and roll of the 3-2-1 sequence [rad].
     - Speeds `v1`, `v2`, `v3` (the book's u, v, w): velocity of G along the airframe's axes [m/s]; `omega1`, `omega2`,
       `omega3`: angular velocity of the airframe along its axes [rad/s].
     - Inputs `force1`, `force2`, `force3` at G [N], `torque1`, `torque2`, `torque3` [N m]: resultants of all external
-      forces, weight included, along the airframe's axes.
+      forces, including the weight, along the airframe's axes.
     """
 
     coordinates = ("x", "y", "z", "psi", "theta", "phi")
@@ -140,7 +140,7 @@ class Aircraft(_Aircraft):
 
 @entry(
     "Example 5",
-    "the same without angles that lock",
+    "the same without gimbal lock",
     q=(100.0, -50.0, -1000.0, *_EULER),
     u=(120.0, 4.0, 7.0, 0.3, -0.2, 0.15),
     operations=657,
@@ -148,7 +148,7 @@ class Aircraft(_Aircraft):
     conservative=False,
 )
 class AircraftEulerParameters(_Aircraft):
-    """`Aircraft` oriented by Euler parameters, which do not lock (Kamman, Unit 5, Example 5, last paragraph).
+    """`Aircraft` with Euler parameters, which have no gimbal lock (Kamman, Unit 5, Example 5, last paragraph).
 
     - Coordinates `x`, `y`, `z`: G in N [m]; `e1` ... `e4`: Euler parameters of the airframe, scalar last.
     """

@@ -21,22 +21,23 @@ from ._entry import entry
     conservative=False,  # a damper
 )
 class BarWithPiston(System):
-    """A bar whose upper end A carries a vertical piston, its lower end B a horizontal light slider on a spring and
-    a damper (Kamman, Unit 5, Exercise 5.1).
+    """A bar between a vertical piston at its upper end A and a light horizontal slider at its lower end B.
+
+    A spring and a damper act on the slider (Kamman, Unit 5, Exercise 5.1).
 
     | parameter | book | meaning |
     |---|---|---|
     | `mass` | m | of the bar [kg] |
     | `length` | l | of the bar [m] |
     | `piston_mass` | m_p | [kg] |
-    | `stiffness`, `damping` | k, c | of the spring [N/m] and the damper [N s/m] on B; unstretched at x_B = 0 |
+    | `stiffness`, `damping` | k, c | of the spring [N/m] and the damper [N s/m] at B; unstretched at x_B = 0 |
     | `gravity` | g | along -N.y [m/s^2] |
 
-    - Coordinate `theta`: of the bar from the vertical: x_B = l sin(theta), y_A = l cos(theta) [rad].
+    - Coordinate `theta`: angle of the bar from the vertical; x_B = l sin(theta), y_A = l cos(theta) [rad].
     - Speed: its rate [rad/s].
     - Input `force` (F): downward on the piston [N].
-    - Auxiliary speeds `piston_guide` (A along N.x) and `slider_guide` (B along N.y) [m/s]: their forces are the
-      walls' on piston and slider [N] (`constraint_forces`).
+    - Auxiliary speeds `piston_guide` (A along N.x) and `slider_guide` (B along N.y) [m/s]: their forces act
+      from the walls on piston and slider [N] (`constraint_forces`).
     """
 
     mass: Scalar = parameter(1.0, positive=True, unit="kg")

@@ -26,16 +26,16 @@ _BENCHMARK = {
 }  # fmt: skip
 
 FAR = 20.0
-"""[m]: no length or place of a bicycle is larger."""
+"""An upper limit of the lengths and positions of a bicycle [m]."""
 ABOVE_GROUND = (-FAR, 0.0)
-"""[m]: z of what is above the ground, since z points down."""
+"""Limits of z above the ground [m]. They are negative, because z points down."""
 TILT = (-1.57, 1.57)
-"""[rad]: less than a right angle."""
+"""Limits of the tilt of the steer axis [rad], less than a right angle."""
 
-# What other sources write out although the model implies it: the name, and what it must be equal to.
+# Parameters that other sources give although the model implies them: name, and the equal parameter (None: zero).
 _IMPLIED = {"IRzz": "IRxx", "IFzz": "IFxx", "yB": None, "yH": None}
 
-# BicycleParameters' split of the front assembly H into handlebar G and fork S, which H already holds.
+# BicycleParameters also splits the front assembly H into handlebar G and fork S. H contains both.
 _PARTS_OF_H = frozenset(f"{what}{part}" for part in "GS" for what in ("m", "x", "z")) | frozenset(
     f"I{part}{axes}" for part in "GS" for axes in ("xx", "yy", "zz", "xz")
 )
@@ -45,15 +45,15 @@ _PARTS_OF_H = frozenset(f"{what}{part}" for part in "GS" for what in ("m", "x", 
     "Example 7",
     "ideal rolling: dependent speeds, a dependent coordinate",
     q=(0.2, 0.2, 0.15, -0.8, -0.0023122917367326048, -0.1, 0.3, -0.4),  # the pitch follows from roll and steer
-    u=(0.3, -17.0, -0.4),  # about 5 m/s, where the benchmark bicycle rights itself
+    u=(0.3, -17.0, -0.4),  # about 5 m/s, where the benchmark bicycle is self-stable
     operations=2070,
     example=lambda: WhippleBicycle.benchmark(),
 )
 class WhippleBicycle(System):
     """A bicycle with four rigid bodies, knife-edge wheels and ideal rolling on level ground (Example 7).
 
-    Parameters carry Meijaard's names. Positions are measured from the rear contact P of the upright bicycle, x forward
-    and z down; inertias are about the mass centres, in the same directions, products as matrix entries.
+    The parameters have Meijaard's names. Positions are relative to the rear contact P of the upright bicycle, with x
+    forward and z down. Inertias are about the mass centres, along the same axes. Products are matrix entries.
 
     | name | meaning | unit |
     |---|---|---|
@@ -66,15 +66,17 @@ class WhippleBicycle(System):
     | rF, mF, IFxx, IFyy | front wheel: as the rear wheel | m, kg, kg m^2 |
     | steer_damping | viscous torque between fork and frame | N m s/rad |
 
-    Coordinates: yaw, roll and pitch of the rear frame (3-1-2), steer about the tilted axis, the wheels' angles (both
-    fall when riding forward: the speed is -rR * rear_wheel_rate), and the rear contact's place x, y. Pitch follows from
-    roll and steer (`assemble`). Inputs: `roll_torque` on the frame about the heading, `drive_torque` on the rear wheel
-    and `steer_torque` on the fork, the last two with their reactions on the frame.
+    - Coordinates: yaw, roll and pitch of the rear frame (3-1-2), steer about the tilted axis, the angles of the wheels,
+      and the position x, y of the rear contact. Pitch follows from roll and steer (`assemble`). The wheel angles
+      decrease in forward motion: the speed is -rR * rear_wheel_rate.
+    - Inputs: `roll_torque` on the frame about the heading, `drive_torque` on the rear wheel and `steer_torque` on the
+      fork. The last two have a reaction on the frame.
+    - Bodies in `motion`: "rear wheel", "rear frame", "fork" and "front wheel". The frame of "fork" is aligned with the
+      rear frame at zero steer.
+    - Frames in `motion`: "Y" (heading), "B" (rear frame) and "C" (fork, z along the steer axis).
+    - Points in `motion`: "P" and "Q" (contacts) and "S" (on the steer axis).
 
-    Its motion names the bodies "rear wheel", "rear frame", "fork" (whose own frame is aligned with the rear frame at
-    zero steer) and "front wheel"; the frames "Y" (heading), "B" (rear frame) and "C" (fork, z along the steer axis);
-    the points "P" and "Q" (contacts) and "S" (on the steer axis). A class that inherits from this one adds to it with
-    `super().motion(t, q, u).extended([...])`.
+    A subclass adds bodies with `super().motion(t, q, u).extended([...])`.
     """
 
     w: Scalar = parameter(positive=True, within=(0.0, FAR), unit="m")
@@ -111,10 +113,11 @@ class WhippleBicycle(System):
     dependent_coordinates = ("pitch",)
     inputs = ("roll_torque", "drive_torque", "steer_torque")
     lateral: ClassVar[tuple[str, ...]] = ("roll", "steer", "roll_rate", "steer_rate")
-    """Coordinates, speeds and states that move to first order when a bicycle leaves straight riding, where those of
-    Meijaard et al. (2007) suffice."""
+    """States of the lateral linear model about straight riding, as in Meijaard et al. (2007). They are the coordinates,
+    speeds and first-order states that change to first order."""
     needs_trim: ClassVar[bool] = False
-    """Whether something resists riding straight on, or sinks under its weight: see `stability.straight_ahead`."""
+    """Whether straight riding needs a drive torque, or parts deflect under their weight. Then
+    `stability.straight_ahead` computes a steady motion."""
     units = dict.fromkeys(coordinates[:6], "rad") | {"x": "m", "y": "m"}
     units |= dict.fromkeys((*speeds, *dependent_speeds), "rad/s") | dict.fromkeys(inputs, "N m")
 
@@ -125,19 +128,25 @@ class WhippleBicycle(System):
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> Self:
-        """A bicycle from a dict with Meijaard's names, and those of a class that inherits from this one.
+        """A bicycle from a dict of parameters.
 
-        What has a default may be left out, as `g` and `steer_damping`. `IRzz`, `IFzz`, `yB` and `yH`, which the model
-        implies, may be given.
+        **Arguments:**
 
-        **Raises:** `ValueError` that names what is missing, unknown, or contradicts the model's symmetry.
+        - `parameters`: numbers by Meijaard's names, and by the names of a subclass. Parameters with a default, such as
+            `g` and `steer_damping`, may be omitted. `IRzz`, `IFzz`, `yB` and `yH` may be given, although the model
+            implies their values.
+
+        **Raises:** `ValueError` with the names that are missing, unknown, or contradict the symmetry of the model.
         """
         values = dict(parameters)
         for name, twin in _IMPLIED.items():
             if name in values:
                 given, implied = float(values.pop(name)), 0.0 if twin is None else float(values.get(twin, jnp.nan))
                 if abs(given - implied) > 1e-9 * max(1.0, abs(implied)):
-                    raise ValueError(f"{cls.__name__}: {name} = {given:.6g}, but the model has {name} = {twin or 0.0}.")
+                    raise ValueError(
+                        f"{cls.__name__}: {name} = {given:.6g}, but the model requires {name} = {twin or 0.0}. Correct "
+                        "or omit it."
+                    )
         fields = [field for field in dataclasses.fields(cls) if field.init]  # type: ignore[arg-type]
         unknown = sorted(set(values) - {field.name for field in fields})
         missing = [field.name for field in fields if field.name not in values and not _has_default(field)]
@@ -145,18 +154,24 @@ class WhippleBicycle(System):
             parts = [f"missing: {', '.join(missing)}"] * bool(missing) + [f"unknown: {', '.join(unknown)}"] * bool(
                 unknown
             )
-            raise ValueError(f"{cls.__name__} takes Meijaard's parameters; {'; '.join(parts)}.")
+            raise ValueError(
+                f"{cls.__name__}: wrong parameters; {'; '.join(parts)}. Pass the parameters by Meijaard's names."
+            )
         return cls(**values)
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Self:
         """A bicycle from a text file of BicycleParameters (`NAME = value+/-deviation`).
 
-        The deviations are read by `jaxkane.catalog.read_bicycle_file`. Where a file also splits the front assembly H
-        into handlebar G and fork S, those parts are passed over; so is the speed `v`.
+        The standard deviations are ignored. Read them with `jaxkane.catalog.read_bicycle_file`. The parameters of
+        handlebar G and fork S, into which some files split the front assembly H, are ignored, and so is the speed `v`.
 
-        **Raises:** `ValueError` that names the lines that are unknown, repeated or malformed, what is missing, and
-        what is not in metres or radians.
+        **Arguments:**
+
+        - `path`: path of the file.
+
+        **Raises:** `ValueError` for lines that are unknown, repeated or malformed, for missing parameters, and for
+        values that are not in metres or radians.
         """
         values, _ = read_bicycle_file(path, known=(*parameter_info(cls), *_IMPLIED, *_PARTS_OF_H, "v"))
         try:
@@ -165,7 +180,7 @@ class WhippleBicycle(System):
             raise ValueError(f"{os.fspath(path)}: {error}") from None
 
     def q_dot(self, t, q, u):
-        # P follows the wheel: v_P = v_A - omega_R x r_P_A, R the frame that rolls but does not pitch.
+        # P moves with the wheel: v_P = v_A - omega_R x r_P_A. The frame R has the roll, but not the pitch.
         forward = -self.rR * (u["rear_wheel_rate"] + u["pitch_rate"])
         turning = [u[f"{part}_rate"] for part in ("roll", "rear_wheel", "steer", "yaw", "pitch", "front_wheel")]
         return (*turning, forward * jnp.cos(q["yaw"]), forward * jnp.sin(q["yaw"]))
@@ -181,12 +196,12 @@ class WhippleBicycle(System):
         omega_A = B.angular_velocity + u["rear_wheel_rate"] * B.y
         omega_D = C.angular_velocity + u["front_wheel_rate"] * C.y
 
-        # S on the steer axis, and everything else, from the rear wheel's centre G_A (Example 7).
+        # All points follow from the centre G_A of the rear wheel, by way of S on the steer axis (Example 7).
         cos, sin = jnp.cos(self.lam), jnp.sin(self.lam)
         xS = (self.w + self.c) * cos * cos - self.rR * sin * cos
         zS = xS * sin / cos
 
-        def from_S(x, z):  # a place measured from P, upright, as a vector fixed in the fork
+        def from_S(x, z):  # a position relative to P (upright) as a vector fixed in the fork
             return ((x - xS) * H.x + (z + self.rR + zS) * H.z).express(C)
 
         P = O.fixed(q["x"] * N.x + q["y"] * N.y, N)  # the ground under the rear wheel, at rest
@@ -206,8 +221,15 @@ class WhippleBicycle(System):
     def bodies(
         self, centers: Sequence[Point], frames: Sequence[Frame], omega_A: Vector, omega_D: Vector
     ) -> tuple[Body, ...]:
-        """Rear wheel, rear frame, fork and front wheel, at their mass centres and in frames in which their inertia is
-        constant; the wheels turn with `omega_A` and `omega_D`."""
+        """Rear wheel, rear frame, fork and front wheel.
+
+        **Arguments:**
+
+        - `centers`: mass centres of the four bodies.
+        - `frames`: frames in which the inertias of the bodies are constant.
+        - `omega_A`: angular velocity of the rear wheel.
+        - `omega_D`: angular velocity of the front wheel.
+        """
         A_inertia = (self.IRxx, self.IRyy, self.IRxx)
         B_inertia = ((self.IBxx, 0.0, self.IBxz), (0.0, self.IByy, 0.0), (self.IBxz, 0.0, self.IBzz))
         H_inertia = ((self.IHxx, 0.0, self.IHxz), (0.0, self.IHyy, 0.0), (self.IHxz, 0.0, self.IHzz))
@@ -231,7 +253,7 @@ class WhippleBicycle(System):
         )
 
     def gravity(self, N: Frame) -> Vector:
-        """[m/s^2]; `N` is the inertial frame, its z square to the ground."""
+        """Gravitational acceleration [m/s^2]. `N` is the inertial frame, whose z is normal to the ground."""
         return self.g * N.z
 
     def configuration_constraints(self, t, q):

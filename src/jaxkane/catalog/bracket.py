@@ -23,8 +23,8 @@ from ._entry import entry
 class Bracket(System):
     """A cross of two identical slender bars OA and BC on a ball joint at O (Kamman, Unit 5, Exercise 5.8).
 
-    OA runs along axis 2 of the bracket, BC across it along axis 1; their midpoints coincide in G, and B is on the
-    positive side.
+    OA is along axis 2 of the bracket, BC along axis 1. Their midpoints coincide at G. B is on the positive side of
+    axis 1.
 
     | parameter | book | meaning |
     |---|---|---|

@@ -20,8 +20,9 @@ from ._entry import entry
     operations=265,
 )
 class ColumnFrameAndDisk(System):
-    """A light column that turns about the vertical, a frame A that turns on it, and a disk D that spins on the frame
-    (Kamman, Unit 5, Exercise 5.7).
+    """A light column that rotates about the vertical, a frame A on the column, and a disk D on the frame.
+
+    The axes are three revolute joints (Kamman, Unit 5, Exercise 5.7).
 
     | parameter | book | meaning |
     |---|---|---|
@@ -33,7 +34,7 @@ class ColumnFrameAndDisk(System):
 
     - Coordinates `phi`: column about N.z; `theta`: frame about the column's y axis; `psi`: disk about A.y [rad].
     - Speeds `omega1`, `omega2`: angular velocity of the frame along A.x and A.y; `omega_disk`: of the disk relative to
-      the frame [rad/s]. They do not give phi_dot = -omega1 / sin(theta) where theta = 0.
+      the frame [rad/s]. At theta = 0, phi_dot = -omega1 / sin(theta) is not defined.
     - Inputs `column_torque` (T_phi, ground on column), `frame_torque` (T_theta, column on frame), `disk_torque`
       (T_psi, frame on disk) [N m].
     """

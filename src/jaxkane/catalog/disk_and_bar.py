@@ -1,4 +1,4 @@
-"""Exercise 5.5: a bar pinned to a turning disk, with a torsional spring and damper."""
+"""Exercise 5.5: a bar pinned to a rotating disk, with a torsional spring and damper."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from ._entry import entry
     conservative=False,  # a damper
 )
 class DiskAndBar(System):
-    """A horizontal disk that turns about the vertical, and a slender bar that hangs from a pin on it
-    (Kamman, Unit 5, Exercise 5.5).
+    """A horizontal disk that rotates about the vertical, and a slender bar that hangs from a pin on the disk.
+
+    See Kamman, Unit 5, Exercise 5.5.
 
     | parameter | book | meaning |
     |---|---|---|
@@ -30,8 +31,8 @@ class DiskAndBar(System):
     | `stiffness`, `damping` | k, c | of the torsional spring [N m/rad] and damper [N m s/rad] at P |
     | `gravity` | g | along -N.z [m/s^2] |
 
-    - Coordinates `phi`: the disk about N.z; `theta`: the bar about the disk's x axis, from the downward vertical,
-      where the spring is unstretched [rad].
+    - Coordinates `phi`: angle of the disk about N.z; `theta`: angle of the bar about the disk's x axis, from the
+      downward vertical, where the spring is unstretched [rad].
     - Speeds: their rates [rad/s].
     - Inputs `disk_torque` (M_phi, ground on disk), `bar_torque` (M_theta, disk on bar) [N m].
     """

@@ -1,4 +1,4 @@
-"""Example 1: the planar double pendulum. Describes; the method is d'Alembert's, since the speeds are rates."""
+"""Example 1: the planar double pendulum. The speeds are rates, so Kane's method is that of d'Alembert."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ._entry import entry
 
 @entry(
     "Example 1",
-    "speeds that are rates of angles, joint torques",
+    "speeds are rates of angles; joint torques",
     q=(0.7, -0.4),
     u=(1.1, -0.8),
     operations=146,

@@ -11,7 +11,7 @@ from ._entry import entry
 
 
 class _FrameAndBar(System):
-    # The mechanism of both examples; what the speeds are is said by `q_dot` alone.
+    # The mechanism of both examples. Only `q_dot` depends on the choice of speeds.
     mass: Scalar = parameter(2.0, positive=True, unit="kg")
     length: Scalar = parameter(0.8, positive=True, unit="m")
     distance: Scalar = parameter(0.5, positive=True, unit="m")
@@ -47,7 +47,7 @@ class _FrameAndBar(System):
     operations=64,
 )
 class RotatingFrameAndBar(_FrameAndBar):
-    """A light frame that turns about the vertical, a slender bar that turns on it (Kamman, Unit 5, Example 3).
+    """A light frame that rotates about the vertical, and a slender bar pinned to it (Kamman, Unit 5, Example 3).
 
     | parameter | book | meaning |
     |---|---|---|
@@ -55,8 +55,8 @@ class RotatingFrameAndBar(_FrameAndBar):
     | `length` | l | length of the bar [m] |
     | `distance` | d | from the vertical axis to the bar's mass centre [m] |
 
-    - Coordinates `phi`: the frame about the vertical N.z; `theta`: the bar about the frame's arm, from the
-      horizontal [rad].
+    - Coordinates `phi`: angle of the frame about the vertical N.z; `theta`: angle of the bar about the frame's arm,
+      from the horizontal [rad].
     - Speeds: their rates [rad/s].
     - Inputs `frame_torque` (M_phi, ground on frame), `bar_torque` (M_theta, frame on bar) [N m].
     """
@@ -66,13 +66,13 @@ class RotatingFrameAndBar(_FrameAndBar):
 
 @entry(
     "Example 4",
-    "the same with chosen speeds",
+    "the same with other generalized speeds",
     q=(0.5, 0.8),
     u=(0.65, -0.9),
     operations=93,
 )
 class RotatingFrameAndBarChosenSpeeds(_FrameAndBar):
-    """`RotatingFrameAndBar` with the speeds of Example 4; all else is the same mechanism (Kamman, Unit 5).
+    """The mechanism of `RotatingFrameAndBar` with the speeds of Example 4 (Kamman, Unit 5).
 
     - Speeds `center_speed` (v_G = d phi_dot): of the bar's mass centre [m/s]; `omega2` = theta_dot [rad/s].
     """

@@ -13,7 +13,7 @@ from ._entry import entry
 
 
 def _shaft_and_bar(mass, length, q, q_dot):
-    # The frame of the shaft and the bar on it: what both exercises have in common.
+    # The shaft and the bar, which both exercises have in common.
     N, O = inertial()
     S = N.rotate(3, q["phi"], q_dot[0], "S")
     B = S.rotate(2, q["theta"], q_dot[1], "B")
@@ -31,13 +31,15 @@ def _motor_torques(motion, inputs):
 
 @entry(
     "Exercise 5.3",
-    "speeds that are rates of angles",
+    "speeds are rates of angles",
     q=(0.3, 0.9),
     u=(1.4, -0.7),
     operations=67,
 )
 class ShaftAndBar(System):
-    """A shaft that turns about the vertical, a slender bar pinned through its centre (Kamman, Unit 5, Exercise 5.3).
+    """A shaft that rotates about the vertical, and a slender bar pinned to it at its centre.
+
+    See Kamman, Unit 5, Exercise 5.3.
 
     | parameter | book | meaning |
     |---|---|---|
@@ -62,7 +64,7 @@ class ShaftAndBar(System):
     def motion(self, t, q, u):
         O, S, bar = _shaft_and_bar(self.mass, self.length, q, u["phi_dot", "theta_dot"])
         I = 0.25 * self.shaft_mass * self.shaft_radius**2
-        shaft = Body(self.shaft_mass, (I, I, 2.0 * I), O, S, name="shaft")  # only the last matters: it turns about S.z
+        shaft = Body(self.shaft_mass, (I, I, 2.0 * I), O, S, name="shaft")  # only 2 I has an effect: rotation about S.z
         return Motion((shaft, bar), frames={"S": S})
 
     def loads(self, t, q, u, motion, inputs):
@@ -84,8 +86,8 @@ class LightShaftAndBar(System):
     | `mass`, `length` | m, l | of the bar [kg, m] |
 
     - Coordinates `phi`: the shaft about N.z; `theta`: the bar about the shaft's y axis, from the vertical [rad].
-    - Speeds `omega1`, `omega2`: angular velocity of the bar along its own axes 1 and 2 [rad/s]. They do not give
-      phi_dot = -omega1 / sin(theta) where the bar stands along the shaft.
+    - Speeds `omega1`, `omega2`: angular velocity of the bar along its own axes 1 and 2 [rad/s]. If the bar
+      is parallel to the shaft, phi_dot = -omega1 / sin(theta) is not defined.
     - Inputs `shaft_torque` (M_phi, ground on shaft), `bar_torque` (M_theta, shaft on bar) [N m].
     """
 

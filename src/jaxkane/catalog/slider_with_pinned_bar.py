@@ -19,8 +19,9 @@ from ._entry import entry
     conservative=False,
 )
 class SliderWithPinnedBar(System):
-    """A mass on a horizontal rail, with spring, damper and a driving force, and a slender bar pinned to it
-    (Kamman, Unit 5, Exercise 5.2).
+    """A mass on a horizontal rail with a spring, a damper and a driving force, and a slender bar pinned to the mass.
+
+    See Kamman, Unit 5, Exercise 5.2.
 
     | parameter | book | meaning |
     |---|---|---|
@@ -30,7 +31,8 @@ class SliderWithPinnedBar(System):
     | `stiffness`, `damping` | k, c | of spring [N/m] and damper [N s/m] at the slider; unstretched at x = 0 |
     | `gravity` | g | along -N.y [m/s^2] |
 
-    - Coordinates `x`: the slider along N.x [m]; `theta`: the bar from the downward vertical, about N.z [rad].
+    - Coordinates `x`: position of the slider along N.x [m]; `theta`: angle of the bar from the downward vertical,
+      about N.z [rad].
     - Speeds: their rates [m/s, rad/s].
     - Input `force` (F): on the slider along N.x [N].
     """

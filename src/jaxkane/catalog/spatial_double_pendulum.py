@@ -31,10 +31,11 @@ class SpatialDoublePendulum(System):
     | `I11_2`, `I22_2`, `I33_2` | I^2 | second link, likewise [kg m^2] |
     | `gravity` | g | along -N.y [m/s^2] |
 
-    With I22 = 0 (a line) the speeds omega12, omega22 have no mass and the equations no solution (note 2).
+    With I22 = 0 (a line), no mass moves with the speeds omega12 and omega22, and the equations have no solution (note
+    2).
 
     - Coordinates `theta11`, `theta12`, `theta13` and `theta21`, `theta22`, `theta23`: 3-1-3 angles of the links, both
-      relative to the ground [rad]. At zero a link hangs along -N.y, and its angles lock.
+      relative to the ground [rad]. At zero, a link hangs along -N.y, and its angles are in gimbal lock.
     - Speeds `omega11` ... `omega13`, `omega21` ... `omega23`: angular velocities along the links' own axes [rad/s].
     """
 

@@ -1,4 +1,4 @@
-"""Models that exist already, as systems: of MJCF and URDF files, and of SymPy's mechanics."""
+"""Import of existing models as systems: MJCF and URDF files, and models of SymPy's mechanics."""
 
 from ._mjcf import from_mjcf as from_mjcf
 from ._mjcf import from_urdf as from_urdf

@@ -1,4 +1,4 @@
-"""MJCF and URDF files as mechanisms of joints. MuJoCo compiles them; nothing of it is needed afterwards."""
+"""MJCF and URDF files as mechanisms of joints. MuJoCo compiles them; it is not needed afterwards."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
 from pathlib import Path as FilePath
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -25,24 +26,25 @@ def from_mjcf(
         arm = jk.convert.from_mjcf("arm.xml")
         jk.fit.fit(arm, trials, free=["mass.forearm", "damping.elbow"])
 
+    Supported are bodies; hinge, slide, ball and free joints with damping, stiffness, springref, armature and ref;
+    gravity; sites; actuators on joints whose force is affine in control, length and velocity; `connect`, `weld` and
+    `joint` equalities, as rigid constraints. Other elements are omitted and listed in `left_out`: contacts, limits,
+    friction, tendons, ...
+
     **Arguments:**
 
     - `model`: a path, or the text of a file, which begins with "<".
-    - `strict`: refuse what has no counterpart, instead of leaving it out with a warning.
-    - `dependent`: hinges and sliders that are solved for where loops are closed, as of `jaxkane.joints.mechanism`.
-    - `name`: of the class; by default the model's.
+    - `strict`: raise an exception for unsupported elements, instead of omitting them with a warning.
+    - `dependent`: hinges and sliders that are solved for in closed loops, as in `jaxkane.joints.mechanism`.
+    - `name`: of the class; the model's name by default.
 
-    **Returns:** a `jaxkane.joints.Mechanism` with the names of the file. `qpos` are its coordinates but for the order
-    of the Euler parameters, scalar last here; `qvel` its speeds; `ctrl` its inputs. A dot in a name becomes an
-    underscore; an actuator or a site that has the name of something else gets `_input` or `_site` behind its own.
-    Masses and inertias are those that MuJoCo compiles, of geoms and meshes too.
+    **Returns:** a `jaxkane.joints.Mechanism` with the names of the file. Its coordinates are `qpos`, except for the
+    order of the Euler parameters, which are scalar-last here. Its speeds are `qvel`, its inputs `ctrl`. A dot in a name
+    becomes an underscore. An actuator or a site whose name is already used gets the suffix `_input` or `_site`. Masses
+    and inertias are those that MuJoCo compiles, also from geoms and meshes.
 
-    Taken: bodies, hinge, slide, ball and free joints with damping, stiffness, springref, armature and ref; gravity;
-    sites; actuators on joints whose force is affine in control, length and velocity; `connect`, `weld` and `joint`
-    equalities, as rigid constraints. What is not is listed in `left_out`: contacts, limits, friction, tendons, ...
-
-    **Raises:** `ImportError` without MuJoCo; `ValueError` for a file that MuJoCo does not read, one without a moving
-    body, two names that differ by a dot alone, and with `strict` for what would be left out.
+    **Raises:** `ImportError` without MuJoCo; `ValueError` for a file that MuJoCo cannot read, one without a moving
+    body, two names that differ only by a dot, and with `strict` for unsupported elements.
     """
     mujoco = _mujoco()
     return _ModelReader(mujoco, _compiled(mujoco, model), name).mechanism(strict, dependent)
@@ -57,11 +59,20 @@ def from_urdf(
     dependent: Sequence[str] | None = None,
     name: str | None = None,
 ) -> Mechanism:
-    """The mechanism of a URDF file; links and joints have its names.
+    """The mechanism of a URDF file, with the names of its links and joints.
 
-    `floating`: the root link flies, by a free joint named `root`; by default it is part of the ground. A link without
-    an `inertial` has no mass, whatever its shapes. `mimic` becomes a coupling, joint damping is taken; the rest, the
-    other arguments and the errors are those of `from_mjcf`.
+    A link without an `inertial` has no mass, whatever its shapes. `mimic` becomes a coupling. Joint damping is
+    supported.
+
+    **Arguments:**
+
+    - `floating`: the root link moves freely, by a free joint named `root`. Default: it is fixed to the ground.
+    - `gravity` (3,) [m/s^2]: in the inertial frame.
+    - the others as in `from_mjcf`.
+
+    **Returns:** as `from_mjcf`.
+
+    **Raises:** as `from_mjcf`.
     """
     mujoco = _mujoco()
     text = str(model) if _is_text(model) else FilePath(model).read_text(encoding="utf-8")
@@ -76,7 +87,7 @@ def from_urdf(
     return reader.mechanism(strict, dependent)
 
 
-def _mujoco() -> Any:
+def _mujoco() -> ModuleType:
     try:
         import mujoco  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -90,37 +101,37 @@ def _is_text(model: Path) -> bool:
     return isinstance(model, str) and model.lstrip().startswith("<")
 
 
-def _compiled(mujoco: Any, model: Path) -> Any:
+def _compiled(mujoco: ModuleType, model: Path) -> Any:
     is_text = _is_text(model)
     if not is_text and not os.path.exists(model):
-        raise FileNotFoundError(f"There is no file {os.fspath(model)!r}. The text of a model begins with '<'.")
+        raise FileNotFoundError(f"The file {os.fspath(model)!r} does not exist. The text of a model begins with '<'.")
     try:
         spec = mujoco.MjSpec.from_string(model) if is_text else mujoco.MjSpec.from_file(os.fspath(model))
         spec.compiler.fusestatic = False
         return spec.compile()
     except ValueError as error:
         where = "the text" if is_text else repr(os.fspath(model))
-        raise ValueError(f"MuJoCo does not read {where}: {error}") from error
+        raise ValueError(f"MuJoCo cannot read {where}: {error}") from error
 
 
 def _robot_of(text: str) -> ElementTree.Element:
     try:
         robot = ElementTree.fromstring(re.sub(r"<(/?)\w+:", r"<\1", text))  # extensions with an undeclared prefix
     except ElementTree.ParseError as error:
-        raise ValueError(f"This is no URDF: {error}.") from error
+        raise ValueError(f"The model is not a URDF: {error}.") from error
     if robot.tag != "robot":
-        raise ValueError(f"This is no URDF, whose root is <robot>, but <{robot.tag}>.")
+        raise ValueError(f"The model is not a URDF: its root must be <robot>, got <{robot.tag}>.")
     return robot
 
 
 def _for_mujoco(text: str, floating: bool) -> str:
-    """Shapes go, since URDF's masses do not come from them; the root link gets a joint on the ground."""
+    """Remove shapes, because a URDF's masses do not depend on them, and connect the root link to the ground."""
     robot = _robot_of(text)
     links = [link.get("name", "") for link in robot.findall("link")]
     children = [child.get("link") for child in robot.findall("joint/child")]
     roots = [name for name in links if name not in children]
     if len(roots) != 1:
-        raise ValueError(f"A URDF has one root link; this one has {', '.join(roots) or 'none'}.")
+        raise ValueError(f"A URDF must have one root link; this one has {', '.join(roots) or 'none'}.")
     for part in list(robot):
         if part.tag not in ("link", "joint"):
             robot.remove(part)
@@ -131,7 +142,7 @@ def _for_mujoco(text: str, floating: bool) -> str:
         _turn_back(inertial)
     if floating or roots[0] != "world":
         if "world" in links:
-            why = "is the ground: leave out floating=True" if roots[0] == "world" else "is not the root: rename it"
+            why = "is the ground: omit floating=True" if roots[0] == "world" else "is not the root: rename it"
             raise ValueError(f"The link 'world' of a URDF {why}.")
         ElementTree.SubElement(robot, "link", name="world")
         joint = ElementTree.SubElement(robot, "joint", name="root", type="floating" if floating else "fixed")
@@ -143,7 +154,7 @@ def _for_mujoco(text: str, floating: bool) -> str:
 
 
 def _turn_back(inertial: ElementTree.Element) -> None:
-    """Resolve an inertia along the link's axes: some versions of MuJoCo pass over the angles it is given in."""
+    """Resolve an inertia along the link's axes, because some versions of MuJoCo ignore the angles of its frame."""
     origin, tensor = inertial.find("origin"), inertial.find("inertia")
     angles = [float(x) for x in origin.get("rpy", "0 0 0").split()] if origin is not None else []
     if origin is None or tensor is None or not any(angles):
@@ -173,9 +184,9 @@ def _mimics(robot: ElementTree.Element) -> list[Loop | Coupling]:
 
 
 class _ModelReader:
-    """Reads a compiled model into links, sites, actuators and loops of a mechanism, and lists what is left out."""
+    """Reads a compiled model into links, sites, actuators and loops of a mechanism, and lists omitted elements."""
 
-    def __init__(self, mujoco: Any, model: Any, name: str | None):
+    def __init__(self, mujoco: ModuleType, model: Any, name: str | None):
         self.m, self.kinds = model, mujoco
         self.name = name or _model_name(model) or "Mechanism"
         self.left_out: list[str] = []
@@ -188,14 +199,14 @@ class _ModelReader:
         self.loops: list[Loop | Coupling] = []
 
     def _is_off(self, *flags: str) -> bool:
-        """Whether the model disables one of these; not every version has each."""
+        """Whether the model disables one of these. Not every version has every flag."""
         bits = [int(getattr(self.kinds.mjtDisableBit, f"mjDSBL_{flag}", 0)) for flag in flags]
         return any(int(self.m.opt.disableflags) & bit for bit in bits)
 
     def _names(self, kind: str, n: int) -> list[str]:
-        """The file's names; what has none is numbered, past these.
+        """The file's names. Elements without a name are numbered, without using these names.
 
-        **Raises:** `ValueError` for two names that become one, since either could then stand for the other's part.
+        **Raises:** `ValueError` for two names that become equal, because parts could then not be distinguished.
         """
         given = [getattr(self.m, kind)(i).name for i in range(n)]
         names = [name.replace(".", "_") for name in given]
@@ -203,7 +214,7 @@ class _ModelReader:
             if name and name in names[:i]:
                 raise ValueError(
                     f"{self.name}: the {_PLURALS.get(kind, kind + 's')} {given[names.index(name)]!r} and {given[i]!r} "
-                    f"would both be {name!r}, since a dot becomes an underscore: rename one in the file."
+                    f"would both be {name!r}, because a dot becomes an underscore. Rename one in the file."
                 )
         for i, name in enumerate(names):
             if not name:
@@ -213,7 +224,7 @@ class _ModelReader:
     def mechanism(self, strict: bool, dependent: Sequence[str] | None) -> Mechanism:
         m = self.m
         if not m.nv:
-            raise ValueError(f"{self.name}: the file has no joint, so that nothing moves.")
+            raise ValueError(f"{self.name}: the file has no joint, so nothing can move.")
         links = [self._link(i) for i in range(1, m.nbody)]
         used = {*self.bodies, *(f"{j} joint" for j in self.joints)}
         for i, name in enumerate(_unused_names(self._names("site", m.nsite), used, "_site")):
@@ -228,9 +239,9 @@ class _ModelReader:
             listed = "; ".join(left_out)
             if strict:
                 raise ValueError(
-                    f"{self.name}: these have no counterpart: {listed}. With strict=False they are left out."
+                    f"{self.name}: these elements are not supported: {listed}. Pass strict=False to omit them."
                 )
-            warnings.warn(f"{self.name}: left out, having no counterpart: {listed}.", UserWarning, stacklevel=3)
+            warnings.warn(f"{self.name}: omitted, because not supported: {listed}.", UserWarning, stacklevel=3)
         return mechanism(
             links,
             gravity=self.gravity,
@@ -249,7 +260,8 @@ class _ModelReader:
         m = self.m
         first, count = int(m.body_jntadr[i]), int(m.body_jntnum[i])
         joints = [self._joint(j) for j in range(first, first + count)]
-        is_free = count and m.jnt_type[first] == int(self.kinds.mjtJoint.mjJNT_FREE)  # placed by its coordinates alone
+        # its coordinates determine its position
+        is_free = count and m.jnt_type[first] == int(self.kinds.mjtJoint.mjJNT_FREE)
         moves = m.body_weldid[i] != 0
         mass = float(m.body_mass[i])
         has_mass = moves and (mass > 0.0 or bool(np.any(m.body_inertia[i] > 0.0)))
@@ -281,7 +293,7 @@ class _ModelReader:
             return hinge(name, _floats(m.jnt_axis[j]), anchor=_floats(m.jnt_pos[j]), **common)
         start = place + (3 if kind == int(types.mjJNT_FREE) else 0)
         if common["stiffness"] and not np.allclose(m.qpos_spring[start : start + 4], (1, 0, 0, 0), atol=1e-12):
-            self.left_out.append(f"the stiffness of the joint {name!r}, which rests turned")
+            self.left_out.append(f"the stiffness of the joint {name!r}, whose rest orientation is not the reference")
             common["stiffness"] = 0.0
         if kind == int(types.mjJNT_BALL):
             return ball(name, anchor=_floats(m.jnt_pos[j]), **common)
@@ -319,7 +331,7 @@ class _ModelReader:
             )
 
     def _why_not(self, i: int) -> str:
-        """Why an actuator has no counterpart."""
+        """Why an actuator is not supported."""
         m, kinds = self.m, self.kinds
         joint = int(m.actuator_trnid[i, 0])
         if m.actuator_trntype[i] not in (int(kinds.mjtTrn.mjTRN_JOINT), int(kinds.mjtTrn.mjTRN_JOINTINPARENT)):
@@ -330,7 +342,7 @@ class _ModelReader:
         if of_ball and m.actuator_trntype[i] == int(kinds.mjtTrn.mjTRN_JOINTINPARENT):
             return "which acts on a ball joint along its parent's axes"
         if m.actuator_dyntype[i] != int(kinds.mjtDyn.mjDYN_NONE) or m.actuator_actnum[i]:
-            return "which has a state of its own"
+            return "which has its own state"
         if m.actuator_gaintype[i] != int(kinds.mjtGain.mjGAIN_FIXED):
             return "whose gain is not constant"
         if m.actuator_biastype[i] not in (int(kinds.mjtBias.mjBIAS_NONE), int(kinds.mjtBias.mjBIAS_AFFINE)):
@@ -340,14 +352,15 @@ class _ModelReader:
             return "which feeds back the rotation of a ball joint"
         own_terms = [getattr(m, f"actuator_{what}", None) for what in ("damping", "dampingpoly", "armature", "delay")]
         if any(x is not None and np.any(x[i]) for x in own_terms):
-            return "which has damping, armature or delay of its own"
+            return "which has its own damping, armature or delay"
         return ""
 
     def _read_equalities(self, used: set[str]) -> None:
         m, kinds = self.m, self.kinds.mjtEq
         for i in range(0 if self._is_off("EQUALITY", "CONSTRAINT") else m.neq):
             kind, data = m.eq_type[i], m.eq_data[i]
-            name = m.eq(i).name.replace(".", "_") or f"equality{i}"  # of sites that are made for it
+            # prefix of the names of sites that are added for it
+            name = m.eq(i).name.replace(".", "_") or f"equality{i}"
             if not m.eq_active0[i]:
                 continue
             first, second = int(m.eq_obj1id[i]), int(m.eq_obj2id[i])
@@ -355,13 +368,13 @@ class _ModelReader:
                 self.loops.append(self._coupling(first, second, data))
                 continue
             if kind not in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
-                self.left_out.append(f"the equality {name!r}, which is no connect, weld or joint")
+                self.left_out.append(f"the equality {name!r}, which is not a connect, weld or joint")
                 continue
             rigid = kind == int(kinds.mjEQ_WELD)
             if m.eq_objtype[i] == int(self.kinds.mjtObj.mjOBJ_SITE):
                 self.loops.append(Loop(self.sites[first].name, self.sites[second].name, rigid))
                 continue
-            # connect: anchors in both bodies; weld: the anchor in the second, the pose of it seen from the first
+            # connect: anchors in both bodies; weld: the anchor in the second body, and its pose relative to the first
             ends = (data[3:6], data[0:3]) if rigid else (data[0:3], data[3:6])
             turned = (_euler(data[6:10]), None) if rigid else (None, None)
             names = []
@@ -374,7 +387,10 @@ class _ModelReader:
 
     def _coupling(self, first: int, second: int, data: np.ndarray) -> Coupling:
         m = self.m
-        zero = lambda j: float(m.qpos0[m.jnt_qposadr[j]])  # noqa: E731
+
+        def zero(j: int) -> float:
+            return float(m.qpos0[m.jnt_qposadr[j]])
+
         if second < 0:
             return Coupling(self.joints[first], None, (zero(first) + float(data[0]),))
         # q1 - zero1 = p(q2 - zero2)
@@ -385,28 +401,33 @@ class _ModelReader:
     def _left_out_effects(self) -> Iterator[str]:
         m = self.m
         collides = np.any(m.geom_contype != 0) and np.any(m.geom_conaffinity != 0)
-        off = lambda flag: self._is_off(flag, "CONSTRAINT")  # noqa: E731
-        has = lambda name: bool(np.any(getattr(m, name, 0)))  # noqa: E731 (older versions lack some)
+
+        def off(flag: str) -> bool:
+            return self._is_off(flag, "CONSTRAINT")
+
+        def has(name: str) -> bool:
+            return bool(np.any(getattr(m, name, 0)))  # older versions do not have every attribute
+
         effects = {
             "contacts": (collides or m.npair > 0) and not off("CONTACT"),
             "limits of joints": has("jnt_limited") and not off("LIMIT"),
             "friction of joints": has("dof_frictionloss") and not off("FRICTIONLOSS"),
             "limits of controls and forces": has("jnt_actfrclimited") and m.nu > 0,
             "tendons": m.ntendon > 0,
-            "damping or stiffness that is not linear": any(has(n) for n in ("dof_dampingpoly", "jnt_stiffnesspoly")),
-            "springs that yield": getattr(m, "nplastic", 0) > 0,
+            "nonlinear damping or stiffness": any(has(n) for n in ("dof_dampingpoly", "jnt_stiffnesspoly")),
+            "plastic springs": getattr(m, "nplastic", 0) > 0,
             "drag and lift of a medium": m.opt.density > 0 or m.opt.viscosity > 0,
             "gravity compensation": has("body_gravcomp"),
             "flexible bodies": m.nflex > 0,
             "plugins": m.nplugin > 0,
-            "bodies moved by hand (mocap), which rest": m.nmocap > 0,
+            "motion of mocap bodies": m.nmocap > 0,
         }
         return (effect for effect, is_present in effects.items() if is_present)
 
 
 def _model_name(model: Any) -> str:
     name = bytes(model.names[:200]).split(b"\0", 1)[0].decode("utf-8", "replace")
-    return "" if name == "MuJoCo Model" else name  # which is that of a file without one
+    return "" if name == "MuJoCo Model" else name  # the name of a file without a name
 
 
 def _unused_name(name: str, used: Any, ending: str) -> str:
@@ -416,7 +437,7 @@ def _unused_name(name: str, used: Any, ending: str) -> str:
 
 
 def _unused_names(names: Sequence[str], used: Any, ending: str) -> list[str]:
-    """The names, those of something else with an ending that makes them names of nothing."""
+    """The names; a name that is already used gets a suffix that makes it unique."""
     return [_unused_name(name + ending, {*used, *names}, ending) if name in used else name for name in names]
 
 
@@ -428,13 +449,14 @@ def _floats(values: Any) -> tuple[float, ...]:
 
 
 def _euler(quaternion: Any) -> tuple[float, ...]:
-    """Scalar last, as everywhere here; MuJoCo has it first."""
+    """Euler parameters, scalar last; MuJoCo has the scalar first."""
     w, x, y, z = _floats(quaternion)
     return (x, y, z, w)
 
 
 def _inertia(moments: Any, quaternion: Any) -> list[list[float]]:
-    """Principal moments in turned axes, along the body's; what is zero but for rounding is zero."""
+    """Inertia along the body's axes, from principal moments in rotated axes. Entries within rounding of zero are
+    zero."""
     w, v = float(quaternion[0]), np.asarray(quaternion[1:], float)
     cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     R = np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross

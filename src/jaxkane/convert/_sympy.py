@@ -1,4 +1,4 @@
-"""SymPy's mechanics as a system: its bodies, loads and constraints. Derives nothing."""
+"""A model of SymPy's mechanics as a system: its bodies, loads and constraints. Does not derive equations."""
 
 from __future__ import annotations
 
@@ -37,33 +37,33 @@ def from_sympy(
 
     **Arguments:**
 
-    - `model`: a `KanesMethod`, a `System`, or a `LagrangesMethod`. Its bodies and loads are those that it was given,
-        or that `kanes_equations` was called with; no equations need have been formed. A Lagrangian without `bodies`
-        gives the motion, and neither points nor frames.
-    - `parameters`: a number for every constant symbol, by symbol or by its name. They become the system's parameters.
-    - `origin`: the point from which positions count, for `jk.positions` and pictures; of a `System` its fixed point.
-        Without one velocities are known, and no positions.
-    - `dependent`: of a `LagrangesMethod` with constraints, the names of the coordinates that these determine.
+    - `model`: a `KanesMethod`, a `System`, or a `LagrangesMethod`. Its bodies and loads are used, or those that were
+        passed to `kanes_equations`. Its equations need not have been formed. A Lagrangian without `bodies` gives the
+        motion, but neither points nor frames.
+    - `parameters`: a number for each constant symbol, by symbol or by name. They become the system's parameters.
+    - `origin`: the point from which positions are measured, for `jk.positions` and animations. Default: the fixed point
+        of a `System`; for other models positions are then not available.
+    - `dependent`: for a `LagrangesMethod` with constraints, the names of the coordinates that these determine.
     - `name`: of its class.
 
-    **Returns:** a `System`. Coordinates and speeds have the names of the dynamic symbols, those of Lagrange's
-    equations `q_dot` behind a coordinate `q`; other functions of time in the loads are its inputs. Dependent
+    **Returns:** a `System`. Coordinates and speeds have the names of the dynamic symbols. The speeds of Lagrange's
+    equations are named `q_dot` for a coordinate `q`. Other functions of time in the loads are inputs. Dependent
     coordinates and speeds, auxiliary speeds and constraints are the model's.
 
-    What a model does not say cannot be had: positions without an origin, units, and constraint forces other than at
-    the points and frames that it names. Of a Lagrangian without bodies none of these is known, and the kinetic energy
-    is 1/2 u.M u; a mass matrix that is not positive definite gives NaN.
+    Information that the model does not contain is not available: positions without an origin, units, and constraint
+    forces except at named points and frames. For a Lagrangian without bodies none of these is available. Its kinetic
+    energy is 1/2 u.M u; a mass matrix that is not positive definite gives NaN.
 
-    **Raises:** `ImportError` without SymPy; `TypeError` for another kind of model; `ValueError` that names a symbol
-    without a value or a value without a symbol, a KanesMethod without bodies, a point without a velocity, a function of
-    time in the motion that is neither coordinate nor speed, and a Lagrangian that is not quadratic in the rates.
+    **Raises:** `ImportError` without SymPy; `TypeError` for another kind of model. `ValueError` for a symbol without a
+    value or a value without a symbol, a KanesMethod without bodies, and a point without a velocity. Also for a function
+    of time in the motion that is neither coordinate nor speed, and a Lagrangian that is not quadratic in the rates.
     """
     sympy = imported()
     data = model_data(sympy, model, as_names(dependent), name)
     if origin is not None and not data.bodies:
         raise ValueError(
-            f"{name}: positions from {origin} cannot be had, since this Lagrangian has no bodies. Leave `origin` out; "
-            "or give what moves, LagrangesMethod(L, qs, bodies=bodies, frame=N, ...)."
+            f"{name}: positions from {origin} are not available, because this Lagrangian has no bodies. Omit `origin`, "
+            "or pass the bodies: LagrangesMethod(L, qs, bodies=bodies, frame=N, ...)."
         )
     extractor = Extractor(sympy, data, origin if origin is not None else data.origin)
     model = extractor.model()
@@ -76,29 +76,29 @@ def _values(extractor: Extractor, model: ExtractedModel, parameters: Mapping[Any
     names = [str(symbol) for symbol in model.constants]
     missing = [name for name in names if name not in numbers]
     if missing:
-        raise ValueError(f"{model.name}: no value for {', '.join(missing)}: `parameters` gives every symbol a number.")
+        raise ValueError(f"{model.name}: no value for {', '.join(missing)}. `parameters` needs a number per symbol.")
     unknown = [name for name in numbers if name not in names]
     if unknown:
         raise ValueError(f"{model.name} has no symbol {unknown[0]!r}; {hint(unknown[0], names, 'it has')}")
     reserved = [name for name in names if hasattr(SympySystem, name) or "." in name]
     if reserved:
         raise ValueError(
-            f"{model.name}: a parameter cannot be called {reserved[0]!r}, which a system has, or which holds a dot: "
-            "give the symbol another name, by `subs` before."
+            f"{model.name}: {reserved[0]!r} cannot be the name of a parameter, because it is an attribute of systems "
+            "or contains a dot. Rename the symbol in the SymPy model, e.g. with `subs`."
         )
     basic = extractor.sympy.Basic
     return {name: float(numbers[name]) if isinstance(numbers[name], basic) else numbers[name] for name in names}
 
 
 class _SympyMotion(Motion):
-    """A motion with the frames and points of the model by their number, and massless bodies for its torques."""
+    """A motion with the model's frames and points by index, and massless bodies on which its torques act."""
 
     __slots__ = ("along_speeds", "model_frames", "model_points", "under_torque")
 
     model_frames: list[Frame]
     model_points: list[Point]
-    under_torque: list[Any]  # a Body for each load; None where it is a force
-    along_speeds: list[Body]  # which turn at the rate of one speed alone: a torque on them is a force along that speed
+    under_torque: list[Any]  # a Body for each load; None for a force
+    along_speeds: list[Body]  # each rotates at the rate of one speed: a torque on it is a force along this speed
 
 
 class SympySystem(System):
@@ -155,7 +155,10 @@ class SympySystem(System):
         named = {x.name: point for x, point in zip(model.points, points, strict=True) if x.name not in body_names}
         motion = _SympyMotion(bodies, [values[i] for i in model.residuals], points=named)
         motion.model_frames, motion.model_points = frames, points
-        carrier = lambda omega: Body(0.0, 0.0, bodies[0].center, N, omega, "what the torque acts on")  # noqa: E731
+
+        def carrier(omega: Vector) -> Body:
+            return Body(0.0, 0.0, bodies[0].center, N, omega, "body under a torque")
+
         motion.under_torque = [
             carrier(_vector(frames, values, load.angular_velocity)) if load.point is None else None
             for load in model.loads
@@ -183,17 +186,17 @@ class SympySystem(System):
         return loads
 
     def _inertia_velocities(self, values: Sequence[Any], u: Any) -> list[Component]:
-        """w = C^T u of M = C C^T: the velocities of particles of mass 1 that have this inertia.
+        """w = C^T u of M = C C^T: the velocities of particles of mass 1 with this inertia.
 
-        With them the left side of Lagrange's equations in momentum form is that of n such particles, and of forces
-        along the speeds: Kane's method gives C dw/dt, and d/dt (C w) = C dw/dt + dC/dt w.
+        Kane's method gives C dw/dt for these n particles. With forces along the speeds this becomes the left side of
+        Lagrange's equations in momentum form, because d/dt (C w) = C dw/dt + dC/dt w.
         """
         M = _rows(values, self._model.inertia)
         C, _ = _cholesky(M, [[0.0] * len(row) for row in M])
         return [dot([row[i] for row in C[i:]], list(u)[i : len(C)]) for i in range(len(C))]
 
 
-Rows = Sequence[Sequence[Component]]  # of a lower triangle
+Rows = Sequence[Sequence[Component]]  # of a lower triangular matrix
 
 
 def _rows(values: Sequence[Any], rows: Sequence[Sequence[int]]) -> list[list[Component]]:
@@ -205,7 +208,7 @@ def _exact(x: Any) -> Component:
 
 
 def _vector(frames: Sequence[Frame], values: Sequence[Any], model: ExtractedVector) -> Vector:
-    # What is zero now is not dropped: the frame in which a vector stands may not depend on the speeds.
+    # Zero components are not dropped: the frame of a vector must not depend on the values of the speeds.
     parts = [frames[frame].vector(*(_exact(values[i]) for i in places)) for frame, places in model]
     return functools.reduce(operator.add, parts) if parts else frames[0].vector(*ZERO3)
 
@@ -224,7 +227,10 @@ def class_of(model: ExtractedModel) -> type[System]:
     of_parameters: dict[str, Any] = {}
     for symbol in model.constants:
         of_parameters[str(symbol)] = parameter(positive=bool(symbol.is_positive))
-    names = lambda symbols: tuple(name_of(x) for x in symbols)  # noqa: E731
+
+    def names(symbols: Sequence[Any]) -> tuple[str, ...]:
+        return tuple(name_of(x) for x in symbols)
+
     members: dict[str, Any] = {
         "__module__": __name__,
         "__doc__": "A model of SymPy.",
@@ -243,7 +249,7 @@ def class_of(model: ExtractedModel) -> type[System]:
 
 
 def _cholesky(M: Rows, M_dot: Rows) -> tuple[list[list[Component]], list[list[Component]]]:
-    """C of M = C C^T and dC/dt, lower triangles; exact zeros stay exact. NaN for what is not positive definite."""
+    """C of M = C C^T and dC/dt, lower triangular; exact zeros stay exact. NaN if M is not positive definite."""
     C: list[list[Component]] = []
     C_dot: list[list[Component]] = []
     for i, (row, row_dot) in enumerate(zip(M, M_dot, strict=True)):

@@ -1,17 +1,18 @@
-"""Expressions of a SymPy model, each once, and how they are put together; and expressions as functions of numbers."""
+"""Expressions of a SymPy model, each stored once, their use in the model, and expressions as functions of numbers."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from .._scalarjit.components import Component, add, mul
-from ._sympy_model import ModelData
+from ._sympy_model import ModelData, SymPyObject
 
-ExtractedVector = tuple[tuple[int, tuple[int, int, int]], ...]  # (frame, places of three expressions), summed
+ExtractedVector = tuple[tuple[int, tuple[int, int, int]], ...]  # (frame, indices of three expressions), summed
 
 
 class ExtractedPoint(NamedTuple):
@@ -23,8 +24,8 @@ class ExtractedPoint(NamedTuple):
 class ExtractedBody(NamedTuple):
     name: str
     mass: int
-    inertia: tuple[int, ...]  # nine, or none for a particle
-    frame: int  # in which the inertia stands
+    inertia: tuple[int, ...]  # nine indices, or none for a particle
+    frame: int  # index of the frame of the inertia
     point: int
     angular_velocity: ExtractedVector
 
@@ -36,7 +37,7 @@ class ExtractedLoad(NamedTuple):
 
 
 class ExtractedModel(NamedTuple):
-    """All of a model: hashable, so that one model has one class. Expressions are referred to by their place."""
+    """A whole model. It is hashable, so that one model has one class. Expressions are stored by their index."""
 
     name: str
     q: tuple[Any, ...]
@@ -57,14 +58,14 @@ class ExtractedModel(NamedTuple):
     bodies: tuple[ExtractedBody, ...]
     loads: tuple[ExtractedLoad, ...]
     forces: tuple[int, ...]
-    inertia: tuple[tuple[int, ...], ...]  # rows of M, of a model without bodies
+    inertia: tuple[tuple[int, ...], ...]  # rows of M, for a model without bodies
     inertia_rates: tuple[tuple[int, ...], ...]
 
 
 class Extractor:
     """Extracts the expressions of a model, each once."""
 
-    def __init__(self, sympy: Any, data: ModelData, origin: Any):
+    def __init__(self, sympy: ModuleType, data: ModelData, origin: Any):
         self.sympy, self.data, self.origin = sympy, data, origin
         self.t = sympy.physics.mechanics.dynamicsymbols._t
         self.of_motion: dict[Any, int] = {}
@@ -76,9 +77,12 @@ class Extractor:
 
     def model(self) -> ExtractedModel:
         data, place = self.data, self._place
-        in_loads = lambda x: place(x, self.of_loads)  # noqa: E731
+
+        def in_loads(x: SymPyObject) -> int:
+            return place(x, self.of_loads)
+
         parts = {
-            # What rests in the inertial frame, as the ground that carries the joints, has no part in the motion.
+            # Bodies at rest in the inertial frame, such as the ground, do not affect the motion.
             "bodies": tuple(self._body(body) for body in data.bodies if not self._rests(body)),
             "loads": tuple(self._load(load) for load in data.loads if not self._rests(load[0])),
             "rates": tuple(place(data.rates[c.diff(self.t)]) for c in data.q),
@@ -107,7 +111,7 @@ class Extractor:
         )
 
     def _place(self, expression: Any, among: dict[Any, int] | None = None) -> int:
-        """The place of an expression, with the rates of coordinates in terms of the speeds."""
+        """The index of an expression, in which rates of coordinates are replaced by speeds."""
         among = self.of_motion if among is None else among
         expression = self.sympy.physics.mechanics.msubs(self.sympy.sympify(expression), self.data.rates)
         return among.setdefault(expression, len(among))
@@ -116,23 +120,23 @@ class Extractor:
         parts = [] if vector == 0 else vector.args
         return tuple((self._frame(frame), tuple(self._place(x, among) for x in column)) for column, frame in parts)  # type: ignore
 
-    def _frame(self, frame: Any) -> int:
+    def _frame(self, frame: SymPyObject) -> int:
         if frame not in self.frames:
             self.frames[frame] = len(self.frames)
-            self.extracted_frames.append(("", (), ()))  # keeps its place while its angular velocity is extracted
+            self.extracted_frames.append(("", (), ()))  # reserves its index while its angular velocity is extracted
             matrix = self._evaluated(lambda: frame.dcm(self.data.N), frame, "no orientation in the inertial frame")
             extracted = frame.name, tuple(self._place(x) for x in matrix), self._vector(self._omega(frame))
             self.extracted_frames[self.frames[frame] - 1] = extracted
         return self.frames[frame]
 
-    def _omega(self, frame: Any) -> Any:
+    def _omega(self, frame: SymPyObject) -> SymPyObject:
         fault = "no angular velocity in the inertial frame"
         return self._evaluated(lambda: frame.ang_vel_in(self.data.N), frame, fault)
 
-    def _velocity(self, point: Any) -> Any:
+    def _velocity(self, point: SymPyObject) -> SymPyObject:
         return self._evaluated(lambda: point.vel(self.data.N), point, "no velocity in the inertial frame")
 
-    def _evaluated(self, quantity: Any, part: Any, fault: str) -> Any:
+    def _evaluated(self, quantity: SymPyObject, part: Any, fault: str) -> SymPyObject:
         try:
             return quantity()
         except ValueError as error:
@@ -146,7 +150,7 @@ class Extractor:
             frame = part
         return (point is None or self._velocity(point) == 0) and (frame is None or self._omega(frame) == 0)
 
-    def _point(self, point: Any) -> int:
+    def _point(self, point: SymPyObject) -> int:
         if point not in self.points:
             self.points[point] = len(self.points)
             velocity, position = self._velocity(point), None
@@ -161,7 +165,7 @@ class Extractor:
             return ExtractedBody(body.name, self._place(body.mass), (), 0, self._point(body.point), ())
         inertia = body.central_inertia
         frames = {unit.args[0][1] for _, *units in inertia.args for unit in units} if inertia != 0 else set()
-        # where it stands as written it is constant, as of a disk in a frame that does not spin with it
+        # constant in the frame in which it is written, e.g. of a disk in a frame that does not spin with it
         frame = frames.pop() if len(frames) == 1 else body.frame
         matrix = inertia.to_matrix(frame) if inertia != 0 else self.sympy.zeros(3)
         places = tuple(self._place(x) for x in matrix)
@@ -176,13 +180,16 @@ class Extractor:
         return ExtractedLoad(self._point(part), (), self._vector(vector, self.of_loads))
 
     def _symbols(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """Inputs, and constants, in the order of their names."""
+        """Inputs and constants, sorted by name."""
         data, name = self.data, self.data.name
         known = {*data.q, *data.u, *data.u_dep, *data.u_aux}
-        atoms = lambda kind, among: {x for e in among for x in e.atoms(*kind)}  # noqa: E731
+
+        def atoms(kind: Sequence[Any], among: Iterable[Any]) -> set[Any]:
+            return {x for e in among for x in e.atoms(*kind)}
+
         derivatives = atoms([self.sympy.Derivative], (*self.of_motion, *self.of_loads))
         if derivatives:
-            raise ValueError(f"{name}: {_listed(derivatives)} follows from no kinematic equation of the model.")
+            raise ValueError(f"{name}: no kinematic equation of the model determines {_listed(derivatives)}.")
         applied = self.sympy.core.function.AppliedUndef
         unknown = {
             x.func.__name__
@@ -190,29 +197,28 @@ class Extractor:
             if not isinstance(x, applied) and x.func.__name__ not in (*FUNCTIONS, "Piecewise")
         }
         if unknown:
-            raise ValueError(f"{name}: {_listed(unknown)} has no counterpart here: write it by other functions.")
+            raise ValueError(f"{name}: {_listed(unknown)} is not supported. Use other functions.")
         undeclared = atoms([applied], self.of_motion) - known
         if undeclared:
             raise ValueError(
-                f"{name}: {_listed(undeclared)} in the motion is neither coordinate nor speed. What is prescribed in "
-                "time "
-                "is written as an expression of time; an input stands in loads alone."
+                f"{name}: {_listed(undeclared)} in the motion is neither a coordinate nor a speed. Write a prescribed "
+                "motion as an expression of time. Inputs can occur in loads only."
             )
         inputs = sorted(atoms([applied], self.of_loads) - known, key=str)
         odd = [x for x in inputs if tuple(x.args) != (self.t,)]
         if odd:
-            raise ValueError(f"{name}: {_listed(odd)} is a function of something else than time.")
+            raise ValueError(f"{name}: {_listed(odd)} must be a function of time only.")
         symbols = {x for e in (*self.of_motion, *self.of_loads) for x in e.free_symbols} - {self.t}
         names = [str(x) for x in symbols]
         twice = {name for name in names if names.count(name) > 1}
         if twice:
             raise ValueError(
-                f"{name}: two symbols are called {_listed(twice)}, with other assumptions (as positive=True): make one."
+                f"{name}: two symbols named {_listed(twice)} have different assumptions, e.g. positive=True. Use one."
             )
         return tuple(inputs), tuple(sorted(symbols, key=str))
 
 
-def name_of(x: Any) -> str:
+def name_of(x: SymPyObject) -> str:
     return str(getattr(x, "func", x)) if getattr(x, "args", ()) else str(x)
 
 
@@ -220,7 +226,7 @@ def _listed(things: Any) -> str:
     return ", ".join(sorted(map(str, things)))
 
 
-def imported() -> Any:
+def imported() -> ModuleType:
     try:
         import sympy  # pyright: ignore[reportMissingImports]
         import sympy.physics.mechanics  # pyright: ignore[reportMissingImports]
@@ -263,41 +269,41 @@ def function(arguments: Sequence[Any], expressions: Sequence[Any]) -> Any:
 
 @functools.cache
 def _printer() -> Any:
-    """Expressions as Python. Sums and products are functions that drop exact zeros: the method asks for velocities
-    along one speed, where all others are exactly zero. Integer powers stay integer."""
+    """A printer of Python code. Sums and products are functions that drop exact zeros, because velocities are evaluated
+    along one speed while all others are exactly zero. Integer powers stay integer."""
     from sympy.printing.pycode import PythonCodePrinter  # pyright: ignore[reportMissingImports]
 
     class Printer(PythonCodePrinter):
-        def call(self, name: str, expr: Any) -> str:
+        def call(self, name: str, expr: SymPyObject) -> str:
             return f"{name}({', '.join(self._print(x) for x in expr.args)})"
 
-        def _print_Add(self, expr: Any, order: Any = None) -> str:
+        def _print_Add(self, expr: SymPyObject, order: Any = None) -> str:
             return self.call("_sum", expr)
 
-        def _print_Mul(self, expr: Any) -> str:
+        def _print_Mul(self, expr: SymPyObject) -> str:
             return self.call("_product", expr)
 
-        def _print_Integer(self, expr: Any) -> str:
-            return repr(float(expr))  # exact ones and zeros are dropped where they are floats
+        def _print_Integer(self, expr: SymPyObject) -> str:
+            return repr(float(expr))  # as floats, exact ones and zeros can be dropped
 
         _print_One = _print_Zero = _print_NegativeOne = _print_Integer
 
-        def _print_Pow(self, expr: Any, rational: bool = False) -> str:
+        def _print_Pow(self, expr: SymPyObject, rational: bool = False) -> str:
             base, exponent = (self._print(x) for x in expr.args)
             if expr.exp.is_Integer:
                 return f"({base})**({int(expr.exp)})"
             return f"sqrt({base})" if expr.exp == imported().S.Half else f"({base})**({exponent})"
 
-        def _print_And(self, expr: Any) -> str:
+        def _print_And(self, expr: SymPyObject) -> str:
             return self.call("_both", expr)
 
-        def _print_Or(self, expr: Any) -> str:
+        def _print_Or(self, expr: SymPyObject) -> str:
             return self.call("_either", expr)
 
-        def _print_Not(self, expr: Any) -> str:
+        def _print_Not(self, expr: SymPyObject) -> str:
             return self.call("_not", expr)
 
-        def _print_Piecewise(self, expr: Any) -> str:
+        def _print_Piecewise(self, expr: SymPyObject) -> str:
             value = "nan"
             for x, condition in reversed(expr.args):
                 if condition is imported().true:
@@ -306,7 +312,7 @@ def _printer() -> Any:
                     value = f"_where({self._print(condition)}, {self._print(x)}, {value})"
             return value
 
-        def _print_known(self, expr: Any) -> str:
+        def _print_known(self, expr: SymPyObject) -> str:
             return self.call(expr.func.__name__, expr)
 
     for name in FUNCTIONS:

@@ -1,4 +1,5 @@
-"""Measured motion of six real machines, shipped with the library: trials to fit, and what their makers say of them."""
+"""Measured data of six real machines, shipped with the library: trials to fit, and the parameters that their authors
+report."""
 
 from ._recordings import Recording as Recording
 from ._recordings import davis_rider as davis_rider

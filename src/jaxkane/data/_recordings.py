@@ -1,8 +1,8 @@
-"""Measured data sets, one function each, with their units and their licences.
+"""Measured data sets, one function each, with their units and licences.
 
-Channels have the names that a description will give its coordinates and speeds, so that a trial can be fitted as it is.
-Each function takes `file`: a CSV file with the same columns, plain or compressed by gzip, in the place of the one that
-is shipped, for other runs of the same machine.
+Channels have the names of the coordinates and speeds of the corresponding system, so that a trial can be fitted
+directly. Each function takes `file`: a CSV file with the same columns, plain or compressed by gzip, e.g. other runs of
+the same machine. Default: the shipped file.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .._common.lookup import as_names, refuse_unknown
-from ..fit import Trial, read_trials
+from ..fit import Trial
 
 File = str | os.PathLike[str] | None
 
@@ -27,9 +27,9 @@ File = str | os.PathLike[str] | None
 class Recording:
     """Trials of a machine, in the order of the file.
 
-    - `trials`: what was measured, with standard deviations by which a fit may start to weigh it.
-    - `parameters`: what the makers say of the machine, by name [SI units]; empty where they say nothing.
-    - `licence`: whose the data are, where they are from, what was changed, and on which terms they may be used.
+    - `trials`: the measurements, with standard deviations as initial weights of a fit.
+    - `parameters`: values that the authors report, by name [SI units]; empty if they report none.
+    - `licence`: owner, source, changes and terms of use of the data.
     """
 
     trials: tuple[Trial, ...]
@@ -43,21 +43,27 @@ class Recording:
 
 
 def multi_arm_pendulum(arms: Literal[1, 2, 3] = 1, *, file: File = None) -> Recording:
-    """Free swings of a pendulum with one, two or three arms on a fixed clamp (Kaheman et al. 2022, arXiv 2205.06231).
+    """Free oscillations of a pendulum with one, two or three arms on a fixed clamp (Kaheman et al. 2022, arXiv
+    2205.06231).
 
-    Channels `angle1`, ... [rad], each from the upright vertical, hanging is pi; 200 Hz, of encoders. `rate1`, ...
-    [rad/s] begin the trials: they were filtered by the authors and are no sensors of their own. The trials follow one
-    another without a gap: the motion decays from each to the next.
+    Channels `angle1`, ... [rad], each from the upright vertical (pi is hanging); 200 Hz, from encoders. `rate1`, ...
+    [rad/s] are initial values of the trials. The authors computed them by filtering; they are not measured by separate
+    sensors. The trials follow one another without a gap: the oscillation decays from each to the next.
 
     `parameters`: the authors' estimates: masses `m1`, ..., mass centres `a1`, ... from the upper joint, lengths `L1`,
     ..., central inertias `I1`, ..., viscous friction `k1`, ... [N m s/rad]. Those of the single arm do not reproduce
     its motion.
 
+    **Arguments:**
+
+    - `arms`: 1, 2 or 3.
+    - `file`: another CSV file with the same columns.
+
     **Raises:** `ValueError` for another number of arms.
     """
     names = {1: "single", 2: "double", 3: "triple"}
     if arms not in names:
-        raise ValueError(f"The pendulum has been recorded with 1, 2 and 3 arms, not with {arms}.")
+        raise ValueError(f"multi_arm_pendulum: `arms` must be 1, 2 or 3; got {arms}.")
     angles, rates = ([f"{what}{i + 1}" for i in range(arms)] for what in ("angle", "rate"))
     return _recording(
         "multi_arm_pendulum",
@@ -73,13 +79,17 @@ def multi_arm_pendulum(arms: Literal[1, 2, 3] = 1, *, file: File = None) -> Reco
 def driven_double_pendulum(torque: Literal["measured", "commanded"] = "measured", *, file: File = None) -> Recording:
     """A double pendulum with geared motors at shoulder and elbow, driven without feedback (DFKI, 2022); five runs.
 
-    Channels `angle1` [rad] from hanging, `angle2` [rad] relative to the first link; their step is 3.8e-4 rad. Inputs
-    `torque1`, `torque2` [N m] after the gear, along the angles: the drive's estimate from its current ("measured"), or
-    what was asked for. The rates [rad/s] from which windows begin are slopes of cubics through 50 ms of the angles.
-    Times are irregular, about 2 ms apart. No model explains the run sysid_00.
+    Channels `angle1` [rad] from hanging, `angle2` [rad] relative to the first link; their resolution is 3.8e-4 rad.
+    Inputs `torque1`, `torque2` [N m] after the gear, along the angles. The initial rates [rad/s] of windows are slopes
+    of cubics through 50 ms of the angles. Times are irregular, about 2 ms apart. No model explains the run sysid_00.
 
-    `parameters`: two sets of the authors, by name; their I1, I2 are about the joints, `Ir` is a rotor's before the gear
-    `gr`, friction is b rate + cf arctan(100 rate).
+    `parameters`: two sets of the authors, by name. Their I1, I2 are about the joints, `Ir` is a rotor's inertia before
+    the gear `gr`, friction is b rate + cf arctan(100 rate).
+
+    **Arguments:**
+
+    - `torque`: "measured" (the drive's estimate from its current) or "commanded".
+    - `file`: another CSV file with the same columns.
     """
     columns = {"measured": "torque_measured", "commanded": "torque_command"}
     refuse_unknown([torque], list(columns), "driven_double_pendulum: no torque")
@@ -96,15 +106,21 @@ def driven_double_pendulum(torque: Literal["measured", "commanded"] = "measured"
 
 
 def steer_by_wire(*, seconds: float = 1.0, file: File = None) -> Recording:
-    """A riderless steer-by-wire bicycle on a treadmill, pushed and left to its controller (TU Delft); 31 rides.
+    """A riderless steer-by-wire bicycle on a treadmill, pushed and then balanced by its controller (TU Delft); 31
+    rides.
 
-    Channels `roll`, `steer` [rad], `roll_rate`, `steer_rate` [rad/s], 100 Hz; roll is the estimate of a filter on the
-    bicycle. Input `steer_torque` [N m]: the motor's command, kept until the next: a
-    zero-order hold, `fit(..., zero_order_hold=("steer_torque",))`.
-    `initial["speed"]`: the treadmill's [m/s]. The first `seconds` of each ride are taken; its authors use one.
+    Channels `roll`, `steer` [rad], `roll_rate`, `steer_rate` [rad/s], 100 Hz; the roll is estimated by a filter on the
+    bicycle. Input `steer_torque` [N m]: the motor's command, a zero-order hold: `fit(...,
+    zero_order_hold=("steer_torque",))`. `initial["speed"]`: the treadmill's [m/s].
 
     `parameters`: in Meijaard's names, for `WhippleBicycle.from_parameters`. Masses, lengths and the wheels' inertias
-    were measured, the rest is guessed; `IByy`, `IHyy`, which its authors do not have, are 2.0 and 0.01 kg m^2.
+    were measured, the others are guesses. The authors do not report `IByy` and `IHyy`; these are 2.0 and 0.01 kg m^2
+    here.
+
+    **Arguments:**
+
+    - `seconds`: the duration [s] that is used of each ride, from its start; the authors use one.
+    - `file`: another CSV file with the same columns.
     """
     recording = _recording(
         "steer_by_wire",
@@ -120,15 +136,20 @@ def steer_by_wire(*, seconds: float = 1.0, file: File = None) -> Recording:
 
 
 def robot_bicycle(channels: Sequence[str] = ("steer", "roll_rate"), *, file: File = None) -> Recording:
-    """A riderless bicycle that balances by its own controller (D. L. Peterson, UC Davis, 2013); four runs, 200 Hz.
+    """A riderless bicycle that its own controller balances (D. L. Peterson, UC Davis, 2013); four runs, 200 Hz.
 
-    `channels`, of these: `steer` [rad], `steer_rate`, `rear_wheel_rate` [rad/s] (which lag: they were filtered),
-    `rear_wheel_angle` [rad]; `roll_rate` [rad/s], the gyroscope along the rear frame's horizontal axis; `gyro_y`,
-    `gyro_z`, `acc_x`, `acc_y`, `acc_z` [m/s^2], specific force in axes that pitch leaves horizontal, at a place that is
-    written nowhere. The roll angle was not measured. Inputs `steer_torque`, `drive_torque` [N m]: commands.
+    The roll angle was not measured. Inputs `steer_torque`, `drive_torque` [N m]: commands.
 
-    `parameters`: in Meijaard's names, from measured gyrostat parameters. Its author calls the data unfit to find
-    values.
+    `parameters`: in Meijaard's names, from measured gyrostat parameters. The author considers the data unsuitable for
+    parameter estimation.
+
+    **Arguments:**
+
+    - `channels`, of these: `steer` [rad], `steer_rate`, `rear_wheel_rate` [rad/s] (filtered, with a lag),
+        `rear_wheel_angle` [rad]; `roll_rate` [rad/s], the gyroscope along the rear frame's horizontal axis; `gyro_y`,
+        `gyro_z` [rad/s]; `acc_x`, `acc_y`, `acc_z` [m/s^2], specific force in axes that remain horizontal under pitch,
+        at an undocumented position.
+    - `file`: another CSV file with the same columns.
     """
     every = {
         "steer": ("steer_angle", 0.01),
@@ -154,15 +175,20 @@ def robot_bicycle(channels: Sequence[str] = ("steer", "roll_rate"), *, file: Fil
 
 
 def davis_rider(*, file: File = None) -> Recording:
-    """A rider who only steers, pulled sideways five times, on a treadmill (J. K. Moore, UC Davis, 2012); 40 s, 200 Hz.
+    """A rider who controls only the steering, pulled sideways five times, on a treadmill (J. K. Moore, UC Davis, 2012);
+    40 s, 200 Hz.
 
-    Channels `roll`, `steer` [rad], `roll_rate`, `steer_rate` [rad/s]. Inputs `steer_torque` [N m], by the rider on the
-    fork, and `lateral_force` [N], positive to the right, below the seat: a torque of 0.943 m times the force about the
-    line of contact, and of 0.011 m times the force about the steering axis. `initial["speed"]`: the median [m/s], since
-    the recorded one has spikes. The bicycle falls without its rider: fit it in windows of a second.
+    Channels `roll`, `steer` [rad], `roll_rate`, `steer_rate` [rad/s]. Input `steer_torque` [N m]: by the rider on the
+    fork. Input `lateral_force` [N]: positive to the right, below the seat. It has a moment arm of 0.943 m about the
+    line of contact, and of 0.011 m about the steering axis. `initial["speed"]`: the median [m/s], because the recorded
+    speed has spikes. The bicycle is unstable without its rider: fit it in windows of a second.
 
     `parameters`: `rigid_rider_and_bicycle`, `bicycle_alone`, `rider_alone` and `as_stored_in_the_run_file`, each in
     Meijaard's names; `identified` are the coefficients that the author found from 57 runs.
+
+    **Arguments:**
+
+    - `file`: another CSV file with the same columns.
     """
     recording = _recording(
         "davis_rider",
@@ -180,14 +206,19 @@ def davis_rider(*, file: File = None) -> Recording:
 
 
 def tossed_elbow(*, file: File = None) -> Recording:
-    """Two cubes on a hinge, thrown, seen by cameras (DAIRLab, 2021): the free flight of twenty tosses, 0.14 s each.
+    """Two cubes on a hinge, thrown and tracked by cameras (DAIRLab, 2021): the free flight of twenty tosses, 0.14 s
+    each.
 
-    Channels `x`, `y`, `z` [m], the first body's origin, z upwards; `e1`, ..., `e4`: its Euler parameters, the scalar
-    last, from the body to the room; `hinge` [rad]. Rates that begin the trials are filtered differences: `omega1`, ...,
+    Channels `x`, `y`, `z` [m], the first body's origin, z upwards; `e1`, ..., `e4`: its Euler parameters, scalar last,
+    from the body to the room; `hinge` [rad]. The initial rates of trials are filtered differences: `omega1`, ...,
     `omega3` [rad/s] along the body's axes, `v1`, ..., `v3` [m/s] along the room's, `hinge_rate`.
 
-    `parameters`: the nominal `mass` [kg] and `inertia` [kg m^2] of each cube, about every axis; the hinge is the first
-    body's y axis through `hinge_place` [m], the second's mass centre lies `arm` [m] along its x axis from there.
+    `parameters`: the nominal `mass` [kg] and `inertia` [kg m^2] of each cube, about every axis. The hinge is the first
+    body's y axis through `hinge_place` [m]. From there the second body's mass centre is at `arm` [m] along its x axis.
+
+    **Arguments:**
+
+    - `file`: another CSV file with the same columns.
     """
     quaternion = {"e1": "qx", "e2": "qy", "e3": "qz", "e4": "qw"}
     rates = {"omega1": "wx", "omega2": "wy", "omega3": "wz", "v1": "vx", "v2": "vy", "v3": "vz"}
@@ -209,8 +240,16 @@ _BICYCLE_SIGMA = {"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0
 def _recording(
     name: str, shipped: str, file: File, *, parameters: Mapping[str, Any], by: str | None = "segment", **columns: Any
 ) -> Recording:
+    import pandas as pd  # takes half a second
+
     with resources.as_file(_folder(name) / shipped) as path:
-        trials = read_trials(path if file is None else Path(file), by=by, **columns)
+        path = path if file is None else Path(file)
+        frame = pd.read_csv(path, dtype={} if by is None else {by: str})
+    stem = path.name.partition(".")[0]
+    if by is not None:
+        refuse_unknown([by], list(frame.columns), f"{path}: no column")
+    runs = {stem: frame} if by is None else {f"{stem}, {by} {key}": run for key, run in frame.groupby(by, sort=False)}
+    trials = [Trial.from_dataframe(run, name=title, **columns) for title, run in runs.items()]
     return Recording(tuple(trials), parameters, (_folder(name) / "LICENCE").read_text(encoding="utf-8"))
 
 
@@ -223,7 +262,7 @@ def _json(name: str, file: str) -> dict[str, Any]:
 
 
 def _with_rates(trial: Trial, step: float = 0.002, window: int = 25) -> Trial:
-    """The same, with rates to begin from: the slopes of cubics through as many samples, `step` [s] apart."""
+    """The trial with initial rates: the slopes of cubics through `window` samples, `step` [s] apart."""
     from scipy.signal import savgol_filter  # which imports all of scipy.stats
 
     even = np.arange(trial.t[0], trial.t[-1] + step, step)

@@ -1,4 +1,4 @@
-"""Estimation while a motion goes on: Kalman filters as pure functions of one time step."""
+"""Online estimation: Kalman filters as pure functions of one time step."""
 
 from ._filter import Belief as Belief
 from ._filter import Filter as Filter

@@ -1,13 +1,13 @@
-"""A Kalman filter as pure functions of one time step: what is known of a motion while it goes on.
+"""A Kalman filter as pure functions of one time step, for online estimation.
 
-The state is v = [q, u, x, p], with the parameters p that are estimated too; its uncertainty is a root S of the
-covariance, P = S S^T, which no rounding error makes indefinite. `lag` states before are kept with their correlations,
-for a smoother of fixed lag and for measurements that arrive late.
+The state is v = [q, u, x, p], where p are the estimated parameters. Its uncertainty is stored as a root S of the
+covariance, P = S S^T, so that rounding errors cannot make P indefinite. The previous `lag` states are kept with their
+correlations, for a fixed-lag smoother and for measurements that arrive late.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import equinox as eqx
@@ -17,49 +17,87 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._common.lookup import hint, real_number
+from .._integrate.jumps import refuse_jumps
 from .._integrate.simulate import checked_state
-from .._kane.arguments import check_is_system, checked_inputs
+from .._kane.api import dependent_speeds
+from .._kane.arguments import check_is_system, check_time, checked_inputs, is_concrete, is_numeric, is_one_number
 from .._kane.checks import check_system
-from .._kane.constraints import check_state, configuration_residual, has_configuration_constraints, projected
-from .._kane.equations import dependent_speeds
-from .._kane.rhs import output_names, outputs_at, values_of, vector_field
+from .._kane.consistent_state import AssemblyProblem, euler_parameters
+from .._kane.constraint_residuals import (
+    check_state,
+    configuration_residual,
+    coordinate_weights,
+    has_configuration_constraints,
+    least_change,
+    projected,
+)
+from .._kane.right_hand_side import output_names, outputs_at, values_of, vector_field
 from .._scalarjit.cache_key import jit
 from .._system.parameters import parameters_in, with_parameters
-from .._system.system import State, System, packed, unpacked
+from .._system.prints import concrete_numbers, module_text, text_of, wrapped
+from .._system.system import State, System, named_numbers, packed, units_of, unpacked
 from ._process_noise import MODES, Disturbance, checked_noise
-from ._square_root import ordered, root
+from ._square_root import moments, root
 from ._square_root import update as update_root
 
 Inputs = Mapping[str, Any] | None
 
 
 class Belief(eqx.Module):
-    """What is known of the motion at a time.
+    """The estimate of a filter: means and covariances of the present state and of the previous `lag` states.
 
-    Attributes: `t` (lag + 1,) [s]: now, and the times before; `mean` (lag + 1, n); `root` (lag + 1, n, k): S, of which
-    S S^T is the covariance, with the columns that all times have in common.
+    Attributes:
+
+    - `t`: times (lag + 1,) [s], the present time first.
+    - `mean`: means (lag + 1, n) of the states at these times. The order is that of `Filter.names`.
+    - `root`: roots S (lag + 1, n, k) of the covariances S S^T. The columns of all times belong to the same variables,
+        so the covariance of two times is S_i S_j^T.
     """
 
     t: Float[Array, " m"]
     mean: Float[Array, "m n"]
     root: Float[Array, "m n k"]
 
+    def __repr__(self) -> str:
+        if concrete_numbers(self.root) is None or self.t.ndim > 1:
+            return module_text(self, ndim=0)
+        items = {"t": text_of(self.t[0], "s"), "mean": text_of(self.mean[0]), "deviation": text_of(self.deviation())}
+        return wrapped(f"Belief({', '.join(map('='.join, items.items()))})")
+
     def covariance(self, age: int = 0) -> Float[Array, "n n"]:
-        """Of the state `age` steps ago."""
+        """Covariance (n, n) of the state `age` steps ago."""
+        _check_age("covariance", self, age)
         return self.root[age] @ self.root[age].T
 
     def deviation(self, age: int = 0) -> Float[Array, " n"]:
-        """Standard deviations of the state `age` steps ago."""
+        """Standard deviations (n,) of the state `age` steps ago."""
+        _check_age("deviation", self, age)
         return jnp.sqrt(jnp.sum(self.root[age] ** 2, axis=1))
 
 
-class Innovation(eqx.Module):
-    """What a measurement said that was not expected.
+def _check_age(function: str, belief: Belief, age: int) -> None:
+    """Check the age. Otherwise, JAX would return the oldest state for a larger age.
 
-    Attributes: `predicted` (n_c,): before anything was measured. `difference`, `deviation` (n_c,): measured less
-    predicted, each after those before it, and the standard deviation of that; zero and one in gaps. `nis`: the
-    normalized innovation squared, e^T (H P H^T + R)^-1 e, which is chi squared with `n` degrees of freedom where the
-    filter is consistent.
+    **Raises:** `ValueError` for an age beyond the filter's lag.
+    """
+    lag = belief.t.shape[-1] - 1
+    if not isinstance(age, (int, np.integer)) or not 0 <= age <= lag:
+        raise ValueError(f"{function}: `age` must be an integer from 0 to the filter's lag {lag}, got {age!r}.")
+
+
+class Innovation(eqx.Module):
+    """The difference between measurements and their predictions.
+
+    The sensors are processed one after the other.
+
+    Attributes:
+
+    - `predicted`: predicted measurements (n_c,) before the update.
+    - `difference`: measured minus predicted (n_c,), where each prediction uses the previous sensors. Zero in gaps.
+    - `deviation`: standard deviations (n_c,) of the differences. One in gaps.
+    - `nis`: normalized innovation squared, e^T (H P H^T + R)^-1 e. If the filter is consistent, it is chi-squared
+        distributed with `n` degrees of freedom.
+    - `n`: number of measurements without gaps.
     """
 
     predicted: Float[Array, " n_c"]
@@ -68,9 +106,12 @@ class Innovation(eqx.Module):
     nis: Float[Array, ""]
     n: Array
 
+    def __repr__(self) -> str:
+        return module_text(self, ndim=1)
+
 
 class Filter(eqx.Module):
-    """A system, its sensors and what disturbs it: all that `predict` and `update` need besides what is known.
+    """A Kalman filter: a system, its sensors and its process noise.
 
         filter = Filter(bicycle, {"roll_rate": 0.01}, noise={"roll_rate": 0.1})
         belief = begin(filter, state, {"roll": 0.1, "roll_rate": 0.1})
@@ -79,14 +120,17 @@ class Filter(eqx.Module):
 
     **Arguments:**
 
-    - `sensors`: by name the standard deviation of a coordinate, speed, state or output that is measured.
-    - `noise`: by name the spectral density of the white noise that disturbs an independent speed or a state
-        [unit^2/s], or an input [unit^2 s].
-    - `drift`: by name the spectral density of a parameter that is estimated too [unit^2/s]; 0.0 if it is constant.
-    - `method`: "extended" linearizes at the mean; "unscented" takes the mean of points on both sides of it, of equal
-        weight (the cubature filter).
-    - `lag`: how many states before are kept. `substeps`: of the integration in one `predict`, by the classical
-        Runge-Kutta method.
+    - `system`: the system.
+    - `sensors`: standard deviations by name of the measured coordinates, speeds, first-order states or outputs.
+    - `noise`: spectral densities by name of white noise that disturbs independent speeds or first-order states
+        [unit^2/s], or inputs [unit^2 s].
+    - `drift`: spectral densities by name of the parameters that are estimated [unit^2/s]. 0.0 for a constant parameter.
+    - `method`: "extended" linearizes at the mean. "unscented" is the cubature filter: it averages over points of equal
+        weight on both sides of the mean, and adds the covariance of the noise.
+    - `lag`: number of previous states that are kept.
+    - `substeps`: number of steps of the classical Runge-Kutta method in one `predict`.
+
+    **Raises:** `TypeError` or `ValueError` for unknown names and invalid numbers.
     """
 
     system: System
@@ -112,6 +156,7 @@ class Filter(eqx.Module):
         substeps: int = 1,
     ):
         check_is_system(system)
+        refuse_jumps(system, "Filter", "A Kalman filter cannot represent jumps. Estimate between the jumps only.")
         noise, drift = {} if noise is None else noise, {} if drift is None else drift
         measurable = (*system.coordinates, *system.speeds, *system.states, *system.dependent_speeds)
         known = {
@@ -120,65 +165,143 @@ class Filter(eqx.Module):
         }
         for label, (given, names) in known.items():
             if not isinstance(given, Mapping):
-                raise TypeError(f"Filter: `{label}` is a dict of numbers by name, got {given!r}.")
+                raise TypeError(f"Filter: `{label}` must be a dict of numbers by name, got {given!r}.")
             for name, value in given.items():
                 if name not in names:
-                    raise ValueError(f"Filter: `{label}` names {name!r}; {hint(name, names, 'it may name')}")
+                    raise ValueError(
+                        f"Filter: `{label}` contains the unknown name {name!r}; "
+                        f"{hint(name, names, 'possible names are')}"
+                    )
                 number = real_number(value, f"Filter: `{label}` of {name}")
                 if not (0 <= number < np.inf) or (label == "sensors" and number == 0):
-                    raise ValueError(f"Filter: `{label}` of {name} is {number}: it must be positive and finite.")
+                    raise ValueError(f"Filter: `{label}` of {name} must be positive and finite, got {number}.")
         if not sensors:
-            raise ValueError("Filter: `sensors` names nothing that is measured.")
+            raise ValueError(
+                "Filter: `sensors` is empty. Pass at least one measured quantity with its standard deviation."
+            )
         if method not in ("extended", "unscented"):
-            raise ValueError(f'Filter: `method` is "extended" or "unscented", got {method!r}.')
+            raise ValueError(f"Filter: `method` must be 'extended' or 'unscented', got {method!r}.")
         for label, number, least in (("lag", lag, 0), ("substeps", substeps, 1)):
             if not isinstance(number, int) or isinstance(number, bool) or number < least:
-                raise ValueError(f"Filter: `{label}` is a whole number of {least} at least, got {number!r}.")
-        array = lambda given: jnp.asarray(np.array([*given.values()], float), jnp.result_type(float))  # noqa: E731
+                raise ValueError(f"Filter: `{label}` must be an integer of at least {least}, got {number!r}.")
+
+        def array(given):
+            return jnp.asarray(np.array([*given.values()], float), jnp.result_type(float))
+
         self.system, self.method, self.lag, self.substeps = system, method, lag, substeps
         self.sensors, self.parameters = tuple(sensors), tuple(drift)
         self.sigma, self.drift = array(sensors), array(drift)
         self.noise, self.density = checked_noise(system, noise, "Filter: `noise`")
 
+    def __repr__(self) -> str:
+        units = units_of(self.system) | {name: info.unit for name, _, info in parameters_in(self.system)}
+        of = {"sensors": (self.sensors, self.sigma), "noise": (self.noise, self.density)}
+        of["drift"] = (self.parameters, self.drift)
+        parts = [type(self.system).__name__, self.method, f"lag={self.lag}, substeps={self.substeps}"]
+        for kind, (names, numbers) in of.items():
+            numbers_text = named_numbers((names,), (numbers,), {}, units if kind == "sensors" else ())
+            parts += [f"{kind}: {numbers_text or text_of(numbers, ndim=1)}"] * bool(names)
+        return wrapped(f"Filter({'; '.join(parts)})")
+
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the state that is estimated: coordinates, independent speeds, states, parameters."""
+        """Names of the estimated state: coordinates, independent speeds, first-order states, parameters."""
         return (*self.system.coordinates, *self.system.speeds, *self.system.states, *self.parameters)
 
     def system_at(self, v: Float[Array, " n"]) -> System:
-        """The system with the parameters that are estimated."""
+        """The system with the estimated parameters of the state `v` (n,)."""
         p = v[len(self.names) - len(self.parameters) :]
         return (
             with_parameters(self.system, dict(zip(self.parameters, p, strict=True))) if self.parameters else self.system
         )
 
+    def onto(self, t: Array, v: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Project points of the unscented transform onto the constraints, because they violate curved constraints."""
+        return v if self.method == "extended" else nearest(self.system_at, t, v)
+
 
 def begin(filter: Filter, state: State, deviation: Mapping[str, float], t: float = 0.0) -> Belief:
-    """What is known at the start: a state, as `assemble` gives it, and standard deviations by name, zero of what is not
-    named.
+    """The initial belief.
 
-    **Raises:** `ValueError` for a name that the filter does not estimate, and for a state that violates a constraint.
+    **Arguments:**
+
+    - `filter`: a `Filter`.
+    - `state`: the mean, a `State` that satisfies the constraints, such as the result of `assemble`.
+    - `deviation`: standard deviations by name, as in `filter.names`. If a coordinate without standard deviation is
+        bound by the constraints, its uncertainty follows from the other coordinates. All others without standard
+        deviation are exact.
+    - `t`: time [s].
+
+    **Returns:** a `Belief`.
+
+    **Raises:** `ValueError` for a name that the filter does not estimate, and for a state that is not finite or
+    violates a constraint.
     """
     names, state = filter.names, checked_state(filter.system, state)
+    check_time("begin", t)
+    if is_concrete(state):
+        wrong = [
+            f"{name} = {x}" for name, x in zip(names, np.asarray(packed(state)), strict=False) if not np.isfinite(x)
+        ]
+        if wrong:
+            raise ValueError(
+                f"begin: the state is not finite: {', '.join(wrong)}. Pass finite numbers. For an unknown state, pass "
+                "a guess and a large `deviation`."
+            )
     check_state(filter.system, t, state.q)
     check_system(filter.system, t, state.q)
     for name, value in deviation.items():
         if name not in names:
-            raise ValueError(f"begin: `deviation` names {name!r}; {hint(name, names, 'the filter estimates')}")
+            raise ValueError(
+                f"begin: `deviation` contains the unknown name {name!r}; {hint(name, names, 'the filter estimates')}"
+            )
         if not 0 <= real_number(value, f"begin: the deviation of {name}") < np.inf:
-            raise ValueError(f"begin: the deviation of {name} is {value}: it is not negative, and finite.")
+            raise ValueError(f"begin: `deviation` of {name} must be finite and not negative, got {value}.")
     by_name = {name: value for name, value, _ in parameters_in(filter.system)}
     v = jnp.concatenate([packed(state), *(jnp.reshape(by_name[name], 1) for name in filter.parameters)])
     S = jnp.asarray(np.diag([float(deviation.get(name, 0.0)) for name in names]), v.dtype)
-    v, S = brought_back(filter.system, jnp.asarray(t, v.dtype), v, S)
+    given = {name: 0.0 for name in filter.system.coordinates if deviation.get(name)}
+    moved = {*AssemblyProblem.of(filter.system, given).moved} - {*given}
+    moved |= {filter.system.coordinates[i] for four in euler_parameters(filter.system) for i in four}
+    v = nearest(filter.system_at, jnp.asarray(t, v.dtype), v)
+    S = begun(filter.system_at, jnp.asarray(t, v.dtype), v, S, np.isin(filter.system.coordinates, [*moved]))
     m, n = filter.lag + 1, len(names)
     return Belief(jnp.full(m, t, v.dtype), jnp.tile(v, (m, 1)), jnp.tile(_widened(S, n * m), (m, 1, 1)))
 
 
+def _check_belief(function: str, filter: Filter, belief: Any) -> None:
+    """**Raises:** `TypeError` or `ValueError` if the belief does not belong to this filter."""
+    if not isinstance(filter, Filter) or not isinstance(belief, Belief):
+        kinds = f"{type(filter).__name__} and {type(belief).__name__}"
+        raise TypeError(
+            f"{function}: the first arguments must be a Filter and a Belief, as from begin(filter, ...); got {kinds}."
+        )
+    m, n = filter.lag + 1, len(filter.names)
+    if belief.mean.shape != (m, n) or belief.root.shape != (m, n, m * n):
+        hint = " For a batch use jax.vmap." if belief.mean.ndim > 2 else ""
+        raise ValueError(
+            f"{function}: the belief belongs to another filter: its mean has the shape {belief.mean.shape}, but this "
+            f"filter needs ({m}, {n}): {', '.join(filter.names)}, with lag={filter.lag}. Call begin(filter, ...)."
+            + hint
+        )
+
+
 @jit
 def predict(filter: Filter, belief: Belief, dt: Any, inputs: Inputs = None) -> Belief:
-    """What is known a time `dt` [s] later, while `inputs` keep their values. A `dt` of 0 changes nothing; where it is
-    negative, everything is NaN."""
+    """The belief after one time step.
+
+    **Arguments:**
+
+    - `filter`: a `Filter`.
+    - `belief`: the belief before the step.
+    - `dt`: time step [s]. With 0, the belief is returned unchanged. With a negative number, everything becomes NaN.
+    - `inputs`: values by name, constant during the step. Omitted inputs are zero.
+
+    **Returns:** a `Belief`.
+
+    **Raises:** `TypeError` or `ValueError` for the belief of another filter.
+    """
+    _check_belief("predict", filter, belief)
     m, n = belief.mean.shape
     k, n_w = belief.root.shape[2], len(filter.noise)
     t, dt = belief.t[0], jnp.asarray(dt, belief.mean.dtype)
@@ -188,97 +311,111 @@ def predict(filter: Filter, belief: Belief, dt: Any, inputs: Inputs = None) -> B
     amplitude = jnp.tile(jnp.sqrt(filter.density), MODES)
 
     def flow(v: Array, xi: Array) -> Array:
-        return _flow(filter, t, dt, v, (amplitude * xi).reshape(MODES, n_w), values)
+        return _flow(filter, t, dt, filter.onto(t, v), xi.reshape(MODES, n_w), values)
 
-    zero = jnp.zeros(MODES * n_w, dt.dtype)
-    directions = jnp.concatenate([belief.root[0], jnp.zeros((n, zero.size), dt.dtype)], axis=1)
-    unit = jnp.concatenate([jnp.zeros((zero.size, k), dt.dtype), jnp.eye(zero.size, dtype=dt.dtype)], axis=1)
-    if filter.method == "extended":
-        along = lambda *direction: jax.jvp(flow, (belief.mean[0], zero), direction)  # noqa: E731
-        v, A = jax.vmap(along, in_axes=1, out_axes=(None, 1))(directions, unit)
-        before = jnp.concatenate([belief.root[:-1], jnp.zeros((m - 1, n, zero.size), dt.dtype)], axis=2)
-    else:
-        spread = jnp.sqrt(jnp.asarray(k + zero.size, dt.dtype))
-        points = jax.vmap(lambda s, d, e: flow(belief.mean[0] + s * spread * d, s * spread * e), in_axes=(None, 1, 1))
-        ends = jnp.concatenate([points(one, directions, unit) for one in (jnp.ones_like(dt), -jnp.ones_like(dt))])
-        v = jnp.mean(ends, axis=0)
-        A = (ends - v[None]).T / jnp.sqrt(jnp.asarray(len(ends), dt.dtype))
-        half = jnp.sqrt(jnp.asarray(0.5, dt.dtype))
-        before = jnp.concatenate([belief.root[:-1], jnp.zeros((m - 1, n, zero.size), dt.dtype)], axis=2)
-        before = jnp.concatenate([half * before, -half * before], axis=2)
-    of_drift = jnp.zeros((n, n), dt.dtype)
-    places = np.arange(n - len(filter.parameters), n)
-    of_drift = of_drift.at[places, places].set(jnp.sqrt(filter.drift * dt))
-    stacked = jnp.concatenate([A[None], before])
-    stacked = jnp.concatenate([stacked, jnp.zeros((m, n, n), dt.dtype).at[0].set(of_drift)], axis=2)
-    S = _root(filter, stacked.reshape(m * n, -1)).reshape(m, n, m * n)
-    v, top = brought_back(filter.system_at(v), t + dt, v, S[0])
+    v, A = moments(flow, belief.mean[0], belief.root[0], amplitude, filter.method)
+    n_y, n_p = n - len(filter.parameters), len(filter.parameters)
+    wide = (
+        jnp.zeros((m, n, A.shape[1] + n_p), dt.dtype).at[0, :, : A.shape[1]].set(A).at[1:, :, :k].set(belief.root[:-1])
+    )
+    wide = wide.at[0, n_y:, A.shape[1] :].set(jnp.diag(jnp.sqrt(filter.drift * dt)))
+    S = root(wide.reshape(m * n, -1))[0].reshape(m, n, k)
+    v, top = brought_back(filter.system_at, t + dt, v, S[0])
     mean = jnp.concatenate([v[None], belief.mean[:-1]])
     after = Belief(jnp.concatenate([(t + dt)[None], belief.t[:-1]]), mean, S.at[0].set(top))
     return jax.tree.map(lambda new, old: jnp.where(still, old, new), after, belief)
 
 
-@jit
 def update(
     filter: Filter, belief: Belief, measured: Any, inputs: Inputs = None, *, age: int = 0
 ) -> tuple[Belief, Innovation]:
-    """What is known after a measurement.
+    """The belief after a measurement.
 
     **Arguments:**
 
-    - `measured`: by name, those left out are gaps; or (n_c,) in the order of `filter.sensors`, NaN in gaps.
-    - `inputs`: that acted when it was measured, for sensors that feel them, as an accelerometer does.
-    - `age`: how many steps ago it was measured, `lag` at most.
+    - `filter`: a `Filter`.
+    - `belief`: the belief before the measurement.
+    - `measured`: values by name, in which omitted sensors are gaps. Or an array (n_c,) in the order of
+        `filter.sensors`, with NaN for gaps.
+    - `inputs`: values by name at the time of the measurement, for sensors that depend on them (accelerometers).
+    - `age`: number of steps since the measurement, at most `lag`.
+
+    **Returns:** a `Belief` and an `Innovation`.
+
+    **Raises:** `ValueError` for an unknown sensor, an infinite measurement, and the belief of another filter. If
+    measurements are traced, an infinite one makes the belief infinite or NaN instead.
     """
+    _check_belief("update", filter, belief)
     if not 0 <= age <= filter.lag:
-        raise ValueError(f"update: `age` is {age}, and the filter keeps {filter.lag} states before: see `lag`.")
-    m, n = belief.mean.shape
+        raise ValueError(
+            f"update: `age` is {age}, but the filter keeps {filter.lag} earlier states. Pass a smaller `age`, or "
+            "create the Filter with a larger `lag`."
+        )
     y = _as_measured(filter, measured, belief.mean.dtype)
+    if is_concrete(y) and np.isinf(y).any():
+        wrong = ", ".join(f"{name} = {x}" for name, x in zip(filter.sensors, np.asarray(y), strict=True) if np.isinf(x))
+        raise ValueError(f"update: a measurement is infinite: {wrong}. If it is missing, pass NaN or leave it out.")
+    return _update(filter, belief, y, inputs, age=age)
+
+
+@jit
+def _update(filter: Filter, belief: Belief, y: Array, inputs: Inputs, *, age: int) -> tuple[Belief, Innovation]:
+    m, n = belief.mean.shape
     values = {name: jnp.asarray(x, y.dtype) for name, x in checked_inputs(filter.system, inputs).items()}
-    is_measured = jnp.isfinite(y)
+    is_measured = ~jnp.isnan(y)
     sigma = jnp.where(is_measured, filter.sigma.astype(y.dtype), 1.0)
 
-    def h(v: Array) -> Array:
-        system = filter.system_at(v)
+    def h(v: Array, _: Array) -> Array:
+        v, system = filter.onto(belief.t[age], v), filter.system_at(v)
         state = unpacked(system, v[: len(filter.names) - len(filter.parameters)])
         return sensed(system, filter.sensors, belief.t[age], state.q, state.u, values_of(system, state.x, values))
 
-    v, S, k = belief.mean[age], belief.root[age], belief.root.shape[2]
-    if filter.method == "extended":
-        along = lambda direction: jax.jvp(h, (v,), (direction,))  # noqa: E731
-        predicted, H = jax.vmap(along, in_axes=1, out_axes=(None, 1))(S)
-        columns = belief.root
-    else:
-        spread = jnp.sqrt(jnp.asarray(k, y.dtype))
-        ends = jnp.concatenate([jax.vmap(lambda d, s=s: h(v + s * spread * d), in_axes=1)(S) for s in (1.0, -1.0)])
-        predicted = jnp.mean(ends, axis=0)
-        H = (ends - predicted[None]).T / jnp.sqrt(jnp.asarray(len(ends), y.dtype))
-        columns = jnp.concatenate([belief.root, -belief.root], axis=2) * jnp.sqrt(jnp.asarray(0.5, y.dtype))
-    known = update_root(jnp.where(is_measured, y - predicted, 0.0), H, sigma, is_measured)
-    columns = columns.reshape(m * n, -1)
-    mean = belief.mean + (columns @ known.shift).reshape(m, n)
-    S = _root(filter, columns @ known.left).reshape(m, n, m * n)
-    v, top = brought_back(filter.system_at(mean[0]), belief.t[0], mean[0], S[0])
+    predicted, F = moments(h, belief.mean[age], belief.root[age], jnp.zeros(0, y.dtype), filter.method)
+    known = update_root(jnp.where(is_measured, y - predicted, 0.0), F, sigma, is_measured)
+    k = belief.root.shape[2]
+    mean = belief.mean + belief.root @ known.shift[:k]
+    S = root(belief.root.reshape(m * n, k) @ known.left[:k])[0].reshape(m, n, k)
+    v, top = brought_back(filter.system_at, belief.t[0], mean[0], S[0])
     after = Belief(belief.t, mean.at[0].set(v), S.at[0].set(top))
     nis = jnp.sum((known.innovation / known.deviation) ** 2)
     return after, Innovation(predicted, known.innovation, known.deviation, nis, jnp.sum(is_measured))
 
 
 def nees(belief: Belief, truth: Float[Array, " n"], age: int = 0) -> Array:
-    """The normalized estimation error squared, (m - v)^T P^-1 (m - v), of a simulation whose truth is known: chi
-    squared with as many degrees of freedom as P has rank, where the filter is consistent."""
+    """The normalized estimation error squared, (m - v)^T P^-1 (m - v), for a simulation with known true state.
+
+    If the filter is consistent, it is chi-squared distributed. The number of degrees of freedom is the rank of P.
+
+    **Arguments:**
+
+    - `belief`: a `Belief`.
+    - `truth`: the true state (n,) in the order of `filter.names`, including parameters.
+    - `age`: number of steps ago, at most `lag`.
+
+    **Raises:** `ValueError` for a wrong shape and for an age beyond the lag.
+    """
+    _check_age("nees", belief, age)
+    n = belief.mean.shape[-1]
+    if not is_numeric(truth) or np.shape(truth) != (n,):
+        got = f"the shape {np.shape(truth)}" if is_numeric(truth) else f"{type(truth).__name__}"
+        raise ValueError(
+            f"nees: `truth` must be an array ({n},) in the order of `filter.names`, got {got}. The order is "
+            "coordinates, speeds, states, parameters. For a State, pass jnp.concatenate([state.q, state.u])."
+        )
     return _of_rank(belief.covariance(age), truth - belief.mean[age])
 
 
 def _of_rank(P: Array, error: Array) -> Array:
-    values, vectors = jnp.linalg.eigh(P)
+    # Use the rank of the correlations. With metres and nanometres, eigenvalues of P cannot be compared.
+    deviation = jnp.sqrt(jnp.where(jnp.diagonal(P) > 0, jnp.diagonal(P), 1.0))
+    values, vectors = jnp.linalg.eigh(P / jnp.outer(deviation, deviation))
     counts = values > 1e-12 * jnp.max(values)
-    along = vectors.T @ error
+    along = vectors.T @ (error / deviation)
     return jnp.sum(jnp.where(counts, along**2 / jnp.where(counts, values, 1.0), 0.0))
 
 
 def _flow(filter: Filter, t0: Array, dt: Array, v: Array, xi: Array, inputs: dict[str, Array]) -> Array:
-    """The state a time dt later, by the classical Runge-Kutta method; `xi` (MODES, n_w): what noise does."""
+    """The state after a time dt, by the classical Runge-Kutta method. `xi` (MODES, n_w): coefficients of the noise."""
     system, n = filter.system_at(v), len(filter.names) - len(filter.parameters)
     h = dt / filter.substeps
     disturbance = Disturbance(t0, t0 + dt, xi, filter.noise, system.speeds, system.states)
@@ -301,7 +438,7 @@ def _flow(filter: Filter, t0: Array, dt: Array, v: Array, xi: Array, inputs: dic
 
 
 def sensed(system: System, sensors: tuple[str, ...], t: Any, q: Array, u: Array, values: Mapping[str, Any]) -> Array:
-    """What the sensors read (n_c,) at a state, whose states of the first order stand among the `values` of inputs."""
+    """The readings (n_c,) of the sensors at a state. `values` contains inputs and first-order states by name."""
     by_name = dict(zip((*system.coordinates, *system.speeds), (*q, *u), strict=True))
     by_name |= {name: values[name] for name in system.states}
     if {*system.dependent_speeds} & {*sensors}:
@@ -315,34 +452,71 @@ def _as_measured(filter: Filter, measured: Any, dtype: Any) -> Array:
     if isinstance(measured, Mapping):
         for name in measured:
             if name not in filter.sensors:
-                raise ValueError(f"update: {name!r} is measured; {hint(name, filter.sensors, 'the filter has')}")
-        return jnp.stack([jnp.asarray(measured.get(name, jnp.nan), dtype) for name in filter.sensors])
+                raise ValueError(
+                    f"update: `measured` contains the unknown name {name!r}; "
+                    f"{hint(name, filter.sensors, 'the filter has')}"
+                )
+        for name, value in measured.items():
+            if not is_one_number(value):
+                raise TypeError(f"update: the measurement of {name!r} must be one number, got {value!r}.")
+        values = [measured.get(name, np.nan) for name in filter.sensors]
+        xp: Any = (
+            np if is_concrete(values) else jnp
+        )  # without jit, JAX would take longer for this than for the whole update
+        return xp.stack([xp.asarray(x, dtype) for x in values])
+    if not is_numeric(measured):
+        raise TypeError(f"update: `measured` must be a dict by name or an array of numbers, got {measured!r}.")
     measured = jnp.asarray(measured, dtype)
     if measured.shape != (len(filter.sensors),):
-        raise ValueError(f"update: `measured` has the shape {measured.shape}, not ({len(filter.sensors)},).")
+        raise ValueError(f"update: `measured` must have the shape ({len(filter.sensors)},), got {measured.shape}.")
     return measured
-
-
-def _root(filter: Filter, A: Array) -> Array:
-    return root(A)[0] if filter.method == "extended" else ordered(root(A)[0])
 
 
 def _widened(S: Array, k: int) -> Array:
     return jnp.concatenate([S, jnp.zeros((S.shape[0], k - S.shape[1]), S.dtype)], axis=1)
 
 
-def brought_back(system: System, t: Array, v: Array, S: Array) -> tuple[Array, Array]:
-    """The nearest coordinates that meet the constraints, and deviations that are tangent to them there."""
-    n_q = len(system.coordinates)
-    if not has_configuration_constraints(system, t, v[:n_q]):
+SystemAt = Callable[[Array], System]
+"""The system with the parameters that a state v contains."""
+
+
+def brought_back(system_at: SystemAt, t: Array, v: Array, S: Array) -> tuple[Array, Array]:
+    """The state with the nearest coordinates that satisfy the constraints, and a root S that is tangent to these."""
+    v, system = nearest(system_at, t, v), system_at(v)
+    q = v[: len(system.coordinates)]
+    if not has_configuration_constraints(system, t, q):
         return v, S
-    v = v.at[:n_q].set(projected(system, t, v[:n_q]))
-    return v, tangent(system, t, v, S, tuple(range(n_q)))
+    return v, _tangent(system_at, t, v, S, coordinate_weights(system, t, q))
 
 
-def tangent(system: System, t: Array, v: Array, S: Array, moved: tuple[int, ...]) -> Array:
-    """Deviations S (n, k) that meet the constraints to first order: `moved` coordinates by as little as that takes."""
-    n_q, at = len(system.coordinates), jnp.asarray(moved, dtype=jnp.int32)
-    G = jax.jacfwd(lambda q: configuration_residual(system, t, q))(v[:n_q])  # (h, n_q)
-    own = G[:, at]
-    return S.at[at].add(-own.T @ jnp.linalg.solve(own @ own.T, G @ S[:n_q]))
+def nearest(system_at: SystemAt, t: Array, v: Array) -> Array:
+    """The state with the nearest coordinates that satisfy the constraints."""
+    system, n_q = system_at(v), len(system_at(v).coordinates)
+    if not has_configuration_constraints(system, t, v[:n_q]):
+        return v
+    return v.at[:n_q].set(projected(system, t, v[:n_q]))
+
+
+def _tangent(system_at: SystemAt, t: Array, v: Array, S: Array, weights: Array) -> Array:
+    """The nearest root S (n, k) of the covariance whose columns satisfy the constraints to first order.
+
+    Changes of the coordinates are measured in `weights` (n_q,). Without weights, metres would be added to radians.
+    """
+    n_q = weights.size
+    G = jax.jacfwd(lambda v: configuration_residual(system_at(v), t, v[:n_q]))(v)  # (h, n)
+    return S.at[:n_q].add(-least_change(G[:, :n_q], G @ S, weights))
+
+
+def begun(system_at: SystemAt, t: Array, v: Array, S: Array, moved: np.ndarray) -> Array:
+    """A root S (n, k) of the initial covariance that satisfies the constraints.
+
+    First, only the deviations of the coordinates in the mask `moved` (n_q,) are changed. If this does not suffice, the
+    deviations contradict the constraints. The Gaussian distribution is then conditioned on the constraints. This is the
+    smallest change in the metric of its own covariance.
+    """
+    system, n_q = system_at(v), moved.size
+    if not has_configuration_constraints(system, t, v[:n_q]):
+        return S
+    weights = coordinate_weights(system, t, v[:n_q])
+    S = _tangent(system_at, t, v, S, jnp.where(moved, weights, 0.0))
+    return _tangent(system_at, t, v, S, jnp.linalg.norm(jax.lax.stop_gradient(S[:n_q]), axis=1))

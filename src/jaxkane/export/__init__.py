@@ -1,6 +1,6 @@
-"""Equations as C, NumPy source, a CasADi function or StableHLO. Simulates nothing.
+"""Equations as C, NumPy source, a CasADi function or StableHLO. Does not simulate.
 
-All are written from the graph of scalars that native kernels are written from, so that no formula stands there twice.
+All are written from the graph of scalars from which native kernels are written, so each formula is defined only once.
 """
 
 from ._filter import ExportedFilter as ExportedFilter

@@ -1,7 +1,8 @@
-"""A Kalman filter with its model as one C99 header, for where the motion is measured. Compiles and runs nothing.
+"""Export a Kalman filter with its model as one C99 header, for example for an embedded controller.
 
-The equations and their derivatives are written from a graph, as those of `jaxkane.export.c`; what stands around them,
-the steps of `jaxkane.estimate.predict` and `update`, is one text for all systems.
+The equations and their derivatives are generated from a graph, as in `jaxkane.export.c`. The code around them, the
+steps of `jaxkane.estimate.predict` and `update`, is a template that is the same for all systems. This module does not
+compile or run C code.
 """
 
 from __future__ import annotations
@@ -16,21 +17,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._common.files import write_file
 from .._common.lookup import real_number
 from .._kane.arguments import is_concrete
-from .._kane.formulas import Formulas, Function
+from .._kane.constraint_residuals import coordinate_weights
+from .._kane.expression_graph import Formulas, Function
 from .._kane.kanes_method import motion_rates_by_matrix
-from .._kane.rhs import rates
+from .._kane.right_hand_side import rates
 from .._scalarjit.graph import NotScalarError
 from .._version import __version__
 from ..estimate import Belief, Filter, predict, update
 from ..estimate._filter import sensed
 from ..estimate._process_noise import MODES
-from ._source import COMPARE, C, CText, in_comment, variable_units, write_file
+from ._source import COMPARE, C, CText, in_comment, variable_units
 
 
 class ExportedFilter(NamedTuple):
-    """The files that `jaxkane.export.c_filter` has written."""
+    """Paths of the files that `jaxkane.export.c_filter` has written."""
 
     header: Path
     test: Path
@@ -45,57 +48,56 @@ def c_filter(
     dtype: str = "float64",
     dt: float = 0.01,
 ) -> ExportedFilter:
-    """A Kalman filter with its model as one header of C99 that needs the mathematical library alone.
+    """Export a Kalman filter with its model as one C99 header. It requires only the C mathematical library.
 
         belief = jk.estimate.begin(filter, state, {"roll": 0.1, "roll_rate": 0.1})
         jk.export.c_filter(filter, "generated/roll.h", belief)
         # cc -std=c99 -O3 generated/roll_test.c -lm -o test && ./test
 
-    In C, with NaN for what was not measured:
+    In C, with NaN for sensors that were not measured:
 
         roll_belief belief = roll_start;
         roll_innovation innovation;
         roll_predict(&belief, &roll_default, 0.01, inputs);
         roll_update(&belief, &roll_default, measured, inputs, 0, &innovation);
 
-    These are `jaxkane.estimate.predict` and `update`, in arrays of fixed size on the stack: nothing is allocated or
-    kept. `roll_default` holds the parameters, the standard deviations of the sensors, and the spectral densities;
-    a copy of it may have others. The header says what is where, with units. A compiler must not be told that there is
-    no NaN (`-ffast-math`).
+    These functions correspond to `jaxkane.estimate.predict` and `update`. They use arrays of fixed size on the stack,
+    and neither allocate memory nor keep data between calls. `roll_default` contains the parameters, the standard
+    deviations of the sensors and the spectral densities. Copy it to use other values. Comments in the header state the
+    order and the units of all arrays. Do not compile with `-ffast-math`, because the code tests for NaN.
 
     **Arguments:**
 
-    - `path`: of the header, "FOLDER/NAME.h", whose folder is made; beside it `NAME_test.c`, a program that
-        compares some steps with numbers that JAX computed.
-    - `belief`: what is known at the start, as `jaxkane.estimate.begin` gives it: `NAME_start`.
-    - `name`: what all names begin with; by default that of the file.
-    - `dtype`: "float64", or "float32" for `float`.
-    - `dt`: the time step of the test program [s].
+    - `filter`: a `jaxkane.estimate.Filter`.
+    - `path`: path of the header, "FOLDER/NAME.h". The folder is created. A test program `NAME_test.c` is written to the
+        same folder. It compares some steps with results of JAX.
+    - `belief`: the initial belief, as returned by `jaxkane.estimate.begin`. In C, it is `NAME_start`.
+    - `name`: prefix of all names in C. The default is the name of the file.
+    - `dtype`: "float64" for `double`, "float32" for `float`.
+    - `dt`: time step of the test program [s].
 
     **Returns:** the paths `header` and `test`.
 
-    **Raises:** `TypeError` for what is no filter, or traced; `ValueError` for a belief of another filter or one that is
-    not finite, a `dt` that is not positive, and for operations that cannot be written as formulas of
-    single numbers, as `jaxkane.export.c`.
+    **Raises:** `TypeError` if `filter` is not a `Filter` or is traced. `ValueError` for a belief of another filter, for
+    numbers that are not finite, and for a `dt` that is not positive. As in `jaxkane.export.c`, also for operations that
+    cannot be written with scalars.
     """
     if not isinstance(filter, Filter):
-        raise TypeError(f"c_filter exports a jaxkane.estimate.Filter, got {filter!r}.")
+        raise TypeError(f"c_filter needs a jaxkane.estimate.Filter, got {filter!r}.")
     m, n = filter.lag + 1, len(filter.names)
     if not isinstance(belief, Belief) or np.shape(belief.root) != (m, n, m * n):
-        raise ValueError("c_filter: `belief` is what jaxkane.estimate.begin gives for this filter.")
+        raise ValueError("c_filter: `belief` does not fit this filter. Pass the result of jaxkane.estimate.begin.")
     if not is_concrete(filter, belief):
-        raise TypeError(
-            "c_filter writes numbers, and these are being traced: call it outside of jax.jit, vmap and grad."
-        )
+        raise TypeError("c_filter: the filter or the belief is traced. Call it outside of jax.jit, vmap and grad.")
     if not all(np.all(np.isfinite(x)) for x in (belief.t, belief.mean, belief.root)):
-        raise ValueError("c_filter: `belief` holds numbers that are not finite.")
+        raise ValueError("c_filter: `belief` contains numbers that are not finite.")
     if not 0 < real_number(dt, "c_filter: `dt`") < np.inf:
-        raise ValueError(f"c_filter: `dt` is a time step [s], positive and finite, got {dt!r}.")
+        raise ValueError(f"c_filter: the time step `dt` [s] must be positive and finite, got {dt!r}.")
     path = Path(path).with_suffix(".h")
     text = _FilterText(filter, belief, name or path.stem, dtype)
     files = ExportedFilter(path, path.with_name(f"{path.stem}_test.c"))
     for file, content in zip(files, (text.header(), text.test(path.name, dt)), strict=True):
-        write_file(file, content.encode())
+        write_file(file, content)
     return files
 
 
@@ -105,12 +107,13 @@ class _FilterText(CText):
     def __init__(self, filter: Filter, belief: Belief, name: str, dtype: str):
         self.filter, self.belief, system = filter, belief, filter.system
         more = {"all_rates": Function(("rate",), _all_rates), "sensed": Function(("z",), self._sensed)}
+        more["weights"] = Function(("weight",), lambda system, t, q, *_: (coordinate_weights(system, t, q),))
         formulas = Formulas(system, dtype, more)
         super().__init__(formulas, name)
         inputs = formulas.directions("inputs")
         of_parameter = dict(zip(formulas.names("parameters"), formulas.directions("parameters"), strict=True))
         self.of_input = dict(zip(system.inputs, inputs, strict=False))
-        self.rows = [*system.coordinates, *system.speeds, *system.states]  # what has a rate
+        self.rows = [*system.coordinates, *system.speeds, *system.states]  # quantities that have a rate
         self.estimated = [*formulas.directions("q"), *formulas.directions("u"), *inputs[len(system.inputs) :]]
         self.estimated += [of_parameter[name] for name in filter.parameters]
         places = [(len(formulas.arguments), i, len(filter.noise)) for i in range(len(filter.noise))]
@@ -120,8 +123,11 @@ class _FilterText(CText):
         return (sensed(system, self.filter.sensors, t, q, u, w),)
 
     def _words(self, is_disturbed: bool) -> dict[int, str]:
-        """What input nodes are called: what the filter estimates is in v, inputs in w, all else in *p."""
-        node_of = lambda place: int(self.formulas.inputs[place[0]].flat[place[1]])  # noqa: E731
+        """The C expressions of input nodes: the estimated state is in v, inputs are in w, all others in *p."""
+
+        def node_of(place: tuple[int, int]) -> int:
+            return int(self.formulas.inputs[place[0]].flat[place[1]])
+
         words = self.input_words | {k: f"e[{i}]" for i, k in enumerate(self.noise)}
         words |= {node_of(place): f"v[{i}]" for i, place in enumerate(self.estimated)}
         for i, (name, place) in enumerate(self.of_input.items()):
@@ -130,7 +136,7 @@ class _FilterText(CText):
         return words
 
     def _model(self) -> str:
-        """What the system says, as functions: rates, what sensors read, residuals of constraints, derivatives."""
+        """The system as C functions: rates, sensors, residuals of constraints, and derivatives."""
         formulas, filter, n = self.formulas, self.filter, len(self.estimated)
         is_extended = filter.method == "extended"
         rates_of, sensed_of = formulas.nodes("all_rates"), formulas.nodes("sensed")
@@ -138,7 +144,10 @@ class _FilterText(CText):
             of_inputs = [self.of_input[name] for name in filter.noise if name in self.of_input]
             (slope,) = formulas.derivatives("all_rates", [*self.estimated, *of_inputs]).values()
             by_input = iter(slope[:, n:].T)
-            number = lambda x: formulas.graph.constant(float(x), formulas.dtype)  # noqa: E731
+
+            def number(x: float) -> int:
+                return formulas.graph.constant(float(x), formulas.dtype)
+
             columns = [
                 next(by_input) if name in self.of_input else [number(name == row) for row in self.rows]
                 for name in filter.noise
@@ -146,17 +155,20 @@ class _FilterText(CText):
             rates_of = rates_of | {"slope": np.column_stack([slope[:, :n], *columns])}
             (slope,) = formulas.derivatives("sensed", self.estimated).values()
             sensed_of = sensed_of | {"slope": slope}
-        else:  # what disturbs a rate is added to it
+        else:  # noise of a rate is added to the rate
             (rate,) = rates_of.values()
             noise = {name: e for name, e in zip(filter.noise, self.noise, strict=True) if name in self.rows}
-            add = lambda x, e: formulas.graph.add("add", (int(x), e), formulas.dtype)  # noqa: E731
+
+            def add(x: int, e: int) -> int:
+                return formulas.graph.add("add", (int(x), e), formulas.dtype)
+
             disturbed = [add(x, noise[row]) if row in noise else x for row, x in zip(self.rows, rate, strict=True)]
             rates_of = {"rate": np.array(disturbed)}
         functions = {"rates": rates_of, "sensed": sensed_of}
         (h,) = formulas.nodes("configuration_residuals").values()
         if h.size:
-            (G,) = formulas.derivatives("configuration_residuals", formulas.directions("q")).values()
-            functions["constraints"] = {"h": h, "G": G}
+            (G,) = formulas.derivatives("configuration_residuals", self.estimated).values()
+            functions["constraints"] = {"h": h, "G": G, **formulas.nodes("weights")}
         helpers = self.helpers([x for outputs in functions.values() for x in outputs.values()])
         text = "\n".join([*helpers, *(self._function(*item) for item in functions.items())])
         return re.sub(r"\b(larger|smaller)\(", rf"{self.name}_\1(", text)
@@ -167,7 +179,9 @@ class _FilterText(CText):
         try:
             body = self.body((*read, "p"), outputs, self._words(is_disturbed))
         except NotScalarError as error:
-            raise ValueError(f"{self.formulas.name}: the filter cannot be written in C: it holds {error}.") from None
+            raise ValueError(
+                f"{self.formulas.name}: the filter cannot be written in C, because it contains {error}."
+            ) from None
         arguments = ", ".join([f"{self.type} t", *(f"const {self.type} *{word}" for word in read[1:])])
         arguments += f", const {self.name}_parameters *p" + "".join(f", {self.type} *{output}" for output in outputs)
         return f"static inline void {self.name}_{function}({arguments}) {body}"
@@ -177,7 +191,7 @@ class _FilterText(CText):
         has_constraints = formulas.nodes("configuration_residuals")["h"].size
         constraints = "with_constraints" if has_constraints else "without_constraints"
         text = _template("header", "common", constraints, filter.method, "end")
-        units = variable_units(filter.system)
+        units, eps = variable_units(filter.system), float(np.finfo(formulas.dtype).eps)
         of_parameter = {a.name: a.info.unit for a in formulas.of_kind("parameters")}
         in_mean = [*(units.get(name) for name in self.rows), *(of_parameter[name] for name in filter.parameters)]
 
@@ -207,6 +221,9 @@ class _FilterText(CText):
             times=filter.lag + 1,
             substeps=filter.substeps,
             modes=MODES,
+            eps=eps,
+            rank=eps ** (2 / 3),
+            new_row=eps**0.75,
             of_mean=listed("mean", filter.names, in_mean),
             of_sensors=listed("measured", filter.sensors, [units.get(name) for name in filter.sensors]),
             of_inputs=listed("inputs", filter.system.inputs, [units.get(name) for name in filter.system.inputs]),
@@ -224,7 +241,7 @@ class _FilterText(CText):
         )
 
     def test(self, header: str, dt: float) -> str:
-        """A program that makes some steps, and compares what is known then."""
+        """A C program that performs some steps and compares the belief with the result of JAX."""
         steps, after = self._steps(dt)
         tolerance = "1e-11" if self.formulas.dtype == "float64" else "2e-3"
         n, k = after.mean.size, after.root.shape[2]
@@ -243,7 +260,7 @@ class _FilterText(CText):
         return "\n".join(lines)
 
     def _steps(self, dt: float) -> tuple[list[tuple[np.ndarray, np.ndarray, int]], Belief]:
-        """Inputs, measurements and their age, of which one is a gap and one is late; and what is known afterwards."""
+        """Inputs, measurements and ages of some steps (one gap, one late measurement), and the belief after them."""
         filter, belief, steps = self.filter, self.belief, []
         for i in range(4):
             inputs = 0.1 * np.sin(1.0 + i + np.arange(len(filter.system.inputs)))
@@ -260,7 +277,7 @@ class _FilterText(CText):
 
 
 def _template(*sections: str) -> Template:
-    """Sections of `filter_template.h`, each of which follows a line `// name`."""
+    """Sections of `filter_template.h`. Each section follows a line `// name`."""
     text = (Path(__file__).parent / "filter_template.h").read_text(encoding="utf-8")
     parts = re.split(r"^// (\w+)\n", text, flags=re.MULTILINE)
     by_name = dict(zip(parts[1::2], parts[2::2], strict=True))

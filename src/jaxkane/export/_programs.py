@@ -5,43 +5,48 @@ from __future__ import annotations
 import operator
 import re
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import jax
 import numpy as np
 
-from .._kane.formulas import Formulas
+from .._common.files import write_file
+from .._integrate.jumps import warn_of_jumps
+from .._kane.expression_graph import Formulas
 from .._scalarjit.backends.source import as_objects
 from .._scalarjit.graph import OPERATORS, NotScalarError, needed
 from .._system.system import System
-from ._source import check_function, in_ascii, write_file
+from ._source import check_function, in_ascii
 
 
 def casadi(system: System, function: str = "rates", *, name: str | None = None) -> Any:
-    """One of a system's functions as a `casadi.Function` of scalars (SX), which CasADi differentiates itself.
+    """One of a system's functions as a `casadi.Function` of scalars (SX), which CasADi can differentiate.
 
         f = jk.export.casadi(pendulum)
         q_dot, u_dot = f(0.0, q, u, [0.0], list(jk.export.parameters(pendulum).values()))
         f(t=0.0, q=q, u=u, inputs=0.0, parameters=p)["u_dot"]; f.jacobian()
 
-    Its inputs are `t`, `q`, `u`, `inputs` and `parameters`, columns in the order of the declared names (parameters with
-    axes row by row; `jaxkane.export.parameters` has them by name), its outputs those of the function; partial
-    velocities V, W (b, 3, n) come as matrices (3 b, n).
+    Its inputs are `t`, `q`, `u`, `inputs` and `parameters`, columns in the order of the declared names. Parameters with
+    axes are flattened row by row; `jaxkane.export.parameters` returns them by name. Its outputs are those of the
+    function. Partial velocities V, W (b, 3, n) are matrices (3 b, n).
 
-    Values are those of JAX, but for two things: CasADi's `fmax` and `fmin` drop what is not a number, and it writes 0
-    for 0 * x, also where x is infinite.
+    Values are equal to those of JAX, with two exceptions: CasADi's `fmax` and `fmin` ignore NaN, and it simplifies 0 *
+    x to 0, also for infinite x.
 
     **Arguments:**
 
+    - `system`: the system.
     - `function`: as in `jaxkane.export.c`: "rates" (q_dot, u_dot), "equations" (M, f), "state_jacobian" ...
-    - `name`: of the function in CasADi; by default that of the system with that of the function.
+    - `name`: of the function in CasADi. Default: the names of the system and of the function.
 
-    **Raises:** `ImportError` without casadi, `ValueError` as `jaxkane.export.c`.
+    **Raises:** `ImportError` without casadi; `ValueError` as `jaxkane.export.c`.
     """
     try:
         import casadi as ca
     except ImportError as error:
         raise ImportError('jaxkane.export.casadi needs CasADi: pip install "jaxkane[casadi]".') from error
+    warn_of_jumps(system, "jaxkane.export.casadi")
     formulas = Formulas(system)
     check_function(formulas, function, "casadi")
     by_output = formulas.nodes(function)
@@ -55,17 +60,18 @@ def casadi(system: System, function: str = "rates", *, name: str | None = None) 
     graph = formulas.graph
     nodes = needed(graph.nodes, by_output.values())
     if any(graph.nodes[k].dtype == "float32" for k in nodes):
-        raise ValueError(f"{formulas.name}: its description computes in float32 in between, which CasADi has not.")
+        raise ValueError(f"{formulas.name}: the system computes some values in float32, which CasADi does not support.")
     try:
         objects = as_objects(graph, nodes, symbols, casadi_operations(ca), lambda v, _: ca.SX(float(v)), "CasADi")
     except NotScalarError as error:
-        raise ValueError(f"{formulas.name}: {function!r} holds {error}.") from None
+        raise ValueError(f"{formulas.name}: {function!r} contains {error}.") from None
     outputs = [_matrix(ca, nodes, objects) for nodes in by_output.values()]
-    label = re.sub(r"_+", "_", in_ascii(name or f"{formulas.name}_{function}")).strip("_")  # as CasADi wants names
+    # the form of names that CasADi accepts
+    label = re.sub(r"_+", "_", in_ascii(name or f"{formulas.name}_{function}")).strip("_")
     return ca.Function(label, [ca.vertcat(*x) for x in columns.values()], outputs, [*columns], [*by_output])
 
 
-def _matrix(ca: Any, nodes: np.ndarray, objects: dict[int, Any]) -> Any:
+def _matrix(ca: ModuleType, nodes: np.ndarray, objects: dict[int, Any]) -> Any:
     rows = nodes.reshape(-1, nodes.shape[-1] if nodes.ndim > 1 else 1)
     matrix = ca.SX(*rows.shape)
     for (i, j), k in np.ndenumerate(rows):
@@ -73,7 +79,7 @@ def _matrix(ca: Any, nodes: np.ndarray, objects: dict[int, Any]) -> Any:
     return matrix
 
 
-def casadi_operations(ca: Any) -> dict[str, Any]:
+def casadi_operations(ca: ModuleType) -> dict[str, Any]:
     """CasADi's functions for the operations of graphs."""
     own = "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp expm1 log log1p erf sqrt floor".split()
     return {name: getattr(ca, name) for name in own} | {
@@ -81,6 +87,7 @@ def casadi_operations(ca: Any) -> dict[str, Any]:
         "rem": ca.fmod,
         "pow": operator.pow,
         "exp2": lambda x: 2**x,
+        # CasADi has no cube root, and a fractional power of a negative number is NaN.
         "cbrt": lambda x: ca.sign(x) * ca.fabs(x) ** (1 / 3),
         "abs": ca.fabs,
         "max": ca.fmax,
@@ -90,7 +97,7 @@ def casadi_operations(ca: Any) -> dict[str, Any]:
         "or": ca.logic_or,
         "xor": operator.ne,
         "select": ca.if_else,
-        "convert": lambda x: x,  # of a comparison, which is 0 or 1
+        "convert": lambda x: x,  # of a comparison, which is 0 or 1 in CasADi
     }
 
 
@@ -107,31 +114,32 @@ def stablehlo(
     platforms: tuple[str, ...] = ("cpu",),
     derivatives: int = 0,
 ) -> Any:
-    """One of a system's functions as a program in StableHLO, which JAX loads without jaxkane, for any batch.
+    """One of a system's functions as a program in StableHLO, which JAX loads without jaxkane, for any batch size.
 
         jk.export.stablehlo(bicycle, "bicycle.stablehlo")
         # elsewhere, without jaxkane:
         # f = jax.export.deserialize(bytearray(open("bicycle.stablehlo", "rb").read())).call
         # q_dot, u_dot = f(t, q, u, inputs, parameters)
 
-    Its arguments have a leading axis of any one length b: `t` (b,), `q` (b, n_q), `u` (b, n_u), `inputs` (b, n_inputs),
-    in the order of the declared names; `parameters` is a dict of arrays by name, as `jaxkane.export.parameters` gives
-    it. Outputs (b, ...) come as a tuple. It holds operations of XLA alone, none of the native kernels: bit for bit what
-    `jax.jit` gives without these. A float64 program is called where `jax_enable_x64` is on.
+    Its arguments have a leading axis of any length b: `t` (b,), `q` (b, n_q), `u` (b, n_u), `inputs` (b, n_inputs), in
+    the order of the declared names. `parameters` is a dict of arrays by name, as from `jaxkane.export.parameters`.
+    Outputs (b, ...) are a tuple. The program contains only operations of XLA and no native kernels. Its results are
+    bit-identical to those of `jax.jit` without native kernels. Enable `jax_enable_x64` to call a float64 program.
 
     **Arguments:**
 
-    - `path`: where the program is written; None writes none.
+    - `system`: the system.
+    - `path`: the file to write, or None.
     - `function`: as in `jaxkane.export.c`: "rates" (q_dot, u_dot), "equations" (M, f) and others.
     - `dtype`: "float64" or "float32".
-    - `batch_parameters`: the parameters, too, have the leading axis.
-    - `platforms`: where it may run: "cpu", "cuda", "rocm", "tpu".
+    - `batch_parameters`: whether the parameters have the leading axis too.
+    - `platforms`: where the program can run: "cpu", "cuda", "rocm", "tpu".
     - `derivatives`: how many times the loaded program can be differentiated in reverse mode.
 
     **Returns:** the `jax.export.Exported`.
 
-    **Raises:** `ImportError` for a path without flatbuffers, which JAX writes with; `ValueError` as `jaxkane.export.c`,
-    but for operations, of which every one can be exported.
+    **Raises:** `ImportError` for a path without flatbuffers, which JAX needs to write; `ValueError` as
+    `jaxkane.export.c`, except for operations, because all of them can be exported.
     """
     from jax import export
 
@@ -140,16 +148,17 @@ def stablehlo(
             import flatbuffers  # noqa: F401
         except ImportError as error:
             raise ImportError(
-                'JAX writes programs with flatbuffers: pip install "jaxkane[stablehlo]". Without a path none is needed.'
+                'To save a program, JAX needs flatbuffers: pip install "jaxkane[stablehlo]". Or omit `path`.'
             ) from error
+    warn_of_jumps(system, "jaxkane.export.stablehlo")
     formulas = Formulas(system, dtype)
     check_function(formulas, function, "stablehlo")
     if isinstance(platforms, str):
-        raise TypeError(f"platforms is a sequence of names; one is ({platforms!r},).")
+        raise TypeError(f"`platforms` must be a sequence of names, e.g. ({platforms!r},).")
     unknown = [platform for platform in platforms if platform not in _PLATFORMS]
     if unknown or not platforms:
-        raise ValueError(f"platforms are of {', '.join(_PLATFORMS)}; got {platforms!r}.")
-    u_dep = np.zeros(len(formulas.names("u_dep")), formulas.dtype)  # no function of `OFFERED` reads them
+        raise ValueError(f"`platforms` must contain some of {', '.join(_PLATFORMS)}; got {platforms!r}.")
+    u_dep = np.zeros(len(formulas.names("u_dep")), formulas.dtype)  # the functions of `OFFERED` do not use them
 
     def of_one_state(t, q, u, inputs, parameters):
         return formulas.by_jax(
@@ -158,11 +167,17 @@ def stablehlo(
 
     axes = (0, 0, 0, 0, 0 if batch_parameters else None)
     with jax.enable_x64(formulas.dtype == "float64"):
+        # With a symbolic size, one program serves batches of any length. A number would fix the length.
         (b,) = export.symbolic_shape("b")
-        of = lambda *shape: jax.ShapeDtypeStruct(shape, formulas.dtype)  # noqa: E731
-        vectors = [of(b, len(formulas.names(kind))) for kind in ("q", "u", "inputs")]
-        numbers = {a.name: of(*((b,) * batch_parameters), *a.shape) for a in formulas.of_kind("parameters")}
-        exported = export.export(jax.jit(jax.vmap(of_one_state, axes)), platforms=platforms)(of(b), *vectors, numbers)
+
+        def array(*shape: Any) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct(shape, formulas.dtype)
+
+        vectors = [array(b, len(formulas.names(kind))) for kind in ("q", "u", "inputs")]
+        numbers = {a.name: array(*((b,) * batch_parameters), *a.shape) for a in formulas.of_kind("parameters")}
+        exported = export.export(jax.jit(jax.vmap(of_one_state, axes)), platforms=platforms)(
+            array(b), *vectors, numbers
+        )
         if path is not None:
             write_file(path, bytes(exported.serialize(vjp_order=derivatives)))
     return exported

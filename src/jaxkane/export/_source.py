@@ -1,6 +1,6 @@
-"""Equations as source code: C99 without dependencies, and Python that needs NumPy alone. Compiles and runs nothing.
+"""Equations as source code: C99 without dependencies, and Python with NumPy. Does not compile or run anything.
 
-Both are written from one graph of scalars, by a `Language` each. What all exports share stands first: functions, names.
+Both are written from one graph of scalars, each by a `Language`. Functions and names that all exports share come first.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from .._common.files import write_file
 from .._common.lookup import refuse_unknown
-from .._kane.formulas import JACOBIANS, OFFERED, Formulas
+from .._integrate.jumps import warn_of_jumps
+from .._kane.expression_graph import JACOBIANS, OFFERED, Formulas
 from .._scalarjit.backends.numpy import NUMPY_NAMES
 from .._scalarjit.backends.source import (
     ARITHMETIC,
@@ -42,38 +44,38 @@ _USUAL = ("rates", "equations", "dependent_speeds", *JACOBIANS)
 def function_names(
     formulas: Formulas, functions: Sequence[str] | None, usual: Sequence[str] = _USUAL
 ) -> tuple[str, ...]:
-    """Names of functions, checked; by default the usual ones that the system has."""
+    """Check names of functions. Default: the usual ones that the system has."""
     if functions is None:
         needs = {"dependent_speeds": "u_dep", "input_jacobian": "inputs", "parameter_jacobian": "parameters"}
         available = tuple(name for name in usual if name not in needs or formulas.names(needs[name]))
         return (*available, "state_rates") if formulas.system.states else available
     if isinstance(functions, str):
-        raise TypeError(f"functions is a sequence of names; one is ({functions!r},).")
+        raise TypeError(f"`functions` must be a sequence of names, e.g. ({functions!r},).")
     functions = tuple(dict.fromkeys(functions))
     if not functions:
-        raise ValueError(f"{formulas.name}: `functions` names none; leave it out for the usual ones.")
+        raise ValueError(f"{formulas.name}: `functions` is empty. Omit it for the usual functions.")
     refuse_unknown(functions, OFFERED, f"{formulas.name}: there is no function", "there are")
     return functions
 
 
 def check_function(formulas: Formulas, function: Any, exporter: str) -> None:
-    """Refuse what is not the name of one function."""
+    """Refuse a value that is not the name of one function."""
     if not isinstance(function, str):
-        raise TypeError(f"{exporter} exports one function at a time; `function` is its name, got {function!r}.")
+        raise TypeError(f"{exporter} exports one function; `function` must be its name, got {function!r}.")
     refuse_unknown([function], OFFERED, f"{formulas.name}: there is no function", "there are")
 
 
 def parameters(system: System) -> dict[str, np.ndarray]:
-    """A system's parameters by name, in the order in which exported functions take them.
+    """A system's parameters by name, in the order of the arguments of exported functions.
 
-    A parameter of a part is called by its path, "frame.mass"; one with axes is an array.
+    The name of a part's parameter is its path, e.g. "frame.mass". A parameter with axes is an array.
     """
     return Formulas(system).values()
 
 
 def in_ascii(name: str) -> str:
-    """A name of letters, digits and underscores that begins with a letter: Greek letters by their names, accents
-    dropped, "frame.mass" as frame_mass, "moments[2]" as moments_2."""
+    """A name of letters, digits and underscores that begins with a letter. Greek letters are written by name and
+    accents are dropped; "frame.mass" becomes frame_mass, "moments[2]" becomes moments_2."""
     words = []
     for letter in unicodedata.normalize("NFKD", name):
         if letter.isascii():
@@ -89,11 +91,11 @@ def in_ascii(name: str) -> str:
 
 
 def identifiers(names: Iterable[str], reserved: Collection[str], in_ascii_only: bool = True) -> list[str]:
-    """For each name an identifier of its own: what is reserved, or equal to another, gets an underscore or a number."""
+    """A unique identifier for each name. A reserved or repeated name gets an underscore or a number."""
     unique: list[str] = []
     used = set(reserved)
     for name in names:
-        own = unicodedata.normalize("NFKC", name)  # as Python reads it
+        own = unicodedata.normalize("NFKC", name)  # as Python normalizes it
         word = own if own.isidentifier() and not in_ascii_only else in_ascii(name)
         candidates = (word, f"{word}_", *(f"{word}_{i}" for i in range(2, 10_000)))
         unique.append(next(c for c in candidates if c not in used))
@@ -101,13 +103,8 @@ def identifiers(names: Iterable[str], reserved: Collection[str], in_ascii_only: 
     return unique
 
 
-def write_file(path: str | Path, content: bytes) -> None:
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Path(path).write_bytes(content)
-
-
 def variable_units(system: System) -> dict[str, str]:
-    """Units of coordinates, speeds and inputs, where they are declared."""
+    """Units of coordinates, speeds and inputs, if declared."""
     declared = units_of(system)
     names = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
     return {name: unit_of(name, declared) for name in names}
@@ -118,7 +115,7 @@ def _title(formulas: Formulas) -> str:
 
 
 def _meaning(formulas: Formulas, function: str) -> str:
-    """What the outputs of a function are, where their names do not say it."""
+    """A comment on the outputs of a function, if their names are not clear."""
     if function in JACOBIANS:
         by = {"state_jacobian": "(q, u)", "input_jacobian": "the inputs"}
         return f": derivatives of (q_dot, u_dot) by {by.get(function, 'the parameters, in their order')}"
@@ -126,24 +123,25 @@ def _meaning(formulas: Formulas, function: str) -> str:
 
 
 def _is_read(word: str, text: str) -> bool:
-    """Whether source code reads a variable; members of other objects have the same names."""
+    """Whether source code uses a variable; members of other objects may have the same name."""
     return re.search(rf"(?<![\w.>]){re.escape(word)}(?!\w)", text) is not None
 
 
 def _constant(false_true: Sequence[str], nan: str, infinity: str, single: str = "") -> Callable[[Any, str], str]:
-    """How a language writes numbers; `single` stands behind those in single precision."""
+    """The form of numbers in a language; `single` is the suffix of those in single precision."""
 
     def constant(value: Any, dtype: str) -> str:
         if dtype == "bool":
             return false_true[bool(value)]
         if not np.isfinite(value):
             return nan if np.isnan(value) else infinity if value > 0 else f"-{infinity}"
+        # The shortest digits that give the same number. `repr(float(np.float32(0.1)))` would be 0.10000000149011612.
         return f"{np.float32(value)!s}{single}" if dtype == "float32" else repr(float(value))
 
     return constant
 
 
-# Words that C99, C++ or their compilers have reserved, macros of <math.h> and <stdio.h> among them.
+# Reserved words of C99, C++ and their compilers, and macros of <math.h> and <stdio.h>.
 C_WORDS = frozenset(
     """auto break case char const continue default do double else enum extern float for goto if inline int long register
     restrict return short signed sizeof static struct switch typedef union unsigned void volatile while
@@ -158,6 +156,7 @@ C_WORDS = frozenset(
 
 
 TYPES = {"float64": "double", "float32": "float", "bool": "int"}
+# `fmod` has the sign of the dividend, as JAX's `rem`. An operator % would differ between languages.
 _IN_LIBRARY = {"abs": "fabs", "rem": "fmod", **{name: name for name in (*LIBRARY, "sqrt", "floor")}}
 _C_FORMS = {
     **ARITHMETIC,
@@ -165,13 +164,14 @@ _C_FORMS = {
     **{name: call(f"{word}{{s}}", 1 + (name in ("rem", "pow", "atan2"))) for name, word in _IN_LIBRARY.items()},
     "max": call("larger", 2),
     "min": call("smaller", 2),
+    # `Form` has one level for comparisons, && and ||, but in C their precedences differ. So operands get parentheses.
     "and": Form("{0} && {1}", COMPARED, (TIGHT, TIGHT)),
     "or": Form("{0} || {1}", COMPARED, (TIGHT, TIGHT)),
     "xor": Form("{0} != {1}", COMPARED, (TIGHT, TIGHT)),
     "select": Form("{0} ? {1} : {2}", LOOSE, (SUM, SUM, SUM)),
     "convert": Form("({type}){0}", SIGNED, (TIGHT,)),
 }
-# As JAX has them: not a number where one of the two is not, and -0 is less than 0.
+# As in JAX: NaN if one of the two is NaN, and -0 is less than 0.
 HELPERS = {
     "max": "static {type} larger({type} a, {type} b) {{\n"
     "    return a != a || (a == b ? !signbit(a) : a > b) ? a : b;\n}}\n",
@@ -195,20 +195,22 @@ def six_a_line(texts: Sequence[str]) -> str:
 
 
 def in_comment(text: str) -> str:
-    """A text that cannot end the comment in which it stands."""
+    """A text that cannot end the comment that contains it."""
     return text.replace("*/", "* /").replace("\\", "/")
 
 
 COMPARE = """
-/* Prints the largest difference, as a part of the largest expected number. */
-static int compare(const char *name, int n, const {type} *computed, const {type} *expected) {{
-    double difference = 0.0, size = 0.0;
+/* Prints the largest difference relative to `size`, or to the largest expected number if that is larger. */
+static int compare(const char *name, int n, const {type} *computed, const {type} *expected, double size) {{
+    double difference = 0.0;
     int i;
+    for (i = 0; i < n; i++) {{ /* equal entries too have a size */
+        if (fabs((double)expected[i]) > size && fabs((double)expected[i]) < HUGE_VAL) size = fabs((double)expected[i]);
+    }}
     for (i = 0; i < n; i++) {{
         const double d = fabs((double)computed[i] - (double)expected[i]);
         if (computed[i] == expected[i] || (computed[i] != computed[i] && expected[i] != expected[i])) continue;
         if (!(d <= difference)) difference = d; /* also where it is not a number */
-        if (fabs((double)expected[i]) > size) size = fabs((double)expected[i]);
     }}
     printf("%-40s %.1e\\n", name, size > 0.0 ? difference / size : difference);
     return !(difference <= {tolerance} * size);
@@ -232,47 +234,49 @@ def c(
     name: str | None = None,
     dtype: str = "float64",
 ) -> ExportedFiles:
-    """A system's equations as C99 that needs the mathematical library alone.
+    """A system's equations as C99 that needs only the mathematical library.
 
         jk.export.c(bicycle, "generated/bicycle.c")
         # cc -std=c99 -O3 generated/bicycle.c generated/bicycle_test.c -lm -o test && ./test
 
     Every function takes `(t, q, u, inputs, parameters, outputs ...)`: time, arrays in the order of the declared names,
-    a struct of the parameters, and an array for each output, matrices row by row. Outputs must not overlap what is
-    read. The header says what is where, with units; `NAME_default` holds the parameters of this system. Nothing is
-    allocated, kept or read but the arguments, so that threads may share it. What is not a number comes out as NaN, as
-    by JAX.
+    a struct of the parameters, and an array for each output, with matrices row by row. Outputs must not overlap the
+    other arguments. The header documents all arguments with units; `NAME_default` contains the parameters of this
+    system. Functions do not allocate or keep anything, so threads may share them. NaN is propagated as by JAX.
 
     **Arguments:**
 
-    - `path`: of the source, "FOLDER/NAME.c", whose folder is made; beside it `NAME.h`, and `NAME_test.c`,
-        a program that compares every function with numbers that JAX computed.
-    - `functions`: which; by default rates (q_dot, u_dot), equations (M, f), dependent_speeds, and the derivatives of
-        the rates, state_jacobian (by q, u), parameter_jacobian and input_jacobian. There are also
+    - `system`: the system.
+    - `path`: the source file, "FOLDER/NAME.c"; the folder is created. `NAME.h` and `NAME_test.c` are written to the
+        same folder. The test is a program that compares every function with values that JAX computed.
+    - `functions`: names of the functions. Default: rates (q_dot, u_dot), equations (M, f), dependent_speeds, and the
+        derivatives of the rates, state_jacobian (by q, u), parameter_jacobian and input_jacobian. Also available:
         dependent_accelerations, constraint_jacobian, constraint_jacobian_rate, partial_velocities, kinetic_energy.
-    - `name`: what the names of all functions begin with; by default that of the file.
+    - `name`: prefix of all function names. Default: the name of the file.
     - `dtype`: "float64", or "float32" for `float`.
 
     **Returns:** the paths `header`, `source` and `test`.
 
-    **Raises:** `ValueError` for a function that there is not, a batch of systems, and operations that cannot be written
-    as formulas of single numbers, as those of LAPACK for more than 12 speeds.
+    **Raises:** `ValueError` for an unknown function, a batch of systems, and operations that are not formulas of
+    scalars, such as those of LAPACK for more than 12 speeds.
     """
     path = Path(path)
     if path.suffix != ".c":
-        raise ValueError(f"`path` is that of the source, which ends with .c: 'generated/bicycle.c'; got {str(path)!r}.")
+        raise ValueError(f"`path` must end with .c, e.g. 'generated/bicycle.c'; got {str(path)!r}.")
+    warn_of_jumps(system, "jaxkane.export.c")
     formulas = Formulas(system, dtype)
     functions = function_names(formulas, functions)
     module = _CModule(formulas, functions, name or path.stem)
     files = ExportedFiles(path.with_suffix(".h"), path, path.with_name(f"{path.stem}_test.c"))
     texts = (module.header(), module.source(files.header.name), module.test(files.header.name))
     for file, text in zip(files, texts, strict=True):
-        write_file(file, text.encode())
+        write_file(file, text)
     return files
 
 
 class CText:
-    """What all sources in C of a system share: its name, the struct of its parameters, numbers, bodies of functions."""
+    """Elements of all C sources of a system: its name, the struct of its parameters, numbers, and bodies of
+    functions."""
 
     def __init__(self, formulas: Formulas, name: str):
         self.formulas = formulas
@@ -298,6 +302,7 @@ class CText:
             notes += f", {' x '.join(map(str, a.shape))}, row by row" if a.shape else ""
             notes += f" [{a.info.unit}]" if a.info.unit else ""
             comment = f" /* {in_comment(notes.strip(', '))} */" if notes else ""
+            # C99 allows neither arrays of length zero nor empty initializers nor structs without members.
             size = f"[{max(1, len(a.elements))}]" if a.shape else ""
             lines.append(f"    {self.type} {member}{size};{comment}")
         if not self.members:
@@ -305,7 +310,7 @@ class CText:
         return [*lines, f"}} {self.name}_parameters;"]
 
     def default(self) -> str:
-        """What initializes that struct with the system's own."""
+        """The initializer of that struct with the system's own values."""
         texts = []
         for x in self.formulas.values().values():
             numbers = ", ".join(map(self.constant, x.flat))
@@ -313,7 +318,7 @@ class CText:
         return six_a_line(texts or ["0"])
 
     def helpers(self, outputs: Sequence[np.ndarray]) -> list[str]:
-        """Functions that the formulas of these outputs call."""
+        """Helper functions that the formulas of these outputs call."""
         used = {self.formulas.graph.nodes[k].operation for k in needed(self.formulas.graph.nodes, outputs)}
         return [text.format(type=self.type) for operation, text in HELPERS.items() if operation in used]
 
@@ -324,17 +329,18 @@ class CText:
         return six_a_line([self.constant(x) for x in np.ravel(numbers)] or ["0"])
 
     def body(self, read: Sequence[str], by_output: dict[str, np.ndarray], words: dict[int, str]) -> str:
-        """Of a function that reads these arguments, in braces."""
+        """The body of a function with these arguments, in braces."""
         lines, outputs = as_source(self.formulas.graph, list(by_output.values()), words, C)
         for output, elements in zip(by_output, outputs, strict=True):
             lines += [f"{output}[{i}] = {text};" for i, text in enumerate(elements)]
         text = "\n    ".join(lines)
+        # Without this use, compilers warn about an unused argument. All functions have the same arguments.
         unused = [f"(void){word};" for word in (*read, *by_output) if not _is_read(word, text)]
         return "{\n    " + "\n    ".join([*unused, *lines]) + "\n}\n"
 
 
 class _CModule(CText):
-    """The texts of the files for some functions of a system."""
+    """The contents of the files for some functions of a system."""
 
     def __init__(self, formulas: Formulas, functions: tuple[str, ...], name: str):
         super().__init__(formulas, name)
@@ -342,7 +348,7 @@ class _CModule(CText):
 
     def _comment(self) -> str:
         title = in_comment(_title(self.formulas))
-        return f"/* {title}\n   Every function is a formula of its arguments; {self.type} throughout. */\n"
+        return f"/* {title}\n   The results depend only on the arguments; all numbers are {self.type}. */\n"
 
     def _signature(self, function: str) -> str:
         read = f"{self.type} t, const {self.type} *q, const {self.type} *u, const {self.type} *inputs"
@@ -354,14 +360,14 @@ class _CModule(CText):
         lines = [self._comment(), f"#ifndef {guard}", f"#define {guard}", "", "#ifdef __cplusplus"]
         lines += ['extern "C" {', "#endif", "", *self.struct(), "", "/* The parameters that were exported. */"]
         lines += [f"extern const {self.name}_parameters {self.name}_default;", ""]
-        lines += ["/* What the functions read:", "", "   t: time [s]"]
+        lines += ["/* Arguments of the functions:", "", "   t: time [s]"]
         for kind in ("q", "u", "inputs"):
             for i, name in enumerate(self.formulas.names(kind)):
                 unit = f" [{unit_of[name]}]" if unit_of.get(name) else ""
                 lines.append(in_comment(f"   {kind}[{i}]: {name}{unit}"))
             if not self.formulas.names(kind):
                 lines.append(f"   {kind}: none; may be null")
-        lines += ["", "   What they write, matrices row by row; it must not overlap what they read: */", ""]
+        lines += ["", "   Outputs, matrices row by row; they must not overlap the other arguments: */", ""]
         for function in self.functions:
             shapes = ", ".join(
                 f"{output} ({' x '.join(map(str, nodes.shape)) or 'a number'})"
@@ -380,8 +386,8 @@ class _CModule(CText):
         return "\n".join([*parts, *map("{} {}".format, map(self._signature, self.functions), bodies)])
 
     def test(self, header: str) -> str:
-        """A program that calls every function at one state, and compares."""
-        state, expected = _state_and_outputs(self.formulas, self.functions)
+        """A program that calls every function at one state, and compares with stored values."""
+        state, expected, sizes = _state_and_outputs(self.formulas, self.functions)
         lines = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n#include <stdio.h>\n']
         lines += [self.array(kind, state[kind]) for kind in ("q", "u", "inputs")]
         calls = []
@@ -393,29 +399,51 @@ class _CModule(CText):
             outputs = "".join(f", computed_{name}" for name in numbers_of)
             t = self.constant(state["t"])
             calls.append(f"    {self.name}_{function}({t}, q, u, inputs, &{self.name}_default{outputs});")
-            for name, numbers in numbers_of.items():
-                calls.append(f'    wrong += compare("{name}", {numbers.size}, computed_{name}, {name});')
+            for (name, numbers), size in zip(numbers_of.items(), sizes[function].values(), strict=True):
+                calls.append(f'    wrong += compare("{name}", {numbers.size}, computed_{name}, {name}, {size!r});')
         tolerance = "1e-11" if self.formulas.dtype == "float64" else "1e-3"
         lines.append(COMPARE.format(type=self.type, tolerance=tolerance))
         return "\n".join([*lines, "int main(void) {", "    int wrong = 0;", *calls, "    return wrong;", "}", ""])
 
 
-def _state_and_outputs(formulas: Formulas, functions: Iterable[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A random state, and what JAX computes there for this system, all of it finite; or the last of twenty tried."""
+_SMALL_CHANGE = 1e-4
+
+
+def _state_and_outputs(formulas: Formulas, functions: Iterable[str]) -> tuple[dict[str, Any], ...]:
+    """A random state, the outputs that JAX computes there for this system, and the sizes of these outputs.
+
+    All outputs are finite, unless twenty states gave none. The size of an output is its largest entry or its relative
+    change with all arguments, whichever is larger. The largest entry is not enough, because terms may cancel: u_dot of
+    a ball on a turntable is 1e-17 instead of zero, and rounding differs between C and JAX.
+    """
     state: dict[str, Any] = {}
     expected: dict[str, dict[str, np.ndarray]] = {}
+    sizes: dict[str, dict[str, float]] = {}
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        draw = lambda n, rng=rng: rng.uniform(0.2, 0.8, n).astype(formulas.dtype)  # noqa: E731
+
+        def draw(n: Any, rng: Any = rng) -> np.ndarray:
+            return rng.uniform(0.2, 0.8, n).astype(formulas.dtype)
+
         state = {"t": draw(()), **{kind: draw(len(formulas.names(kind))) for kind in ("q", "u", "inputs", "u_dep")}}
         args = [*state.values(), *formulas.values().values()]
+        nearby = [np.asarray(x) * (1 + _SMALL_CHANGE * rng.uniform(-1.0, 1.0, np.shape(x))) for x in args]
+        nearby = [x.astype(formulas.dtype) for x in nearby]
         with jax.enable_x64(formulas.dtype == "float64"):
             for function in functions:
-                outputs = jax.tree.map(np.asarray, jax.jit(formulas.by_jax, static_argnums=0)(function, *args))
+                compiled = jax.jit(formulas.by_jax, static_argnums=0)
+                outputs, others = (jax.tree.map(np.asarray, compiled(function, *x)) for x in (args, nearby))
                 expected[function] = dict(zip(formulas.nodes(function), outputs, strict=True))
+                pairs = zip(formulas.nodes(function), outputs, others, strict=True)
+                with np.errstate(invalid="ignore"):  # infinite entries
+                    sizes[function] = {name: _size(x, (other - x) / _SMALL_CHANGE) for name, x, other in pairs}
         if all(np.all(np.isfinite(x)) for outputs in expected.values() for x in outputs.values()):
             break
-    return state, expected
+    return state, expected, sizes
+
+
+def _size(*values: np.ndarray) -> float:
+    return max(float(np.abs(x[np.isfinite(x)]).max(initial=0.0)) for x in values)
 
 
 _PYTHON_FORMS = {
@@ -426,6 +454,7 @@ _PYTHON_FORMS = {
     },
     **ARITHMETIC,
     "erf": call("_erf"),
+    # In Python, & and | bind more tightly than comparisons, so comparisons need parentheses here.
     "and": Form("{0} & {1}", COMPARED, (TIGHT, TIGHT)),
     "or": Form("{0} | {1}", COMPARED, (TIGHT, TIGHT)),
     "xor": Form("{0} ^ {1}", COMPARED, (TIGHT, TIGHT)),
@@ -454,20 +483,21 @@ def numpy(
     *,
     dtype: str = "float64",
 ) -> str:
-    """A system's equations as the source of a Python module that needs NumPy alone.
+    """A system's equations as the source of a Python module that needs only NumPy.
 
         print(jk.export.numpy(pendulum, functions=("equations",)))
         jk.export.numpy(pendulum, "pendulum.py")  # import pendulum; pendulum.rates(0.0, q, u)
 
-    Every function is `f(t, q, u, inputs=(), parameters=PARAMETERS)`: arrays in the order of the declared names, inputs
-    that are left out being zero; and the parameters by name. What is not a number comes out as NaN, as by JAX, without
-    a warning.
+    Every function is `f(t, q, u, inputs=(), parameters=PARAMETERS)`, with arrays in the order of the declared names and
+    the parameters by name. Omitted inputs are zero. NaN is propagated as by JAX, without a warning.
 
     **Arguments:**
 
-    - `path`: where the source is written; None writes none.
-    - `functions`: which, as `jaxkane.export.c`; by default rates, equations, and dependent_speeds where there are some.
-    - `dtype`: "float64", or "float32".
+    - `system`: the system.
+    - `path`: the file to write, or None.
+    - `functions`: names as in `jaxkane.export.c`. Default: rates, equations, and dependent_speeds if the system has
+        any.
+    - `dtype`: "float64" or "float32".
 
     **Returns:** the source.
 
@@ -476,7 +506,7 @@ def numpy(
     formulas = Formulas(system, dtype)
     text = _source(formulas, function_names(formulas, functions, ("rates", "equations", "dependent_speeds")))
     if path is not None:
-        write_file(path, text.encode())
+        write_file(path, text)
     return text
 
 
@@ -498,7 +528,7 @@ def _source(formulas: Formulas, functions: Sequence[str]) -> str:
 
 
 class _Names:
-    """What variables, parameters and outputs of a function are called. A parameter may be called like a coordinate."""
+    """The names of variables, parameters and outputs of a function. A parameter may have the name of a coordinate."""
 
     def __init__(self, formulas: Formulas, outputs: Iterable[str]):
         kinds = ("q", "u", "inputs", "parameters")
@@ -520,13 +550,13 @@ class _Names:
         return words
 
     def temporary(self) -> str:
-        """The pattern of the names of intermediate results, which no other name fits."""
+        """The pattern of the names of intermediate results; no other name has this form."""
         letters = ("x", "z", *(f"x{'_' * n}" for n in range(1, 10)))
         return next(f"{x}{{}}" for x in letters if not any(re.fullmatch(rf"{x}\d+", word) for word in self.words))
 
 
 def _names_of(formulas: Formulas, kind: str) -> tuple[str, ...]:
-    """Of parameters with axes the whole, of the others every element."""
+    """Names of whole arrays for parameters with axes, of every element for the other kinds."""
     return tuple(a.name for a in formulas.of_kind(kind)) if kind == "parameters" else formulas.names(kind)
 
 
@@ -537,6 +567,7 @@ def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str
         formulas.graph, list(by_output.values()), names.input_words(formulas), PYTHON, names.temporary()
     )
     text = "\n".join([*body, *(e for elements in outputs for e in elements)])
+    # `np.where` evaluates both branches, and the one that is not chosen may divide by zero.
     lines = ["", '@np.errstate(all="ignore")']
     lines.append(f"def {function}(t, q, u, inputs=(), parameters=PARAMETERS):")
     lines.append(f'    """{", ".join(by_output)}{_meaning(formulas, function)}."""')
@@ -547,6 +578,7 @@ def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str
             right = f"np.asarray({kind}, np.{formulas.dtype})"
             if kind == "inputs":
                 right += f" if len(inputs) else np.zeros({len(words)}, np.{formulas.dtype})"
+            # A single name needs a comma, or it would be the whole array.
             lines.append(f"    {', '.join(words)}{',' * (len(words) == 1)} = {right}  # [{units}]")
     for name in _names_of(formulas, "parameters"):
         word = names.of["parameters", name]

@@ -1,4 +1,4 @@
-"""The front door for bicycles: rides with roll, steer and their rates. Knows the Whipple bicycle."""
+"""Fits of the Whipple bicycle to rides with roll, steer and their rates."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ import numpy as np
 
 from ..catalog import WhippleBicycle
 from ..catalog._entry import read_bicycle_file
-from ._declarations import Inertia, Prior
-from ._fit import solve
-from ._model import Unknowns
-from ._optimizers import GradientDescent, Optimizer
-from ._parameters import parameters_of
-from ._problem import Problem, with_options
-from ._result import Fit
-from ._trial import Trial, as_trials
+from .problem.declarations import Inertia, Items, Prior
+from .problem.from_declarations import parameters_of
+from .problem.model import Unknowns
+from .problem.problem import Problem
+from .problem.specification import with_options
+from .problem.trial import Trial, as_trials
+from .result.fit_result import Fit
+from .solve.fit import solve
+from .solve.optimizers import GradientDescent, Optimizer
 
 WHEEL = "rear_wheel_rate"
 SIGMA = {"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0.2}
-"""Standard deviations of a ride's channels where nothing better is known [rad, rad/s]."""
+"""Default standard deviations of the channels of a ride [rad, rad/s]."""
 
 
 @with_options
 def fit_bicycle(
     rides: Sequence[Trial] | Trial,
     bicycle: WhippleBicycle,
-    free: Any,
+    free: Items,
     *,
     optimizer: Optimizer | None = None,
     steps: int | None = None,
@@ -38,17 +39,26 @@ def fit_bicycle(
     progress: bool = False,
     **options: Any,
 ) -> Fit:
-    """The parameters of a bicycle from rides.
+    """Estimate the parameters of a bicycle from rides.
 
-        fit_bicycle(rides, bicycle, free=("steer_damping",), input_bias=("roll_torque", "steer_torque"), window=1.0)
+        fit_bicycle(rides, bicycle, free=("steer_damping", Offset("steer_torque", each="trial")), window=1.0)
 
-    **Arguments:** `rides`, `bicycle`, `free` and `options` as in `bicycle_problem`, of which the most used are
-    `unknown`, `window`, `input_bias`, `sensor_bias`, `priors` and `zero_order_hold`; the rest as in `fit`, with
-    `GradientDescent()` as the default `optimizer`.
+    **Arguments:**
+
+    - `rides`: one `Trial` or several, as in `bicycle_problem`.
+    - `bicycle`: the bicycle, with initial guesses of its parameters.
+    - `free`: the parameters to estimate, as in `fit`.
+    - `optimizer`: by default `GradientDescent()`.
+    - `steps`: the maximum number of steps, as in `fit`.
+    - `start`: the `Unknowns` at which the search starts, as in `fit`.
+    - `checkpoint`: a file from which an interrupted fit can be resumed, as in `fit`.
+    - `callback`: a function of the unknowns and their cost, as in `fit`.
+    - `progress`: whether to show a progress bar.
+    - `options`: the options of `bicycle_problem`, such as `unknown`, `window`, `priors` and `zero_order_hold`.
 
     **Returns:** a `Fit`.
 
-    **Raises:** `ValueError` for a ride without a speed, and what `fit` raises.
+    **Raises:** `ValueError` for a ride without a speed, and the errors of `fit`.
     """
     problem = bicycle_problem(rides, bicycle, free, **options)
     optimizer = GradientDescent() if optimizer is None else optimizer
@@ -60,43 +70,49 @@ def fit_bicycle(
 def bicycle_problem(
     rides: Sequence[Trial] | Trial,
     bicycle: WhippleBicycle,
-    free: Any,
+    free: Items,
     *,
     unknown: Sequence[str] | Mapping[str, float | None] | None = None,
     window: float | None = None,
-    input_bias: Sequence[str] | Mapping[str, float | None] = (),
     priors: Mapping[str, Prior] | str | os.PathLike[str] | None = None,
     **options: Any,
 ) -> Problem:
-    """What `fit_bicycle` solves: for `identifiability` before rides are measured, or to `load` what was found.
+    """The problem that `fit_bicycle` solves. Use it for `identifiability` before the rides, or to `load` a fit.
 
     **Arguments:**
 
-    - `rides`: `Trial`s with channels such as roll, steer, roll_rate and steer_rate [rad, rad/s], inputs such as
-        steer_torque [N m], and `initial={"speed": v}` [m/s] (a number or samples; rear_wheel_rate serves too).
-    - `bicycle`: with initial guesses of its parameters. `free`: what to find, as in `fit`.
-    - `unknown`: what every window starts with besides; by default roll, steer and their rates, and in a ride cut into
-        windows the rear wheel's rate, near what is known of the speed (5 %): it changes as the bicycle rolls. Yaw and
-        the place start at zero, pitch follows.
-    - `input_bias`: inputs with a constant offset in every ride, as of a motor's calibration or a tilted road.
-    - `priors`: (mean, standard deviation) by name, or a text file of BicycleParameters, of which those count that were
-        measured with a deviation.
-    - `window` and `options`: as in `fit`: `sensor_bias`, `simulation`, ...
+    - `rides`: one `Trial` or several. Channels are for example roll, steer [rad], roll_rate and steer_rate [rad/s]. An
+        input is for example steer_torque [N m]. The speed is `initial={"speed": v}` [m/s], a number or samples.
+        Alternatively, pass or measure rear_wheel_rate [rad/s].
+    - `bicycle`: the bicycle, with initial guesses of its parameters.
+    - `free`: the parameters to estimate, as in `fit`.
+    - `unknown`: the unknown initial values of every window, as in `fit`. The default is roll, steer and their rates.
+        With `window`, the default also contains the rear wheel's rate, because the speed changes during a ride. Its
+        prior has a standard deviation of 5 % of the largest given rate. Yaw and position start at zero, and pitch
+        follows from the constraints.
+    - `window`: the length of a window [s], as in `fit`.
+    - `priors`: by name, (mean, standard deviation); or a text file of BicycleParameters, from which the values with a
+        standard deviation are used.
+    - `options`: other options of `fit`, such as `simulation`.
 
     **Returns:** a `Problem`.
 
-    **Raises:** `ValueError` for a ride without a speed, and what `fit` raises.
+    **Raises:** `ValueError` for a ride without a speed, and the errors of `fit`.
     """
     rides = as_trials(rides)
     if not isinstance(bicycle, WhippleBicycle):
-        raise TypeError(f"`bicycle` is a WhippleBicycle, got {type(bicycle).__name__}: `fit` takes other systems.")
+        raise TypeError(
+            f"`bicycle` must be a WhippleBicycle, got {type(bicycle).__name__}. For other systems, call "
+            "`jaxkane.fit.fit`."
+        )
     channels = tuple(dict.fromkeys(name for ride in rides for name in ride.measured))
-    names = parameters_of(bicycle, free, options.get("noise"), channels).names
+    names = parameters_of(bicycle, free, options.get("noise"), channels, rides).names
     if isinstance(priors, (str, os.PathLike)):
         priors = bicycle_priors(priors)
     if "rR" in names and any("speed" in ride.initial for ride in rides):
         raise ValueError(
-            "With rR free a speed does not give the rear wheel's rate: give that as initial={'rear_wheel_rate': rate}."
+            "`free` contains rR, so the speed of a ride does not determine the rate of the rear wheel. Pass "
+            "initial={'rear_wheel_rate': rate} instead of the speed."
         )
     rides = bicycle_rides(rides, bicycle)
     if unknown is None:
@@ -104,31 +120,56 @@ def bicycle_problem(
         if window is not None:
             known = [np.abs(ride.initial[WHEEL]).max() for ride in rides if WHEEL in ride.initial]
             unknown[WHEEL] = 0.05 * max(known) if known else None
-    posed = {"unknown": unknown, "input_bias": input_bias, "window": window, "priors": priors}
+    posed = {"unknown": unknown, "window": window, "priors": priors}
     return Problem.of(bicycle, rides, free, **posed, **options)
 
 
 def bicycle_rides(rides: Sequence[Trial] | Trial, bicycle: WhippleBicycle) -> tuple[Trial, ...]:
-    """Rides with the rear wheel's rate in the place of their speed, as a fit takes them.
+    """Replace the speed of rides by the rear wheel's rate, as a fit of the bicycle requires.
 
-    held_back = validate(fit, bicycle_rides(other_rides, bicycle))
+        validate(fit, bicycle_rides(other_rides, bicycle))
+
+    **Arguments:**
+
+    - `rides`: one `Trial` or several, with `initial={"speed": v}` [m/s].
+    - `bicycle`: the bicycle, whose rear wheel radius is used.
+
+    **Returns:** a tuple of `Trial`s.
+
+    **Raises:** `ValueError` for a ride without a speed.
     """
     rides = as_trials(rides)
     return tuple(_with_wheel_rate(ride, bicycle) for ride in rides)
 
 
 def bicycle_priors(path: str | os.PathLike[str]) -> dict[str, Prior]:
-    """What a text file of BicycleParameters says was measured: (value, standard deviation) by name.
+    """Read priors from a text file of BicycleParameters.
 
-    Entries without a deviation are not among them: how well they are known is not given.
+    Values without a standard deviation are ignored, because their accuracy is not given.
+
+    **Arguments:**
+
+    - `path`: the path of the file.
+
+    **Returns:** by name, (value, standard deviation).
     """
     values, deviations = read_bicycle_file(path)
     return {name: (values[name], deviation) for name, deviation in deviations.items() if deviation > 0}
 
 
 def frame_inertia(part: str, **more: Any) -> Inertia:
-    """Mass centre and inertia of a part of the bicycle, kept possible: "B" (rear frame and rider), "H" (handlebar and
-    fork), both symmetric about the bicycle's plane, or the wheels "R" and "F". The mass stays, unless `fixed=()`."""
+    """The `Inertia` of a part of the bicycle, for `free` of a fit.
+
+    The mass keeps its value, unless `fixed=()` is passed. The parts "B" and "H" are symmetric about the bicycle's
+    plane.
+
+    **Arguments:**
+
+    - `part`: "B" (rear frame and rider), "H" (handlebar and fork), "R" (rear wheel) or "F" (front wheel).
+    - `more`: the arguments `fixed`, `prior` and `unit` of `Inertia`.
+
+    **Returns:** an `Inertia`. For "B" and "H" it contains the mass centre.
+    """
     if part in ("R", "F"):
         moments = (f"I{part}xx", f"I{part}yy", f"I{part}xx")
         return Inertia(moments, mass=f"m{part}", **{"fixed": (f"m{part}",), **more})
@@ -142,5 +183,8 @@ def _with_wheel_rate(ride: Trial, bicycle: WhippleBicycle) -> Trial:
     if "speed" in initial:
         initial["rear_wheel_rate"] = -initial.pop("speed") / float(bicycle.rR)
     elif "rear_wheel_rate" not in initial and "rear_wheel_rate" not in ride.measured:
-        raise ValueError(f"{ride.name}: a ride needs its speed: Trial(..., initial={{'speed': v}}) [m/s].")
+        raise ValueError(
+            f"{ride.name}: the speed is missing. Pass Trial(..., initial={{'speed': v}}) [m/s], or measure "
+            "rear_wheel_rate."
+        )
     return ride.with_initial_state(initial)

@@ -1,4 +1,4 @@
-"""Mechanisms as trees of links and joints, given as data: `mechanism([Link(...), ...])` is an ordinary `System`."""
+"""Mechanisms as trees of links and joints, defined by data: `mechanism([Link(...), ...])` is an ordinary `System`."""
 
 from ._joints import Joint as Joint
 from ._joints import ball as ball

@@ -1,4 +1,5 @@
-"""Types of joints, with their coordinates, rates, kinematics and loads, and joints as users write them."""
+"""Types of joints, with their coordinates, rates, kinematics and loads, and the functions that users call for
+joints."""
 
 from __future__ import annotations
 
@@ -14,52 +15,54 @@ from .. import rotations
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, Triple, is_zero, mul, sub
 from .._system.kinematics import Frame, Point
-from .._system.motion import Body, Force, Load, Torque
+from .._system.motion import Force, Load, ReflectedInertia, Torque
 
 
 def unit_vector(axis: Any, name: str) -> Triple:
-    """A direction as three floats of length 1; what is zero or one but for rounding is made so."""
+    """A direction as three floats of length 1. Components within rounding of zero or one are made exact."""
     a = exact_numbers(axis, f"The axis of {name!r}")
     length = float(np.linalg.norm(a)) if a.shape == (3,) else 0.0
     if not length > 0.0:
-        raise ValueError(f"The axis of {name!r} is three numbers that are not all zero, got {axis!r}.")
+        raise ValueError(f"The axis of {name!r} must be three numbers that are not all zero, got {axis!r}.")
     return tuple(exact(x) for x in a / length)  # type: ignore[return-value]
 
 
 def exact_numbers(values: Any, what: str) -> np.ndarray:
-    """Numbers of a structure, by which programs are kept: nothing is differentiated by them.
+    """Numbers of a structure, which are constants of compiled programs and cannot be differentiated.
 
-    **Raises:** `TypeError` for what is traced; `ValueError` for what is no finite number.
+    **Raises:** `TypeError` for traced values; `ValueError` for values that are not finite numbers.
     """
     if any(isinstance(x, Tracer) for x in jax.tree.leaves(values)):
         raise TypeError(
-            f"{what} is part of the structure, of exact numbers: it cannot be traced, as by jax.jit, jax.grad or "
-            "jax.vmap. Places, masses, inertias, gains, dampers and springs can."
+            f"{what} is part of the structure and must be concrete, but is traced (by jax.jit, jax.grad or jax.vmap). "
+            "Positions, masses, inertias, gains, dampers and springs may be traced."
         )
     try:
         numbers = np.asarray(values)
     except (TypeError, ValueError):
         numbers = np.array(None)
-    if numbers.dtype.kind not in "iuf" or not np.all(np.isfinite(numbers)):  # text that reads as a number is none
-        raise ValueError(f"{what}: finite numbers are asked for, got {values!r}.")
+    # text is refused, also if it could be converted to a number
+    if numbers.dtype.kind not in "iuf" or not np.all(np.isfinite(numbers)):
+        raise ValueError(f"{what} must be finite numbers, got {values!r}.")
     return numbers.astype(float)
 
 
 def exact(x: float) -> float:
-    """A direction cosine, freed from the rounding of the angle that it came from."""
+    """A direction cosine without the rounding error of the angle from which it was computed."""
     nearest = float(round(x))
     return nearest if abs(x - nearest) < 1e-15 else float(x)
 
 
 def is_structural_zero(value: Any) -> bool:
-    """A zero that was written as a number is structure and costs nothing; a JAX array is a parameter whatever it is."""
+    """Whether a value is a zero that was written as a number. Such a zero is structure and costs nothing; a JAX array
+    is a parameter."""
     return not isinstance(value, jax.Array) and np.ndim(value) == 0 and not isinstance(value, str) and value == 0
 
 
 def components(name: str, values: Any) -> dict[str, Any]:
     """Three numbers as parameters `name.x`, `name.y`, `name.z`."""
     if not hasattr(values, "__len__") or len(values) != 3:
-        raise ValueError(f"{name} has three components, got {values!r}.")
+        raise ValueError(f"{name} must have three components, got {values!r}.")
     return {f"{name}.{end}": x for end, x in zip("xyz", values, strict=True) if not is_structural_zero(x)}
 
 
@@ -74,11 +77,11 @@ class JointKinematics(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class JointType:
-    """One joint's static part. `axis` is a unit vector in the link's frame, where the joint has one."""
+    """The static part of one joint. `axis`: a unit vector in the link's frame, for joints with an axis."""
 
     name: str
     axis: Triple = (0.0, 0.0, 1.0)
-    reference: float = 0.0  # the coordinate where the link stands as it was placed
+    reference: float = 0.0  # the coordinate at the link's initial position and orientation
 
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = ()  # ending of the name, unit
     speeds: ClassVar[tuple[tuple[str, str], ...]] = ()
@@ -95,26 +98,26 @@ class JointType:
         return u
 
     def norm(self, q: Sequence[Component]) -> tuple[Component, ...]:
-        """Residuals of the coordinates' own: of Euler parameters, their norm."""
+        """Residuals of the coordinates themselves: the norm of Euler parameters."""
         return ()
 
     def displacement(self, q: Sequence[Component], rest: Sequence[Component]) -> tuple[Component, ...]:
-        """How far the joint is from where its spring rests, along each speed."""
+        """The displacement of the joint from the rest position of its spring, along each speed."""
         raise NotImplementedError
 
     def loads(self, at: JointKinematics, forces: Sequence[Component]) -> tuple[Load, ...]:
-        """Forces along each speed [N or N m], with their reactions on what is before the joint."""
+        """Forces along each speed [N or N m], with their reactions on the parent."""
         raise NotImplementedError
 
-    def rotors(self, N: Frame, at: Point, armature: Component, u: Sequence[Component]) -> tuple[Body, ...]:
-        """What adds `armature` to the diagonal of the mass matrix and nothing else, 1/2 armature u^2 for each speed.
+    def rotors(self, N: Frame, at: Point, armature: Component, u: Sequence[Component]) -> tuple[ReflectedInertia, ...]:
+        """Bodies of kinetic energy 1/2 armature u^2: they add `armature` to the diagonal of the mass matrix.
 
-        A rotor behind a gear turns with the joint's rate alone, whatever its carrier does: its angular velocity is
-        u N.x, fixed in direction, so that its momentum changes with u_dot and nothing else.
+        The angular velocity u N.x does not depend on the motion of the carrier. Its direction is fixed, so that the
+        moment depends only on u_dot.
         """
         triples = [[*u[i : i + 3], 0.0, 0.0][:3] for i in range(0, len(u), 3)]
         return tuple(
-            Body(
+            ReflectedInertia(
                 0.0,
                 tuple(armature if 3 * i + j < len(u) else 0.0 for j in range(3)),
                 at,
@@ -155,9 +158,8 @@ class Slide(JointType):
 
     def loads(self, at, forces):
         push = forces[0] * at.parent_frame.vector(*self.axis)
-        rail = at.parent_point.fixed(
-            at.child_point.position_from(at.parent_point), at.parent_frame
-        )  # at the slider, not with it
+        # The reaction acts on the parent's material point at the slider, which does not move with the slider.
+        rail = at.parent_point.fixed(at.child_point.position_from(at.parent_point), at.parent_frame)
         return Force(push, at.child_point), Force(-push, rail)
 
 
@@ -211,16 +213,17 @@ class Free(JointType):
 
 
 def _about(P: Point, F: Frame, G: Frame, anchor: Triple) -> Point:
-    """P behind a rotation from F to G about the point at `anchor` from it."""
+    """P after a rotation from F to G about the point at `anchor` from it."""
     if all(is_zero(x) for x in anchor):
         return P
     return P.fixed(F.vector(*anchor)).fixed(G.vector(*(mul(-1.0, x) for x in anchor)))
 
 
 def _rotation_vector(e: Sequence[Component]) -> tuple[Component, ...]:
-    """Angle times axis of Euler parameters, scalar last; the shorter way round [rad].
+    """Angle times axis of Euler parameters, scalar last; the shorter rotation [rad].
 
-    2 atan2(|v|, w) / |v| is even in |v|: beside zero its series is used, whose derivatives are right there too.
+    2 atan2(|v|, w) / |v| is even in |v|. Near zero its series is used, because the derivatives of the formula are not
+    finite there.
     """
     *v, w = (jnp.asarray(x) for x in e)
     sign = jnp.where(w < 0, -1.0, 1.0)
@@ -236,7 +239,7 @@ def _rotation_vector(e: Sequence[Component]) -> tuple[Component, ...]:
 
 
 class Joint(NamedTuple):
-    """What joins a link to its parent: joint types that follow each other, and numbers by the names of parameters."""
+    """The connection of a link to its parent: a chain of joint types, and numbers by the names of parameters."""
 
     types: tuple[JointType, ...]
     values: Mapping[str, Any]
@@ -247,20 +250,23 @@ def hinge(
     axis: Any = (0.0, 0.0, 1.0),
     *,
     anchor: Any = (0.0, 0.0, 0.0),
-    damping: Any = 0.0,
-    stiffness: Any = 0.0,
-    rest: Any = 0.0,
-    armature: Any = 0.0,
+    damping: Component = 0.0,
+    stiffness: Component = 0.0,
+    rest: Component = 0.0,
+    armature: Component = 0.0,
     reference: float = 0.0,
 ) -> Joint:
     """A hinge: the coordinate `name` [rad], the speed `name_rate` [rad/s].
 
     **Arguments:**
 
-    - `axis`, of any length, and `anchor` [m], the place of the hinge, in the link's frame.
-    - `damping` [N m s/rad], `stiffness` [N m/rad] of a spring that rests at the angle `rest` [rad].
-    - `armature` [kg m^2]: the inertia of a geared rotor as felt at the joint, on the diagonal of the mass matrix.
-    - `reference` [rad], an exact number: the coordinate where the link stands as its position and orientation say.
+    - `axis`: of any length, in the link's frame.
+    - `anchor` [m]: the position of the hinge, in the link's frame.
+    - `damping` [N m s/rad], `stiffness` [N m/rad]: of a damper and a spring.
+    - `rest` [rad]: the angle at which the spring is relaxed.
+    - `armature` [kg m^2]: the inertia of a geared rotor, reflected to the joint. It is added to the diagonal of the
+        mass matrix.
+    - `reference` [rad]: the coordinate at the link's `position` and `orientation`. An exact number, not a parameter.
     """
     values = _numbers(name, damping=damping, stiffness=stiffness, rest=rest, armature=armature)
     return Joint(
@@ -273,15 +279,15 @@ def slide(
     name: str,
     axis: Any = (0.0, 0.0, 1.0),
     *,
-    damping: Any = 0.0,
-    stiffness: Any = 0.0,
-    rest: Any = 0.0,
-    armature: Any = 0.0,
+    damping: Component = 0.0,
+    stiffness: Component = 0.0,
+    rest: Component = 0.0,
+    armature: Component = 0.0,
     reference: float = 0.0,
 ) -> Joint:
     """A slider along `axis` of the link's frame: the coordinate `name` [m], the speed `name_rate` [m/s].
 
-    `damping` [N s/m], `stiffness` [N/m], `rest` [m], `armature` [kg], `reference` [m]: as of `hinge`.
+    **Arguments** as of `hinge`: `damping` [N s/m], `stiffness` [N/m], `rest` [m], `armature` [kg], `reference` [m].
     """
     values = _numbers(name, damping=damping, stiffness=stiffness, rest=rest, armature=armature)
     return Joint((Slide(name, unit_vector(axis, name), _reference(reference, name)),), values)
@@ -292,45 +298,66 @@ def _reference(value: Any, name: str) -> float:
 
 
 def ball(
-    name: str, *, anchor: Any = (0.0, 0.0, 0.0), damping: Any = 0.0, stiffness: Any = 0.0, armature: Any = 0.0
+    name: str,
+    *,
+    anchor: Any = (0.0, 0.0, 0.0),
+    damping: Component = 0.0,
+    stiffness: Component = 0.0,
+    armature: Component = 0.0,
 ) -> Joint:
-    """A ball joint: Euler parameters `name_e1` ... `name_e4`, scalar last, and the relative angular velocity
-    `name_w1` ... `name_w3` along the link's axes [rad/s].
+    """A ball joint: Euler parameters `name_e1` ... `name_e4`, scalar last, and the relative angular velocity `name_w1`
+    ... `name_w3` along the link's axes [rad/s].
 
-    `anchor` [m] in the link's frame; `damping` [N m s/rad]; `stiffness` [N m/rad] times the rotation vector from where
-    all Euler parameters but the last are zero; `armature` [kg m^2] for each of the three.
+    **Arguments:**
+
+    - `anchor` [m]: in the link's frame.
+    - `damping` [N m s/rad].
+    - `stiffness` [N m/rad]: times the rotation vector from the orientation with zero vector part.
+    - `armature` [kg m^2]: for each of the three speeds.
     """
     values = _numbers(name, damping=damping, stiffness=stiffness, armature=armature)
     return Joint((Ball(name),), values | components(f"anchor.{name}", anchor))
 
 
-def free(name: str, *, damping: Any = 0.0, stiffness: Any = 0.0, rest: Any = (0.0,) * 3, armature: Any = 0.0) -> Joint:
-    """No joint at all, of a link that flies: place `name_x`, `name_y`, `name_z` of its origin in the inertial frame [m]
-    and Euler parameters `name_e1` ... `name_e4`; velocity `name_vx` ... in the inertial frame [m/s], angular velocity
+def free(
+    name: str,
+    *,
+    damping: Component = 0.0,
+    stiffness: Component = 0.0,
+    rest: Any = (0.0,) * 3,
+    armature: Component = 0.0,
+) -> Joint:
+    """A free link on the ground: position `name_x`, `name_y`, `name_z` of its origin in the inertial frame [m] and
+    Euler parameters `name_e1` ... `name_e4`; velocity `name_vx` ... in the inertial frame [m/s], angular velocity
     `name_w1` ... along its own axes [rad/s].
 
-    `damping`, `stiffness` and `armature` are for all six, in SI units; the spring rests at the place `rest` [m].
+    **Arguments:**
+
+    - `damping`, `stiffness`, `armature`: for all six speeds, in SI units.
+    - `rest` (3,) [m]: the position at which the spring is relaxed.
     """
     values = _numbers(name, damping=damping, stiffness=stiffness, armature=armature)
     return Joint((Free(name),), values | components(f"rest.{name}", rest))
 
 
 def fixed() -> Joint:
-    """A rigid connection: as no joint."""
+    """A rigid connection, equivalent to no joint."""
     return Joint((), {})
 
 
 def universal(name: str, axes: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **options: Any) -> Joint:
-    """Two hinges, `name_1` on the carrier and `name_2` on the link, about two axes; `options` of `hinge`, for both."""
+    """Two hinges about two axes, `name_1` on the parent and `name_2` on the link; `options` of `hinge`, for both."""
     if len(axes) != 2:
-        raise ValueError(f"A universal joint has two axes, {name!r} {len(axes)}: give several hinges to a link.")
+        raise ValueError(
+            f"A universal joint needs two axes, but {name!r} has {len(axes)}. Pass several hinges to the link instead."
+        )
     return _chain([hinge(f"{name}_{i + 1}", axis, **options) for i, axis in enumerate(axes)])
 
 
 def planar(name: str, axes: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **options: Any) -> Joint:
     """Two sliders `name_x` and `name_y` along two axes, and a hinge `name_angle` about the normal of their plane.
 
-    `options`, as `damping`, is of all three, in SI units.
+    `options`, e.g. `damping`, are for all three, in SI units.
     """
     first, second = (np.asarray(axis, float) for axis in axes)
     normal = np.cross(first, second)

@@ -1,4 +1,4 @@
-"""Links, sites, actuators and loops as users write them, and the mechanism that is made of them."""
+"""Links, sites, actuators and loops as users define them, and the mechanism that is made of them."""
 
 from __future__ import annotations
 
@@ -31,23 +31,25 @@ from ._mechanism import (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Link:
-    """A rigid link, its place in the tree, and the joints by which its parent carries it.
+    """A rigid link, its position in the tree, and the joints to its parent.
 
         Link("forearm", parent="upper arm", joints=hinge("elbow", (0, 1, 0)), position=(0, 0, -0.3), mass=1.2,
              center=(0, 0, -0.12), inertia=(0.01, 0.01, 0.001))
 
     **Arguments:**
 
+    - `name`: of the link, without a dot.
     - `parent`: the name of another link; None for the ground.
-    - `joints`: one, or several that follow each other, all written in the link's frame; none for a rigid connection.
-    - `position` [m] and `orientation`: the link's frame in its parent's, where all joint coordinates are zero. The
-        orientation is four Euler parameters (scalar last), a sequence and its angles as ("3-1-2", (a, b, c)) [rad], or
-        a (3, 3) matrix whose columns are the link's axes in the parent.
-    - `mass` [kg], `center` [m] of mass, `inertia` [kg m^2] about it along the link's axes: three principal moments, or
-        a (3, 3) matrix. Without a mass the link is a frame that carries others.
+    - `joints`: one, or a chain of several, all defined in the link's frame; none for a rigid connection.
+    - `position` [m], `orientation`: the link's frame in its parent's, for zero joint coordinates. The orientation is
+        four Euler parameters (scalar last), a sequence and its angles, e.g. ("3-1-2", (a, b, c)) [rad], or a (3, 3)
+        matrix whose columns are the link's axes in the parent.
+    - `mass` [kg], `center` [m]: mass and mass centre. A link without a mass is a frame that carries others.
+    - `inertia` [kg m^2]: about the mass centre, along the link's axes: three principal moments, or a (3, 3) matrix.
 
     Numbers become parameters: `mass.forearm`, `center.forearm.z`, `inertia.forearm.xx`, `position.forearm.z`. A zero
-    that is written as a number is part of the structure, costs nothing and is no parameter; `jnp.zeros(())` is one.
+    that is written as a number is not a parameter but part of the structure, and costs nothing. Write `jnp.zeros(())`
+    for a parameter that is zero.
     """
 
     name: str
@@ -62,9 +64,10 @@ class Link:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Site:
-    """A named point of a link (None: of the ground), for pictures, sensors and loops: `motion["name"]`.
+    """A named point of a link (None: of the ground), for animations, sensors and loops: `motion["name"]`.
 
-    `position` [m] in the link's frame, parameters `site.name.x`; `orientation` as of `Link`, for a rigid `Loop`.
+    - `position` [m]: in the link's frame, with the parameters `site.name.x`, ...
+    - `orientation`: as of `Link`, for a rigid `Loop`.
     """
 
     name: str
@@ -79,9 +82,14 @@ class Actuator:
 
         force along the joint's speeds = gear * (gain * input + offset - position_gain * length - velocity_gain * rate)
 
-    **Arguments:** `joint`: its name; `gear`: one number for a hinge or a slider, three for a ball joint, six for a free
-    one; length = gear * coordinate, of hinges and sliders; rate = gear . speeds. The other four are parameters, as
-    `gain.name`; a servo of stiffness k has `gain=k, position_gain=k`.
+    **Arguments:**
+
+    - `joint`: its name.
+    - `gear`: one number for a hinge or a slider, three for a ball joint, six for a free one.
+    - `gain`, `offset`, `position_gain`, `velocity_gain`: parameters, named `gain.name` and so on. A servo of stiffness
+        k has `gain=k, position_gain=k`.
+
+    length = gear * coordinate, for hinges and sliders; rate = gear . speeds.
     """
 
     name: str
@@ -95,10 +103,11 @@ class Actuator:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Loop:
-    """Two sites that are in one place: what closes a loop; `rigid`, with one orientation too, and not half a turn away.
+    """A loop closure: two sites that coincide. With `rigid` their orientations coincide too, and may not differ by half
+    a turn.
 
-    Those of the three (six) residuals count that are independent of each other at trial coordinates; of a loop in a
-    plane two (three).
+    Only independent residuals are used, determined at trial coordinates. A spatial loop has three (six if rigid), a
+    planar loop two (three).
     """
 
     first: str
@@ -108,9 +117,9 @@ class Loop:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Coupling:
-    """A joint that follows another, as gears do: first = c0 + c1 * second + c2 * second^2 + ...
+    """A joint that follows another, as by gears: first = c0 + c1 * second + c2 * second^2 + ...
 
-    Names of hinges or sliders, and exact numbers; without `second` the joint is held at c0.
+    The arguments are names of hinges or sliders, and exact numbers. Without `second` the joint is fixed at c0.
     """
 
     first: str
@@ -129,26 +138,28 @@ def mechanism(
     name: str = "Mechanism",
     left_out: Sequence[str] = (),
 ) -> Mechanism:
-    """A `System` of links in a tree, joined as they say.
+    """A `System` of links in a tree.
 
         upper = Link("upper", joints=hinge("q1", (0, 1, 0)), mass=2.0, center=(0, 0, -0.2), inertia=(0.02, 0.02, 0))
         arm = mechanism([upper], actuators=[Actuator("motor", "q1")])
 
     **Arguments:**
 
-    - `links`: in any order, a parent before or behind its children.
-    - `gravity` [m/s^2] in the inertial frame N; parameters `gravity.x` and so on.
-    - `actuators`, `sites`: inputs that drive joints; named points.
-    - `loops`: what closes loops, `Loop` and `Coupling`. They are configuration constraints and velocity residuals.
-    - `dependent`: the hinges and sliders that are solved for, as many as there are residuals; by default those are
-        found by which the residuals can best be solved, at trial coordinates.
+    - `links`: in any order.
+    - `gravity` (3,) [m/s^2]: in the inertial frame N; parameters `gravity.x` and so on.
+    - `actuators`: inputs that drive joints.
+    - `sites`: named points.
+    - `loops`: closed loops, `Loop` and `Coupling`. They become configuration constraints and velocity residuals.
+    - `dependent`: the hinges and sliders that are solved for, one for each residual. Default: the best-conditioned
+        choice at trial coordinates.
     - `name`: of its class, for messages.
+    - `left_out`: elements of a file that were not imported.
 
-    **Returns:** a `Mechanism`, of one class for each structure. Its coordinates and speeds are those of its joints, in
-    the order of the tree.
+    **Returns:** a `Mechanism`, with one class for each structure. Its coordinates and speeds are those of its joints,
+    in the order of the tree.
 
-    **Raises:** `ValueError` for names that stand for two things or hold a dot, a parent that is not there, links in a
-    circle, and whatever has not the numbers that it should.
+    **Raises:** `ValueError` for names that are used twice or contain a dot, an unknown parent, links that carry each
+    other in a circle, and wrong numbers of values.
     """
     for what, given, kind in (
         ("links", links, "Link"),
@@ -158,13 +169,13 @@ def mechanism(
     ):
         if isinstance(given, str) or not isinstance(given, Iterable):
             raise TypeError(
-                f"mechanism: `{what}` is a list, such as [{kind}(...), ...], of one thing too; got a "
+                f"mechanism: `{what}` must be a list, e.g. [{kind}(...), ...], also for one element; got a "
                 f"{type(given).__name__}."
             )
     if isinstance(dependent, str):
-        raise TypeError(f"mechanism: `dependent` is a list of names, such as [{dependent!r}]; got {dependent!r}.")
+        raise TypeError(f"mechanism: `dependent` must be a list of names, e.g. [{dependent!r}]; got {dependent!r}.")
     if not isinstance(name, str):
-        raise TypeError(f"mechanism: `name` is a text, got {name!r}.")
+        raise TypeError(f"mechanism: `name` must be a string, got {name!r}.")
     values: dict[str, Any] = components("gravity", gravity)
     links = _in_order([_checked(link, Link) for link in links])
     link_structures = tuple(_link(link, values) for link in links)
@@ -178,9 +189,9 @@ def mechanism(
         left_out=tuple(left_out),
     )
     if not joints:
-        raise ValueError(f"{name}: no link has a joint, so that nothing moves: Link(..., joints=hinge(...)).")
+        raise ValueError(f"{name}: no link has a joint, so nothing can move. Pass Link(..., joints=hinge(...)).")
     if not any(link.has_mass for link in link_structures):
-        raise ValueError(f"{name}: no link that could be moved by a force has a mass: Link(..., mass=1.0).")
+        raise ValueError(f"{name}: no movable link has a mass. Pass Link(..., mass=1.0).")
     _check_names(structure)
     closures = [_loop(loop, structure, joints) for loop in loops]
     structure = structure._replace(
@@ -193,12 +204,12 @@ def mechanism(
 
 def _checked(part: Any, kind: type) -> Any:
     if not isinstance(part, kind):
-        raise TypeError(f"mechanism: this is no {kind.__name__}: {part!r}.")
+        raise TypeError(f"mechanism: this is not a {kind.__name__}: {part!r}.")
     return part
 
 
 def _in_order(links: list[Link]) -> list[Link]:
-    """Parents before their children, otherwise as they were given."""
+    """Sort parents before their children, otherwise in the given order."""
     names = [link.name for link in links]
     for link in links:
         _check_name(link.name, "link")
@@ -211,7 +222,10 @@ def _in_order(links: list[Link]) -> list[Link]:
         waiting = [link for link in links if link.name not in ordered]
         ready = next((link for link in waiting if link.parent is None or link.parent in ordered), None)
         if ready is None:
-            raise ValueError(f"Links carry each other in a circle: {', '.join(link.name for link in waiting)}.")
+            raise ValueError(
+                f"The parents of the links form a cycle: {', '.join(link.name for link in waiting)}. Connect one of "
+                "these links to the ground (parent=None). If they form a closed chain, close it with loops=[Loop(...)]."
+            )
         ordered[ready.name] = ready
     return list(ordered.values())
 
@@ -219,8 +233,8 @@ def _in_order(links: list[Link]) -> list[Link]:
 def _check_name(name: Any, what: str) -> None:
     if not isinstance(name, str) or not name or "." in name:
         raise ValueError(
-            f"The name of a {what} is a text without a dot, which stands between the parts of a parameter's name as in "
-            f"mass.forearm; got {name!r}."
+            f"The name of a {what} must be a string without a dot, because dots separate the parts of a parameter's "
+            f"name, e.g. mass.forearm; got {name!r}."
         )
 
 
@@ -231,7 +245,9 @@ def _check_known(label: str, name: Any, known: Iterable[str], where: str) -> Non
 
 def _link(link: Link, values: dict[str, Any]) -> LinkStructure:
     if not isinstance(link.joints, (Joint, list, tuple)):
-        raise TypeError(f"The joints of the link {link.name!r} are a Joint or a list of them, got {link.joints!r}.")
+        raise TypeError(
+            f"The joints of the link {link.name!r} must be a Joint or a list of Joints, got {link.joints!r}."
+        )
     types: list[JointType] = []
     for joint in [link.joints] if isinstance(link.joints, Joint) else link.joints:
         types += _checked(joint, Joint).types
@@ -239,8 +255,8 @@ def _link(link: Link, values: dict[str, Any]) -> LinkStructure:
     values |= components(f"position.{link.name}", link.position)
     if any(len(joint.speeds) == 6 for joint in types) and (link.parent is not None or len(types) > 1):
         raise ValueError(
-            f"The link {link.name!r} is free of its parent: a free joint is the only one of a link on the ground "
-            "(parent=None). To fly relative to a moving link, chain three sliders and a ball joint."
+            f"The link {link.name!r} has a free joint, which must be its only joint and needs the ground as parent "
+            "(parent=None). For free motion relative to a moving link, chain three sliders and a ball joint."
         )
     if link.mass is not None:
         values[f"mass.{link.name}"] = link.mass
@@ -255,7 +271,7 @@ def _moments(link: Link) -> dict[str, Any]:
     rows = link.inertia
     lengths = [np.shape(row) for row in rows] if hasattr(rows, "__len__") else []
     if lengths not in ([()] * 3, [(3,)] * 3):
-        raise ValueError(f"The inertia of {link.name!r} is three moments or a (3, 3) matrix, got {rows!r}.")
+        raise ValueError(f"The inertia of {link.name!r} must be three moments or a (3, 3) matrix, got {rows!r}.")
     if lengths[0] == ():
         entries = dict(zip(MOMENTS, (*rows, 0.0, 0.0, 0.0), strict=True))
     else:
@@ -284,7 +300,7 @@ def _actuator(actuator: Actuator, joints: Mapping[str, JointType], values: dict[
     gear = tuple(float(x) for x in np.atleast_1d(exact_numbers(actuator.gear, f"The gear of {actuator.name!r}")))
     if len(gear) != len(joint.speeds):
         raise ValueError(
-            f"The gear of the actuator {actuator.name!r} is {len(joint.speeds)} numbers, one for each speed of "
+            f"The gear of the actuator {actuator.name!r} must be {len(joint.speeds)} numbers, one for each speed of "
             f"{joint.name!r}; got {actuator.gear!r}."
         )
     for kind in ("gain", "offset", "position_gain", "velocity_gain"):
@@ -293,7 +309,8 @@ def _actuator(actuator: Actuator, joints: Mapping[str, JointType], values: dict[
             values[f"{kind}.{actuator.name}"] = value
     if f"position_gain.{actuator.name}" in values and len(gear) > 1:
         raise ValueError(
-            f"The actuator {actuator.name!r}: {joint.name!r} has no length that a position gain could act on."
+            f"The actuator {actuator.name!r}: `position_gain` needs a joint with one speed, but {joint.name!r} has "
+            "several. Omit `position_gain`."
         )
     return ActuatorStructure(actuator.name, joint.name, gear)
 
@@ -302,25 +319,27 @@ def _loop(loop: Any, structure: Structure, joints: Mapping[str, JointType]) -> L
     if isinstance(loop, Loop):
         sites = [site.name for site in structure.sites]
         for end in (loop.first, loop.second):
-            _check_known("What closes a loop", end, sites, "the sites")
+            _check_known("A loop", end, sites, "the sites")
         if loop.first == loop.second:
-            raise ValueError(f"Loop({loop.first!r}, {loop.second!r}): a site is always where it is; name two.")
+            raise ValueError(f"Loop({loop.first!r}, {loop.second!r}): the sites are equal. Name two different sites.")
         return LoopStructure(loop.first, loop.second, bool(loop.rigid), tuple(range(6 if loop.rigid else 3)))
     _checked(loop, Coupling)
     for end in [loop.first, *([] if loop.second is None else [loop.second])]:
         if not isinstance(joints.get(end), (Hinge, Slide)):
-            raise ValueError(f"A coupling is of hinges and sliders; {end!r} is none.")
+            raise ValueError(f"Coupling: {end!r} is not a hinge or a slider of the mechanism. Name one of these.")
     if loop.first == loop.second:
-        raise ValueError(f"Coupling({loop.first!r}, {loop.second!r}): a joint cannot follow itself; name two.")
+        raise ValueError(
+            f"Coupling({loop.first!r}, {loop.second!r}): a joint cannot follow itself. Name two different joints."
+        )
     what = f"The coefficients of the coupling of {loop.first!r}"
     coefficients = tuple(float(a) for a in np.atleast_1d(exact_numbers(loop.coefficients, what)))
     if not coefficients:
-        raise ValueError(f"{what} are one number at least, got none.")
+        raise ValueError(f"{what} must be at least one number, got none.")
     return CouplingStructure(loop.first, loop.second, coefficients, True)
 
 
 def _check_names(structure: Structure) -> None:
-    """Names are those of the parts of one motion, of its coordinates, speeds and inputs, and of parameters."""
+    """Check that names are unique among parts of the motion; coordinates, speeds and inputs; and parameters."""
     for joint in structure.joints:
         _check_name(joint.name, "joint")
     for what, names in (
@@ -346,7 +365,7 @@ def _field(name: str, joints: Mapping[str, JointType]) -> Field:
     if kind not in _OF_HINGES:
         return name, positive, _UNITS.get(kind, "")
     joint = joints[name.split(".")[1]]
-    if len(joint.speeds) == 6:  # newtons and newton metres in one
+    if len(joint.speeds) == 6:  # the speeds have different units, m and rad
         return name, positive, "m" if kind == "rest" else ""
     return name, positive, (_OF_SLIDERS if isinstance(joint, Slide) else _OF_HINGES)[kind]
 
@@ -354,7 +373,7 @@ def _field(name: str, joints: Mapping[str, JointType]) -> Field:
 def _matrix(orientation: Any, name: str) -> Matrix | None:
     """[R] (components in the parent -> components here) as exact floats; None for no rotation.
 
-    **Raises:** `ValueError` for what is no rotation.
+    **Raises:** `ValueError` if it is not a rotation.
     """
     if orientation is None:
         return None
@@ -368,10 +387,10 @@ def _matrix(orientation: Any, name: str) -> Matrix | None:
         else:
             R = np.asarray(orientation, float).T  # columns are the axes
         if R.shape != (3, 3) or not (np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0):
-            raise ValueError("no rotation matrix")
+            raise ValueError("not a rotation matrix")
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"{name!r}: the orientation is four Euler parameters (scalar last), a sequence with its angles as "
+            f"{name!r}: the orientation must be four Euler parameters (scalar last), a sequence with its angles, e.g. "
             f'("3-1-2", (a, b, c)), or a (3, 3) rotation matrix; got {orientation!r}.'
         ) from error
     U, _, Vt = np.linalg.svd(R)

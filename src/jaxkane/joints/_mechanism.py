@@ -28,9 +28,9 @@ from .._scalarjit.components import (
     total,
 )
 from .._system.kinematics import Frame, Point, inertial
-from .._system.motion import Body, Force, Motion
+from .._system.motion import Body, Force, GroupedResiduals, Motion, SomeComponents
 from .._system.parameters import parameter, parameter_info
-from .._system.system import System
+from .._system.system import NamedVector, System
 from ..rotations import Matrix
 from ._joints import JointKinematics, JointType
 
@@ -61,7 +61,7 @@ class LoopStructure(NamedTuple):
     first: str
     second: str
     rigid: bool
-    independent: tuple[int, ...]  # of its residuals
+    independent: tuple[int, ...]  # indices of its independent residuals
 
     @property
     def size(self) -> int:
@@ -76,7 +76,7 @@ class CouplingStructure(NamedTuple):
 
 
 class Structure(NamedTuple):
-    """All that is static in a mechanism."""
+    """The static data of a mechanism."""
 
     name: str
     links: tuple[LinkStructure, ...]  # parents before children
@@ -99,11 +99,11 @@ _OWNERS = {
     **dict.fromkeys(("gain", "offset", "position_gain", "velocity_gain"), "actuators"),
     "site": "sites",
 }
-"""What has parameters of a kind, the first part of their names; those of "gravity" are the mechanism's own."""
+"""The owners of parameters of each kind, the first part of their names. "gravity" belongs to the mechanism."""
 
 
 class NamedParameters(dict[str, Any]):
-    """Parameters by name. One that is zero in the structure is none, and is refused as such."""
+    """Parameters by name. A structural zero is not a parameter; looking it up raises an exception."""
 
     def __init__(self, of: str, structure: Structure):
         super().__init__()
@@ -115,8 +115,8 @@ class NamedParameters(dict[str, Any]):
         if name not in ((*"xyz", *MOMENTS) if parts else owners):
             raise not_there(name, self, f"`{self.of}`")
         raise KeyError(
-            f"{self.structure.name} has no parameter {self.of}.{name}: it was written as 0 where the mechanism was "
-            "made, and is part of its structure, which cannot be changed. Give jax.numpy.zeros(()) there."
+            f"{self.structure.name} has no parameter {self.of}.{name}: it was defined as the number 0, which is part "
+            "of the structure and cannot be changed. Use jax.numpy.zeros(()) in the definition of the mechanism."
         )
 
 
@@ -136,30 +136,31 @@ jax.tree_util.register_pytree_with_keys(NamedParameters, _flat, _from_flat)
 
 
 class Mechanism(System):
-    """A tree of links and joints; made by `jaxkane.joints.mechanism`, or from a file by `jaxkane.convert`.
+    """A tree of links and joints, made by `jaxkane.joints.mechanism`, or from a file by `jaxkane.convert`.
 
-    Parameters are read by kind and name, as `arm.mass["forearm"]` or `arm.center["forearm"]["z"]`, and named so in a
-    fit or the columns of a sweep: "mass.forearm", "center.forearm.z". `arm.replace({"mass.forearm": 1.3})` is a copy.
+    Parameters are read by kind and name, e.g. `arm.mass["forearm"]` or `arm.center["forearm"]["z"]`. Their names in a
+    fit or in the columns of a sweep are "mass.forearm" and "center.forearm.z". `arm.replace({"mass.forearm": 1.3})` is
+    a copy.
     """
 
     structure: ClassVar[Structure]
     left_out: ClassVar[tuple[str, ...]] = ()
-    """What a file has and the mechanism does not."""
+    """Elements of the file that are not part of the mechanism."""
 
     def __init__(self, **values: Any):
-        for field in dataclasses.fields(self):  # names with a dot cannot be those of arguments
+        for field in dataclasses.fields(self):  # names with a dot cannot be keyword arguments
             setattr(self, field.name, values.pop(field.name) if field.name in values else _default(self, field))
         if values:
             raise TypeError(f"{type(self).__name__} has no parameter {', '.join(values)}.")
 
     def __reduce__(self) -> Any:
-        if type(self) is not class_of(self.structure, _fields(type(self))):  # one that inherits from it
+        if type(self) is not class_of(self.structure, _fields(type(self))):  # a class that inherits from it
             return super().__reduce__()
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return _restored, (self.structure, _fields(type(self)), values)
 
     def replace(self, values: Mapping[str, Any]) -> Mechanism:
-        """A copy with other parameters, by name. **Raises:** `ValueError` for a name that is none."""
+        """A copy with other parameters, by name. **Raises:** `ValueError` for an unknown name."""
         names = [field.name for field in dataclasses.fields(self)]
         wrong = [name for name in values if name not in names]
         if wrong:
@@ -167,7 +168,7 @@ class Mechanism(System):
         return dataclasses.replace(self, **values)
 
     def with_outputs(self, outputs: Callable[..., Any], parameters: Mapping[str, Any] | None = None) -> Mechanism:
-        """A copy that carries sensors: `outputs(self, t, q, u, motion, now)`, as that of a `System`.
+        """A copy with sensors: `outputs(self, t, q, u, motion, now)`, as the method of a `System`.
 
             def outputs(self, t, q, u, motion, now):
                 frame, point = motion.sites["imu"]
@@ -176,15 +177,17 @@ class Mechanism(System):
 
             arm = arm.with_outputs(outputs, {"tilt": 0.0})
 
-        **Arguments:** `parameters`: numbers by name that it reads of itself, parameters as all others. `motion.sites`
-        are pairs of the frame and the point of every site.
+        **Arguments:**
 
-        **Raises:** `ValueError` for a parameter that it has already, or that is no name of Python.
+        - `outputs`: the function. `motion.sites` are pairs of the frame and the point of each site.
+        - `parameters`: additional parameters by name, which the function reads as attributes of `self`.
+
+        **Raises:** `ValueError` for a parameter that exists already, or whose name is not a Python identifier.
         """
         extra = dict(parameters or {})
         twice = [name for name in extra if hasattr(self, name) or not name.isidentifier()]
         if twice:
-            raise ValueError(f"{type(self).__name__}: {twice[0]!r} cannot be the name of another parameter.")
+            raise ValueError(f"{type(self).__name__}: {twice[0]!r} cannot be the name of an additional parameter.")
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         kind: Any = type(self)
         return _equipped(kind, outputs, tuple(extra))(**values, **extra)
@@ -195,7 +198,7 @@ class Mechanism(System):
     def _triple(self, name: str) -> Triple:
         return self._read(f"{name}.x"), self._read(f"{name}.y"), self._read(f"{name}.z")
 
-    def _of(self, joint: JointType, q: Any, u: Any) -> tuple[list[Component], list[Component]]:
+    def _of(self, joint: JointType, q: NamedVector, u: NamedVector) -> tuple[list[Component], list[Component]]:
         """The joint's own coordinates and speeds."""
         return [q[name] for name in joint.names(joint.coordinates)], [u[name] for name in joint.names(joint.speeds)]
 
@@ -239,7 +242,7 @@ class Mechanism(System):
     def loads(self, t, q, u, motion: Any, inputs):
         gravity = motion.N.vector(*self._triple("gravity"))
         falls = not all(is_zero(x) for x in gravity.components)
-        weighed = [body for body in motion.bodies if falls and not is_zero(body.mass)]  # rotors have none
+        weighed = [body for body in motion.bodies if falls and not is_zero(body.mass)]  # rotors have no weight
         loads: list[Any] = [Force(body.mass * gravity, body.center) for body in weighed]
         for joint in self.structure.joints:
             forces = self._forces(joint, *self._of(joint, q, u), inputs)
@@ -248,11 +251,15 @@ class Mechanism(System):
         return loads
 
     def configuration_constraints(self, t, q):
-        own = lambda joint: [q[name] for name in joint.names(joint.coordinates)]  # noqa: E731
+
+        def own(joint: JointType) -> list[Component]:
+            return [q[name] for name in joint.names(joint.coordinates)]
+
         norms = [x for joint in self.structure.joints for x in joint.norm(own(joint))]
         if not (self.structure.loops or self.structure.couplings):
             return norms
-        return [*self._loops_at_rest(t, q, independent=True), *norms]
+        loops = self._loops_at_rest(t, q, independent=True)
+        return GroupedResiduals([*loops.groups, *(SomeComponents((x,), (x,)) for x in norms)])
 
     def implied_constraints(self, t, q):
         structure = self.structure
@@ -261,12 +268,12 @@ class Mechanism(System):
             return []
         return self._loops_at_rest(t, q, independent=False)
 
-    def _loops_at_rest(self, t: Any, q: Any, independent: bool) -> list[Any]:
+    def _loops_at_rest(self, t: Component, q: NamedVector, independent: bool) -> GroupedResiduals:
         rest = dict.fromkeys((*self.speeds, *self.dependent_speeds), 0.0)
         return loop_residuals(self, self.motion(t, q, tuple(rest.values())).sites, q, rest, independent)[0]
 
     def _forces(self, joint: JointType, q: list[Component], u: list[Component], inputs: Any) -> list[Component]:
-        """Forces along the joint's speeds [N or N m]: of its spring, damper and actuators."""
+        """Forces along the joint's speeds [N or N m], by its spring, damper and actuators."""
         damping, stiffness = self._read(f"damping.{joint.name}"), self._read(f"stiffness.{joint.name}")
         forces = [mul(-1.0, mul(damping, w)) for w in u]
         if not is_zero(stiffness):
@@ -302,12 +309,12 @@ class MechanismMotion(Motion):
 
 
 def _default(mechanism: Mechanism, field: dataclasses.Field[Any]) -> Any:
-    """Of a parameter that a class which inherits from a mechanism's has besides."""
+    """The default of a parameter that a subclass of a mechanism's class adds."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     if field.default is not dataclasses.MISSING:
         return field.default
-    raise TypeError(f"{type(mechanism).__name__}: the parameter {field.name} is missing, which has no default.")
+    raise TypeError(f"{type(mechanism).__name__}: the parameter {field.name} is missing and has no default.")
 
 
 def _view(kind: str) -> property:
@@ -332,28 +339,37 @@ for _kind in (*_OWNERS, "gravity"):
 
 
 def loop_residuals(
-    mechanism: Mechanism, sites: dict[str, tuple[Frame, Point]], q: Any, u: Any, independent: bool = True
-) -> tuple[list[Any], list[Any]]:
-    """Residuals of the loops, of the configuration and of the velocities: those that are independent, or the others."""
-    h: list[Any] = []
+    mechanism: Mechanism,
+    sites: dict[str, tuple[Frame, Point]],
+    q: Mapping[str, Component] | NamedVector,
+    u: Mapping[str, Component] | NamedVector,
+    independent: bool = True,
+) -> tuple[GroupedResiduals, list[Any]]:
+    """Configuration and velocity residuals of the loops: the independent ones, or the others.
+
+    A component of a loop's vector is compared with the size of this vector, a component of a rotation with 1.
+    """
+    h: list[SomeComponents] = []
     c: list[Any] = []
     for loop in mechanism.structure.loops:
         (A, P), (B, Q) = sites[loop.first], sites[loop.second]
         apart = Q.position_from(P).components_in(A)
         parting = (Q.velocity - P.velocity).components_in(A)
+        turned: tuple[Component, ...] = ()
         if loop.rigid:
-            apart = (*apart, *_turned_apart(A, B))
+            turned = _turned_apart(A, B)
             parting = (*parting, *(B.angular_velocity - A.angular_velocity).components_in(A))
         rows = [i for i in range(loop.size) if (i in loop.independent) == independent]
-        h += [apart[i] for i in rows]
+        h.append(SomeComponents(tuple(apart[i] for i in rows if i < 3), apart))
+        h.append(SomeComponents(tuple(turned[i - 3] for i in rows if i >= 3), (1.0,)))
         c += [parting[i] for i in rows]
     for coupling in mechanism.structure.couplings:
         if coupling.is_independent == independent:
             value, slope = _polynomial(coupling.coefficients, q[coupling.second] if coupling.second else 0.0)
-            h.append(q[coupling.first] - value)
+            h.append(SomeComponents((q[coupling.first] - value,), (q[coupling.first] - value,)))
             rate = mul(slope, u[f"{coupling.second}_rate"]) if coupling.second else 0.0
             c.append(sub(u[f"{coupling.first}_rate"], rate))
-    return h, c
+    return GroupedResiduals(h), c
 
 
 def _moved(P: Point, F: Frame, r: Triple) -> Point:
@@ -365,24 +381,26 @@ def _turned(F: Frame, orientation: Matrix | None, name: str) -> Frame:
 
 
 def _turned_apart(A: Frame, B: Frame) -> Triple:
-    """The axis by which B is turned from A, times twice the tangent of half the angle: zero in one orientation only."""
+    """The axis of the rotation from A to B, times twice the tangent of half the angle. It is zero only if the
+    orientations are equal."""
     x, y, z = (axis.components_in(A) for axis in (B.x, B.y, B.z))
     sines = sub(y[2], z[1]), sub(z[0], x[2]), sub(x[1], y[0])
-    size = dot(x, x)  # of Euler parameters that `assemble` moves it is not yet 1
+    size = dot(x, x)  # Euler parameters that `assemble` changes do not have norm 1 yet
     cosines = total((math.sqrt(size) if is_exact(size) else jnp.sqrt(size), x[0], y[1], z[2]))
     if is_exact(cosines):
         return scale3(2.0 / cosines, sines) if cosines > _HALF_A_TURN else (1.0, 1.0, 1.0)
-    # Half a turn away no direction is nearest: there the residuals say that it is far, and `assemble` starts beside.
+    # At half a turn no direction is nearest. The residuals are then large, and `assemble` starts from a perturbed
+    # guess.
     is_far = jnp.abs(cosines) < _HALF_A_TURN
     factor = 2.0 / jnp.where(is_far, 1.0, cosines)
     return tuple(jnp.where(is_far, 1.0, mul(factor, x)) for x in sines)  # type: ignore[return-value]
 
 
-_HALF_A_TURN = 1e-6  # 1 + the sum of the direction cosines: within 0.06 degrees of it
+_HALF_A_TURN = 1e-6  # 1 + the sum of the direction cosines: within 0.06 degrees of half a turn
 
 
 def _polynomial(coefficients: tuple[float, ...], x: Component) -> tuple[Component, Component]:
-    """Value and slope."""
+    """Value and derivative."""
     value: Component = 0.0
     slope: Component = 0.0
     for a in reversed(coefficients):
@@ -392,12 +410,12 @@ def _polynomial(coefficients: tuple[float, ...], x: Component) -> tuple[Componen
 
 
 Field = tuple[str, bool, str]
-"""Of a parameter: its name, whether it must be positive, its unit."""
+"""The name of a parameter, whether it must be positive, and its unit."""
 
 
 @functools.lru_cache(maxsize=1000)
 def class_of(structure: Structure, fields: tuple[Field, ...]) -> type[Mechanism]:
-    """The class of a structure: the same one each time, since programs are kept by class."""
+    """The class of a structure. It is always the same object, because compiled programs are cached by class."""
     joints = structure.joints
     coordinates = [pair for joint in joints for pair in zip(joint.names(joint.coordinates), joint.coordinates)]
     speeds = [pair for joint in joints for pair in zip(joint.names(joint.speeds), joint.speeds)]

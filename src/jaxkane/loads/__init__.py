@@ -1,18 +1,18 @@
-"""Loads and elements that people expect: springs, dampers, actuators, friction, drag, stops, backlash and motors.
+"""Loads: springs, dampers, actuators, friction, drag, stops, backlash and motors.
 
-What stands between points and between frames returns a tuple of `Force`s or `Torque`s, with the reaction on the other
-end, for `System.loads`:
+Loads between points or frames return a tuple of `Force`s or `Torque`s, including the reaction on the second point or
+frame, for `System.loads`:
 
     def loads(self, t, q, u, motion, inputs):
         P, Q = motion["P"], motion["Q"]
         return jk.loads.spring(P, Q, self.stiffness, self.length), jk.weight(motion, -9.81 * motion.N.y)
 
-A follower needs no function of its own: `jk.Force(10.0 * B.x, P)` turns with the frame B. Where a law is not linear,
-give a function of the extension, the rate or the angle in the place of the coefficient: `lambda x: k * x + k3 * x**3`.
+A follower force is `jk.Force(10.0 * B.x, P)`, which rotates with the frame B. For a nonlinear law, pass a function of
+the extension, the rate or the angle instead of the coefficient: `lambda x: k * x + k3 * x**3`.
 
-Laws are such functions, of numbers: `coulomb`, `stribeck`, `quadratic`, `dead_zone`; and of a state of the first order
-beside them, `lugre` and `bouc_wen`. They are the resistance, of the sign of the rate; a load is minus that. They may be
-added, and used along any speed:
+`coulomb`, `stribeck`, `quadratic` and `dead_zone` are such functions. `lugre` and `bouc_wen` also have a first-order
+state. They return the resistance, which has the sign of the rate; the load has the opposite sign. Laws can be added and
+used with any speed:
 
     friction = lambda w: jk.loads.stribeck(w, 0.3, 0.5, 0.1) + 0.02 * w
     jk.loads.torsional_damper(arm, None, N.z, friction)

@@ -1,11 +1,10 @@
-"""Laws of friction, drag, stops and backlash, as functions of numbers. Knows numbers; knows no frame and no load.
+"""Laws of friction, drag, stops and backlash, as functions of numbers.
 
-One smoothing is in all of them: |x| stands for sqrt(x^2 + width^2), and the sign of x for x / |x|. Both are analytic,
-so that every derivative is finite. Against the sharp law they are off by width^2 / (2 |x|) and by width^2 / (2 x^2),
-of the second order in `width`; at x = 0, where the sharp law has a corner or a jump, |x| by `width`. Andersson,
-Soderberg and Bjorklund (2007), *Friction models for sliding dry, boundary and mixed lubricated contacts*, compare such
-smoothings. What is smoothed so does not stick: under a load less than the static one it creeps, with a speed of the
-order of `width`. What sticks is `lugre`, which has a state.
+All laws use the same smoothing: |x| is replaced by sqrt(x^2 + width^2), and the sign of x by x / |x|. Both are
+analytic, so all derivatives are finite. The errors are width^2 / (2 |x|) and width^2 / (2 x^2). At x = 0, the error of
+|x| is `width`. Andersson, Soderberg and Bjorklund (2007), *Friction models for sliding dry, boundary and mixed
+lubricated contacts*, compare such smoothings. Smoothed friction does not stick. Below the static friction a mass creeps
+with a speed of the order of `width`. For sticking, use `lugre`, which has a state.
 """
 
 from __future__ import annotations
@@ -13,30 +12,49 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from .._scalarjit.components import Component, positive
 from .._system.kinematics import Vector
 
 
+def check_numbers(law: str, **values: Any) -> None:
+    """Raise `TypeError` if an argument is not a number, an array or a Vector."""
+    for name, value in values.items():
+        dtype = getattr(value, "dtype", None)
+        is_number = isinstance(value, (int, float, Vector)) and not isinstance(value, bool)
+        is_array = (
+            hasattr(value, "__jax_array__") or getattr(dtype, "kind", "V") in "iuf" or isinstance(value, jax.Array)
+        )
+        if not (is_number or is_array):
+            hint = f" By name it is q[{value!r}], u[{value!r}] or inputs[{value!r}]." if isinstance(value, str) else ""
+            raise TypeError(f"{law}: `{name}` must be one number, got {value!r}.{hint}")
+
+
 def smooth_abs(x: Component | Vector, width: Component) -> Component:
-    """sqrt(x^2 + width^2), of a number or a Vector's length: |x| without its corner, too large by `width` at most."""
-    positive(width, "The width of the smoothing")  # or there is no slope at rest
+    """sqrt(x^2 + width^2), a smooth |x|, of a number or the length of a Vector. It exceeds |x| by at most `width`."""
+    positive(width, "The width of the smoothing")  # otherwise the derivative at rest is infinite
     square = x.dot(x) if isinstance(x, Vector) else x * x
     return jnp.sqrt(square + width * width)
 
 
 def smooth_sign(x: Component, width: Component) -> Component:
-    """x / sqrt(x^2 + width^2): the sign of x without its jump."""
+    """x / sqrt(x^2 + width^2), a smooth sign of x."""
     return x / smooth_abs(x, width)
 
 
 def coulomb(v: Component, level: Component, *, width: Component = 1e-2) -> Component:
     """Dry friction: level * v / |v|.
 
-    **Arguments:** `v`: the rate [m/s, rad/s]; `level` [N, N m], not negative; `width`: of the smoothing, in the unit of
-    v. Well below it the law is viscous, level / width * v, and the equations become stiff as it falls.
+    **Arguments:**
+
+    - `v`: the rate [m/s, rad/s].
+    - `level`: friction force or torque [N, N m], not negative.
+    - `width`: width of the smoothing, in the unit of v. Well below it, the law is viscous, level / width * v. A smaller
+        value makes the equations stiffer.
     """
+    check_numbers("coulomb", v=v, level=level, width=width)
     return level * smooth_sign(v, width)
 
 
@@ -49,51 +67,70 @@ def stribeck(
     exponent: Component = 2.0,
     width: Component = 1e-2,
 ) -> Component:
-    """Dry friction that falls with the rate, from static to kinetic: the Stribeck curve.
+    """Dry friction that decreases with the rate from static to kinetic friction: the Stribeck curve.
 
         (kinetic + (static - kinetic) * exp(-(|v| / falloff)^exponent)) * v / |v|
 
-    Stribeck (1902), *Die wesentlichen Eigenschaften der Gleit- und Rollenlager*; with this exponential Bo and Pavelescu
-    (1982), *The friction-speed relation and its influence on the critical velocity of stick-slip motion*, who find
-    exponents of 1/2 to 1, and Armstrong-Helouvry, Dupont and Canudas de Wit (1994), *A survey of models, analysis
-    tools and compensation methods for the control of machines with friction*, who take 2. A viscous term is added by
-    the user: `stribeck(...) + damping * v`.
+    Stribeck (1902), *Die wesentlichen Eigenschaften der Gleit- und Rollenlager*. Bo and Pavelescu (1982), *The
+    friction-speed relation and its influence on the critical velocity of stick-slip motion*, use this exponential with
+    exponents of 1/2 to 1. Armstrong-Helouvry, Dupont and Canudas de Wit (1994), *A survey of models, analysis tools and
+    compensation methods for the control of machines with friction*, use the exponent 2. To add viscous friction, write
+    `stribeck(...) + damping * v`.
 
-    **Arguments:** `v`: the rate [m/s, rad/s]; `kinetic`, `static` [N, N m], not negative; `falloff`: the rate at which
-    it falls, the unit of v; `exponent`; `width` of the smoothing, a tenth of `falloff` at most, since the peak is lost
-    otherwise.
+    **Arguments:**
+
+    - `v`: the rate [m/s, rad/s].
+    - `kinetic`, `static`: kinetic and static friction [N, N m], not negative.
+    - `falloff`: the rate at which the friction decreases, in the unit of v.
+    - `exponent`: the exponent of the decrease.
+    - `width`: width of the smoothing. Use at most a tenth of `falloff`, otherwise the peak is smoothed away.
     """
+    check_numbers("stribeck", v=v, kinetic=kinetic, static=static, falloff=falloff, exponent=exponent, width=width)
     positive(falloff, "stribeck: the rate `falloff`")
     rate = smooth_abs(v, width)
     return (kinetic + (static - kinetic) * jnp.exp(-((rate / falloff) ** exponent))) * v / rate
 
 
 def quadratic(v: Component, coefficient: Component) -> Component:
-    """Turbulent drag of one rate: coefficient * v |v|. It is not smoothed: its first derivative is 2 coefficient |v|,
-    zero at rest, and its second jumps there. `coefficient` [N s^2/m^2, N m s^2]."""
+    """Turbulent drag: coefficient * v |v|.
+
+    It is not smoothed. Its first derivative is continuous; its second derivative is discontinuous at rest.
+
+    **Arguments:**
+
+    - `v`: the rate [m/s, rad/s].
+    - `coefficient`: [N s^2/m^2, N m s^2].
+    """
+    check_numbers("quadratic", v=v, coefficient=coefficient)
     return coefficient * v * jnp.abs(v)
 
 
 def dead_zone(x: Component, lower: Component | None, upper: Component | None, *, width: Component = 1e-4) -> Component:
-    """How far x is beyond the ends of an interval: zero within, x - upper above it, x - lower below.
+    """The distance of x from an interval: zero inside, x - upper above, x - lower below.
 
         x - (lower + upper) / 2 - (|x - lower| - |x - upper|) / 2
 
-    Times a stiffness it is a joint's stops, or the torque of a gear with play, whose two sides touch again after the
-    gap: `k * dead_zone(motor / ratio - link, -0.5 * gap, 0.5 * gap)`. Between -width / 2 and width / 2 from each end
-    both sides of it act a little; it is monotone, and off by at most width / 2 at an end and by the order of width^2
-    elsewhere. A stop that takes energy has a damper that grows with the depth, as Hunt and Crossley (1975) say:
-    `k * depth * (1.0 + c * rate)`.
+    Multiplied by a stiffness, it is the torque of stops or of a gear with backlash:
+    `k * dead_zone(motor / ratio - link, -0.5 * gap, 0.5 * gap)`. The smoothed function is monotone. Its error is at
+    most width / 2 at the ends, and of the order of width^2 elsewhere. For a stop that dissipates energy, add damping
+    that grows with the depth (Hunt and Crossley, 1975): `k * depth * (1.0 + c * rate)`.
 
-    **Arguments:** `x` [m, rad]; `lower`, `upper` of which either may be None, where there is no end; `width` of the
-    smoothing, in the unit of x.
+    **Arguments:**
+
+    - `x`: the position [m, rad].
+    - `lower`, `upper`: the ends of the interval. One of them may be None.
+    - `width`: width of the smoothing, in the unit of x.
     """
+    check_numbers(
+        "dead_zone", x=x, width=width, **{k: e for k, e in (("lower", lower), ("upper", upper)) if e is not None}
+    )
     if lower is None and upper is None:
-        raise ValueError("dead_zone(x, lower, upper): give one end at least.")
+        raise ValueError("dead_zone(x, lower, upper): pass at least one of `lower` and `upper`.")
     ends = [float(x) for x in (lower, upper) if isinstance(x, (int, float))]
     if not all(map(math.isfinite, ends)) or (len(ends) == 2 and ends[0] > ends[1]):
         raise ValueError(
-            f"dead_zone(x, lower, upper): got {lower} and {upper}. The first end is below the second; None is no end."
+            f"dead_zone(x, lower, upper): got {lower} and {upper}. `lower` must be less than `upper`. Pass None for "
+            "an end that does not exist."
         )
     if lower is None:
         return 0.5 * (x - upper + smooth_abs(x - upper, width))
@@ -113,22 +150,30 @@ def lugre(
     falloff: Component,
     viscous: Component = 0.0,
 ) -> tuple[Any, Any]:
-    """Friction by bristles that bend, with a state: it sticks, creeps before it slides, and lags behind the rate.
+    """The LuGre friction model with the mean deflection z of bristles: sticking, presliding and frictional lag.
 
         level = kinetic + (static - kinetic) * exp(-(v / falloff)^2)
         z_dot = v - stiffness * |v| / level * z
         force = stiffness * z + damping * z_dot + viscous * v
 
     Canudas de Wit, Olsson, Astrom and Lischinsky (1995), *A new model for control of systems with friction*. At a
-    steady rate the force is level * sign(v) + viscous * v, the Stribeck curve; |z| stays below static / stiffness. It
-    gives back no more than it has taken where damping * |v| <= 4 * level (Barabanov and Ortega, 2000, *Necessary and
-    sufficient conditions for passivity of the LuGre friction model*).
+    steady rate the force is level * sign(v) + viscous * v, the Stribeck curve. |z| remains below static / stiffness.
+    The model is passive if damping * |v| <= 4 * level (Barabanov and Ortega, 2000, *Necessary and sufficient conditions
+    for passivity of the LuGre friction model*).
 
-    **Arguments:** `v`: the rate [m/s, rad/s]; `z`: how far the bristles are bent [m, rad]; `stiffness` [N/m, N m/rad],
-    `damping` and `viscous` [N s/m, N m s/rad]; `kinetic`, `static` [N, N m], positive; `falloff`, the unit of v.
+    **Arguments:**
 
-    **Returns:** the force, which resists v, and z_dot: the one for `loads`, the other for the state's rate.
+    - `v`: the rate [m/s, rad/s].
+    - `z`: the mean deflection of the bristles [m, rad], a first-order state.
+    - `stiffness`: stiffness of the bristles [N/m, N m/rad].
+    - `damping`, `viscous`: damping of the bristles and viscous friction [N s/m, N m s/rad].
+    - `kinetic`, `static`: kinetic and static friction [N, N m], positive.
+    - `falloff`: the rate at which the friction decreases, in the unit of v.
+
+    **Returns:** the resisting force for `loads`, and z_dot for `state_rates`.
     """
+    check_numbers("lugre", v=v, z=z, stiffness=stiffness, damping=damping, viscous=viscous)
+    check_numbers("lugre", kinetic=kinetic, static=static, falloff=falloff)
     level = kinetic + (static - kinetic) * jnp.exp(-((v / falloff) ** 2))
     z_dot = v - stiffness * jnp.abs(v) / level * z
     return stiffness * z + damping * z_dot + viscous * v, z_dot
@@ -144,21 +189,28 @@ def bouc_wen(
     exponent: Component = 1.0,
     width: Component = 1e-9,
 ) -> tuple[Any, Any]:
-    """Hysteresis of a spring that yields, with a state: a rope, rubber, a wire, a bolted joint.
+    """The Bouc-Wen model of a spring with hysteresis, such as a rope, rubber or a bolted joint.
 
         z_dot = v (1 - (share sign(v z) + 1 - share) |z / z_y|^exponent),   z_y = yield_force / stiffness
         force = stiffness * z
 
-    Bouc (1967) and Wen (1976), *Method for random vibration of hysteretic systems*, where it has beta = share / z_y^n
-    and gamma = (1 - share) / z_y^n. Begun at |z| <= z_y it stays there, and never gives back more than it has taken,
-    where `share` is 1/2 to 1. An elastic part beside it is a spring of its own.
+    Bouc (1967) and Wen (1976), *Method for random vibration of hysteretic systems*, with beta = share / z_y^n and
+    gamma = (1 - share) / z_y^n. If |z| <= z_y initially, this remains true. The model is passive if `share` is between
+    1/2 and 1. Add an elastic spring separately.
 
-    **Arguments:** `v`: the rate [m/s, rad/s]; `z`: the elastic extension [m, rad]; `stiffness` [N/m, N m/rad] before it
-    yields; `yield_force` [N, N m], positive; `exponent`: how sharply it yields, 1 at least; `width` of |z / z_y|, of no
-    unit.
+    **Arguments:**
 
-    **Returns:** the force, which resists v, and z_dot.
+    - `v`: the rate [m/s, rad/s].
+    - `z`: the elastic extension [m, rad], a first-order state.
+    - `stiffness`: stiffness before yielding [N/m, N m/rad].
+    - `yield_force`: [N, N m], positive.
+    - `exponent`: sharpness of yielding, at least 1.
+    - `share`: see the equation.
+    - `width`: width of the smoothing of |z / z_y|, dimensionless.
+
+    **Returns:** the resisting force for `loads`, and z_dot for `state_rates`.
     """
+    check_numbers("bouc_wen", v=v, z=z, stiffness=stiffness, yield_force=yield_force, share=share, exponent=exponent)
     bent = z * stiffness / yield_force
     along = share * jnp.sign(v * z) + 1.0 - share
     return stiffness * z, v * (1.0 - along * smooth_abs(bent, width) ** exponent)

@@ -1,13 +1,19 @@
-"""Pictures with matplotlib: trajectories, eigenvalues, modes, audits, fits.
+"""Plots with matplotlib: trajectories, eigenvalues, modes, audits, fits.
 
-Every function takes the axes that it draws into and returns them; without, it makes a figure. What is given as plain
-arrays may come from anywhere. Colours, sizes and fonts are those of matplotlib's settings, so that a picture follows
-`plt.style.use("dark_background")`, and a style sheet of one's own. matplotlib is imported at the first call.
+Each function draws into the axes that are passed and returns them; without axes it makes a figure. Plain arrays may
+come from any source. Colours, sizes and fonts follow matplotlib's settings, such as `plt.style.use("dark_background")`.
+matplotlib is imported at the first call.
 """
 
+from ._fits import costs as costs
+from ._fits import estimates as estimates
+from ._fits import fits as fits
+from ._fits import profiles as profiles
+from ._fits import residuals as residuals
+from ._fits import selection_path as selection_path
 from ._stability import eigenvalues as eigenvalues
+from ._stability import frequency_response as frequency_response
 from ._stability import mode_shapes as mode_shapes
 from ._stability import root_locus as root_locus
 from ._trajectories import audit as audit
-from ._trajectories import fits as fits
 from ._trajectories import trajectories as trajectories

@@ -1,4 +1,4 @@
-"""Eigenvalues along a parameter, their root loci, and mode shapes, drawn. Knows arrays."""
+"""Plots of eigenvalues along a parameter, root loci, mode shapes and frequency responses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._common.lookup import as_names, label_of, refuse_unknown
-from ._trajectories import SOFT, STABLE, finish, panels
+from ._trajectories import SOFT, STABLE, Axes, finish, panels
 
 
 def mode_shapes(
@@ -21,32 +21,35 @@ def mode_shapes(
     only: Sequence[str] | None = None,
     axes: Any = None,
 ) -> np.ndarray:
-    """Each mode's eigenvector as arrows in the complex plane: how far and how much later each state moves.
+    """Each mode's eigenvector as arrows in the complex plane: amplitude and phase of each state.
 
         modes = jk.stability.eigenvalues(bicycle, speeds)
         jk.plot.mode_shapes(modes, at=5.0, only=("roll", "steer"))
 
-    Every vector is turned and scaled so that its largest state has length one and phase zero. Of a conjugate pair one
-    is drawn.
+    Each vector is normalized so that its largest state has length one and phase zero. One mode of a conjugate pair is
+    drawn.
 
     **Arguments:**
 
-    - `eigenvalues`: what `jaxkane.stability.eigenvalues` gives, with `at`, the value of its parameter (the nearest is
-        taken); or eigenvalues (n,) [1/s] with
-    - `vectors` (n_states, n): one column for each mode, and `states`: names of the rows.
-    - `modes`: names of the columns. `only`: those states that are drawn; angles and rates have different units, so that
-        their arrows cannot be compared.
-    - `axes`: polar axes, as many as there are modes to draw.
+    - `eigenvalues`: the result of `jaxkane.stability.eigenvalues`; or eigenvalues (n,) [1/s] together with `vectors`.
+    - `vectors` (n_states, n): one column for each mode.
+    - `states`: names of the rows of `vectors`.
+    - `at`: the value of the parameter; the nearest one of the result is used.
+    - `modes`: names of the columns.
+    - `only`: the states to draw. Angles and rates have different units, so their arrows cannot be compared.
+    - `axes`: polar axes, as many as modes are drawn.
 
     **Returns:** the axes (n_drawn,).
     """
     lam, X, labels, names, where = _one_point(eigenvalues, vectors, states, at, modes)
     chosen = labels if only is None else as_names(only)
-    refuse_unknown(chosen, labels, "mode_shapes: there is no state")
+    refuse_unknown(chosen, labels, "mode_shapes: the model has no state")
     rows = [i for i, state in enumerate(labels) if state in chosen]
     drawn = [k for k in range(len(lam)) if lam[k].imag >= -1e-9 * abs(lam[k])]
     if not np.all(np.isfinite(lam)):
-        raise ValueError("mode_shapes: the eigenvalues are not finite here: there is no steady motion, and no mode.")
+        raise ValueError(
+            "mode_shapes: the eigenvalues are not finite, because there is no steady motion. Choose another value `at`."
+        )
     axes = panels(axes, 1, len(drawn), size=(3.1, 3.6), subplot_kw={"projection": "polar"})[0]
     for ax, k in zip(axes, drawn, strict=True):
         phasors = X[rows, k] / X[rows, k][np.argmax(np.abs(X[rows, k]))]
@@ -69,12 +72,12 @@ def _one_point(model: Any, vectors: Any, states: Any, at: float | None, modes: A
     if vectors is None:
         if not hasattr(model, "vectors"):
             raise TypeError(
-                "Give eigenvalues (n,), vectors (n_states, n) and the states' names, or the result of "
+                "mode_shapes: pass eigenvalues (n,), vectors (n_states, n) and the states' names, or the result of "
                 "jaxkane.stability.eigenvalues(...) and `at`."
             )
         values = np.asarray(model.values, dtype=float)
         if at is None and len(values) > 1:
-            raise ValueError(f"mode_shapes: say `at` which value, between {values.min():g} and {values.max():g}.")
+            raise ValueError(f"mode_shapes: pass `at`, a value between {values.min():g} and {values.max():g}.")
         i = 0 if at is None else int(np.argmin(np.abs(values - at)))
         where = f"\nat {values[i]:.4g}" if len(values) > 1 else ""
         states = model.states if states is None else states
@@ -82,11 +85,16 @@ def _one_point(model: Any, vectors: Any, states: Any, at: float | None, modes: A
         model, vectors = model.eigenvalues[i], model.vectors[i]
     lam, X = np.asarray(model, dtype=complex), np.asarray(vectors, dtype=complex)
     if X.ndim != 2 or lam.shape != X.shape[1:]:
-        raise ValueError(f"mode_shapes: vectors (n_states, n) for eigenvalues (n,), got {X.shape} for {lam.shape}.")
+        raise ValueError(
+            f"mode_shapes: vectors must be (n_states, n) for eigenvalues (n,), got {X.shape} and {lam.shape}."
+        )
     states = [f"state {i + 1}" for i in range(X.shape[0])] if states is None else list(as_names(states))
     names = [""] * len(lam) if modes is None else list(as_names(modes))
     if len(states) != X.shape[0] or len(names) != len(lam):
-        raise ValueError(f"mode_shapes: {len(states)} states and {len(names)} names for vectors of shape {X.shape}.")
+        raise ValueError(
+            f"mode_shapes: got {len(states)} states and {len(names)} names of modes for vectors of shape {X.shape}. "
+            "Pass one state for each row and one name for each column."
+        )
     return lam, X, states, names, where
 
 
@@ -103,22 +111,24 @@ def eigenvalues(
     modes: Sequence[str] | None = None,
     xlabel: str | None = None,
     ylim: tuple[float, float] | None = None,
-    ax: Any = None,
-) -> Any:
-    """Real parts (lines) and imaginary parts (thin, dotted) against a parameter; where all modes decay is shaded.
+    ax: Axes = None,
+) -> Axes:
+    """Real parts (lines) and imaginary parts (thin, dotted) over a parameter. Stable ranges are shaded.
 
         modes = jk.stability.eigenvalues(bicycle, jnp.linspace(0.0, 10.0, 401))
         jk.plot.eigenvalues(modes)
 
     **Arguments:**
 
-    - `values`: what `jaxkane.stability.eigenvalues` gives; or values (m,) of a parameter and
-    - `eigenvalues` (m, n) [1/s], one column for each mode, NaN where there is none.
-    - `modes`: names of the columns; those of one name share a colour. By default those of the result, if any.
-    - `xlabel`: the parameter and its unit, by default as the result has it. `ylim`: by default what holds the real
-        parts and the slower oscillations.
+    - `values`: the result of `jaxkane.stability.eigenvalues`; or values (m,) of a parameter together with
+        `eigenvalues`.
+    - `eigenvalues` (m, n) [1/s]: one column for each mode, NaN if it does not exist.
+    - `modes`: names of the columns; those of one name share a colour. Default: those of the result, if any.
+    - `xlabel`: the parameter and its unit. Default: the label of the result.
+    - `ylim`: limits. Default: the range of the real parts and of the slower oscillations.
+    - `ax`: the axes, or None for a new figure.
 
-    **Returns:** the axes. The borders of the shaded ranges lie on straight lines between the values.
+    **Returns:** the axes. The borders of the shaded ranges are found by linear interpolation between the values.
     """
     x, lam, names = _table(values, eigenvalues, modes)
     xlabel = getattr(values, "parameter", "parameter") if xlabel is None else xlabel
@@ -141,7 +151,7 @@ def eigenvalues(
     ax.set(xlabel=xlabel, ylabel="eigenvalues [1/s]", xlim=(x[0], x[-1]), ylim=(low, high))
     finish(ax, legend=False)
     handles, labels = ax.get_legend_handles_labels()
-    handle_of = dict(zip(labels, handles, strict=True))  # modes of one name have one entry
+    handle_of = dict(zip(labels, handles, strict=True))  # modes of one name share an entry
     ax.legend(handle_of.values(), handle_of.keys(), frameon=False, fontsize="small")
     return ax
 
@@ -151,13 +161,17 @@ def root_locus(
     eigenvalues: Any = None,
     *,
     label: str | None = None,
-    ax: Any = None,
-) -> Any:
-    """The eigenvalues' way through the complex plane; the colour is the parameter, the decaying half is shaded.
+    ax: Axes = None,
+) -> Axes:
+    """The path of the eigenvalues in the complex plane. The colour is the parameter, the stable half-plane is shaded.
 
-    **Arguments:** `values`, `eigenvalues`: as for `eigenvalues`. `label`: of the colour bar, as `xlabel` there.
+    **Arguments:**
 
-    **Returns:** the axes. A cross marks where each way starts.
+    - `values`, `eigenvalues`: as for `eigenvalues`.
+    - `label`: of the colour bar, as `xlabel` there.
+    - `ax`: the axes, or None for a new figure.
+
+    **Returns:** the axes. A cross marks the start of each path.
     """
     from matplotlib.collections import LineCollection
 
@@ -184,9 +198,42 @@ def root_locus(
     return ax
 
 
+def frequency_response(response: Any, *, axes: Any = None) -> np.ndarray:
+    """Magnitude, phase and coherence over frequency: measured (dots, two standard errors) and of the model (line).
+
+        jk.plot.frequency_response(jk.stability.frequency_response(model, trials, "torque", "angle"))
+
+    **Arguments:**
+
+    - `response`: a `jaxkane.stability.FrequencyResponse`.
+    - `axes`: three.
+
+    **Returns:** the axes (3, 1).
+    """
+    axes = panels(axes, 3, size=(6.4, 1.9), sharex=True)
+    magnitude, phase, coherence = axes[:, 0]
+    w, error = response.frequencies, 2 * response.relative_error
+    size = np.abs(response.measured)
+    low, high = size * np.maximum(1 - error, 1e-3), size * (1 + np.minimum(error, 1e3))
+    magnitude.vlines(w, low, high, color="C0", alpha=0.4, linewidth=1)
+    magnitude.loglog(w, size, ".", color="C0", markersize=3, label="measured")
+    magnitude.loglog(w, np.abs(response.model), color="C1", linewidth=1.2, label="model")
+    of_model = np.unwrap(np.angle(response.model))
+    off = np.angle(response.measured / response.model)  # unwrapping the measured phase would add turns by noise
+    phase.semilogx(w, np.rad2deg(of_model + off), ".", color="C0", markersize=3)
+    phase.semilogx(w, np.rad2deg(of_model), color="C1", linewidth=1.2)
+    coherence.semilogx(w, response.coherence, ".", color="C0", markersize=3)
+    magnitude.set(ylabel=f"{label_of(response.output)} /\n{label_of(response.input)}")
+    phase.set(ylabel="phase [deg]")
+    coherence.set(ylabel="coherence", xlabel="frequency [rad/s]", ylim=(0.0, 1.05))
+    for ax in (magnitude, phase, coherence):
+        finish(ax)
+    return axes
+
+
 def stable_ranges(x: Any, eigenvalues: Any) -> list[tuple[float, float]]:
-    """Where all real parts are negative, by straight lines between the values x (m,)."""
-    largest = eigenvalues.real.max(axis=1)  # NaN where any is
+    """The ranges in which all real parts are negative, by linear interpolation between the values x (m,)."""
+    largest = eigenvalues.real.max(axis=1)  # NaN if any is NaN
     ranges, start = [], None
     for k, y in enumerate(largest):
         before = largest[k - 1] if k else np.nan
@@ -203,25 +250,28 @@ def _table(values: Any, eigenvalues: Any, modes: Sequence[str] | None) -> tuple[
     if eigenvalues is None:
         if not hasattr(values, "eigenvalues"):
             raise TypeError(
-                "Give values (m,) and eigenvalues (m, n), or the result of jaxkane.stability.eigenvalues(...)."
+                "Pass values (m,) and eigenvalues (m, n), or the result of jaxkane.stability.eigenvalues(...)."
             )
         modes = getattr(values, "modes", None) if modes is None else modes
         values, eigenvalues = values.values, values.eigenvalues
     x, lam = np.asarray(values, dtype=float), np.asarray(eigenvalues, dtype=complex)
     if lam.ndim != 2 or x.shape != lam.shape[:1] or len(x) < 2:
         raise ValueError(
-            f"The eigenvalues (m, n) stand at m values of the parameter, at least two; got {lam.shape} at {x.shape}."
+            f"Eigenvalues must have the shape (m, n) for m >= 2 values of the parameter; got {lam.shape} for {x.shape}."
         )
     if not np.any(np.isfinite(lam)):
-        raise ValueError("None of the eigenvalues is finite: there is no steady motion at these values.")
+        raise ValueError(
+            "All eigenvalues are NaN, because no steady motion exists at these values. Choose other values."
+        )
     names = [""] * lam.shape[1] if modes is None else list(as_names(modes))
     if len(names) != lam.shape[1]:
-        raise ValueError(f"There are {lam.shape[1]} modes, and {len(names)} names: {', '.join(names)}.")
+        raise ValueError(f"There are {lam.shape[1]} modes but {len(names)} names: {', '.join(names)}.")
     return x, lam, names
 
 
 def _limits(lam: Any) -> tuple[float, float]:
-    """Holds the largest real part and oscillation; what decays much faster than anything oscillates runs out below."""
+    """Limits that include the largest real part and oscillation. Modes that decay much faster than any oscillation are
+    cut off."""
     finite = lam[np.isfinite(lam)]
     top = max(finite.real.max(), finite.imag.max(), 1e-6)
     return max(float(finite.real.min()), -1.2 * float(top)) - 0.05 * float(top), 1.05 * float(top)

@@ -1,24 +1,27 @@
-"""Motions over time, audits, and fits beside measurements, drawn. Knows matplotlib and results."""
+"""Plots of trajectories over time, and of audits."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from .._common.lookup import as_names, hint, label_of, refuse_unknown
+from .._common.lookup import as_names, label_of
 from .._integrate.audit import Audit
 from .._integrate.status import Status
 from .._integrate.trajectory import Trajectory
-from .._system.system import in_degrees, refuse_no_angle, unit_of, units_of
+from .._system.system import in_degrees, refuse_no_angle, unit_of
 
-SOFT = "0.55"  # a grey that is seen on white and on black
+Axes: TypeAlias = Any
+"""matplotlib's `Axes`. matplotlib is imported only when something is drawn."""
+
+SOFT = "0.55"  # a grey that is visible on white and on black
 STABLE = "#2ca02c"
 
 
 def panels(axes: Any, rows: int, columns: int = 1, *, size: tuple[float, float], **options: Any) -> np.ndarray:
-    """An array (rows, columns) of axes: those given, or of a new figure, `size` [inches] for each."""
+    """An array (rows, columns) of axes: the passed ones, or those of a new figure, `size` [inches] for each."""
     if axes is not None:
         array = np.ravel(axes)
         if array.size != rows * columns:
@@ -30,14 +33,14 @@ def panels(axes: Any, rows: int, columns: int = 1, *, size: tuple[float, float],
     return plt.subplots(rows, columns, figsize=figsize, squeeze=False, layout="constrained", **options)[1]
 
 
-def finish(ax: Any, legend: bool = True) -> None:
-    """A faint grid, and a legend without a frame where something has a name."""
+def finish(ax: Axes, legend: bool = True) -> None:
+    """A faint grid, and a legend without a frame if anything has a label."""
     ax.grid(alpha=0.25)
     if legend and ax.get_legend_handles_labels()[1]:
         ax.legend(frameon=False, fontsize="small")
 
 
-_MARKED = 200  # more members of a batch than this are drawn without a mark where they ended
+_MARKED = 200  # with more members of a batch, the ends are not marked
 
 
 def trajectories(
@@ -50,24 +53,25 @@ def trajectories(
     axes: Any = None,
     **style: Any,
 ) -> np.ndarray:
-    """Coordinates, speeds and inputs over time, a panel for each; and how the simulation ended, if it ended early.
+    """Coordinates, speeds and inputs over time, one panel each. The end of a simulation that ended early is marked.
 
-        jk.plot.trajectories(ride, ["roll", "steer", ("roll_rate", "steer_rate")], degrees=True)
+        jk.plot.trajectories(trajectory, ["roll", "steer", ("roll_rate", "steer_rate")], degrees=True)
 
     **Arguments:**
 
-    - `trajectory`: a `Trajectory`. Of a batch all members are drawn, faintly.
-    - `names`: of what is drawn; names in a tuple share a panel. By default the coordinates.
+    - `trajectory`: a `Trajectory`. All members of a batch are drawn, faintly.
+    - `names`: the quantities; names in a tuple share a panel. Default: the coordinates.
     - `degrees`: angles in degrees instead of radians.
-    - `units`: by name. By default those that the system declares (`System.units`); where it declares none, those of
-        usual names, as "roll", "x", "yaw_rate" and "steer_torque" do.
-    - `label`: what this motion is called in the legend, when several are drawn into the same `axes`.
-    - `axes`: as many as there are panels. `style`: passed on to matplotlib's `plot`.
+    - `units`: by name. Default: those that the system declares (`System.units`), else those of usual names, e.g.
+        "roll", "x", "yaw_rate" and "steer_torque".
+    - `label`: of this trajectory in the legend, if several are drawn into the same `axes`.
+    - `axes`: as many as there are panels.
+    - `style`: passed to matplotlib's `plot`.
 
     **Returns:** the axes (n_panels,).
 
-    **Raises:** `KeyError` for a name that the trajectory does not have; `ValueError` for `degrees` where nothing is
-    known to be an angle.
+    **Raises:** `KeyError` for a name that the trajectory does not have; `ValueError` for `degrees` if no quantity is an
+    angle.
     """
     groups = [as_names(group) for group in ([names] if isinstance(names, str) else names or trajectory.names[0])]
     drawn = [name for group in groups for name in group]
@@ -83,7 +87,7 @@ def trajectories(
     for ax, group in zip(panel_axes, groups, strict=True):
         labelled = []
         for name in group:
-            scale, unit = _scale(units_by_name[name], degrees)
+            scale, unit = scale_of(units_by_name[name], degrees)
             parts = [part for part in (label_of(name) if len(group) > 1 else "", label) if part]
             y = (scale * values[name]).reshape(n, -1)
             line = ax.plot(t[0], y[0], label=", ".join(parts) or None, **members | style)[0]
@@ -98,8 +102,8 @@ def trajectories(
     return panel_axes
 
 
-def _scale(unit: str, degrees: bool) -> tuple[float, str]:
-    """The factor to the unit that is drawn, and that unit."""
+def scale_of(unit: str, degrees: bool) -> tuple[float, str]:
+    """The factor to the unit that is drawn, and this unit."""
     return (180.0 / np.pi, unit.replace("rad", "deg")) if degrees and in_degrees(unit) else (1.0, unit)
 
 
@@ -110,8 +114,8 @@ def _axis_label(labelled: Sequence[tuple[str, str]]) -> str:
     return f"{name}\n{unit}".strip()
 
 
-def _mark_ends(ax: Any, trajectory: Trajectory, t: np.ndarray, y: np.ndarray, color: Any) -> None:
-    """A cross at the last value of every motion that ended early."""
+def _mark_ends(ax: Axes, trajectory: Trajectory, t: np.ndarray, y: np.ndarray, color: Any) -> None:
+    """A cross at the last value of each trajectory that ended early."""
     early = np.flatnonzero(np.ravel(np.asarray(trajectory.status)) != Status.COMPLETED)
     if len(early) > _MARKED:
         return
@@ -132,20 +136,23 @@ def _mark_t_end(axes: np.ndarray, trajectory: Trajectory) -> None:
 def audit(audit: Audit, *, axes: Any = None) -> np.ndarray:
     """Energies, energy error, residuals of the constraints and conditioning over time.
 
-        jk.plot.audit(jk.audit(system, ride))
+        jk.plot.audit(jk.audit(system, trajectory))
 
-    **Arguments:** an `Audit`; `axes`: four.
+    **Arguments:**
+
+    - `audit`: an `Audit`.
+    - `axes`: four.
 
     **Returns:** the axes (2, 2).
     """
     if not isinstance(audit, Audit):
-        raise TypeError(f"plot.audit draws an Audit, jk.audit(system, ride); got a {type(audit).__name__}.")
+        raise TypeError(f"plot.audit needs an Audit, e.g. jk.audit(system, trajectory); got a {type(audit).__name__}.")
     panel_axes = panels(axes, 2, 2, size=(4.75, 2.75), sharex=True)
     energies, errors, residuals, conditions = np.ravel(panel_axes)
     energies.plot(audit.t, audit.kinetic_energy, label="kinetic energy")
     energies.plot(audit.t, audit.work, label="work of the loads")
     energies.set(ylabel="[J]")
-    errors.plot(audit.t, audit.energy_error, color="C3", label="kinetic energy gained, less work")
+    errors.plot(audit.t, audit.energy_error, color="C3", label="change of kinetic energy minus work")
     errors.set(ylabel="[J]")
     for values, label in (
         (audit.configuration_residuals, "configuration constraints"),
@@ -163,91 +170,3 @@ def audit(audit: Audit, *, axes: Any = None) -> np.ndarray:
     for panel in (residuals, conditions):
         panel.set(xlabel="time [s]")
     return panel_axes
-
-
-_TRIALS = 3
-
-
-def fits(
-    fit: Any,
-    trials: Sequence[str | int] | None = None,
-    channels: Sequence[str] | None = None,
-    *,
-    residuals: bool = True,
-    degrees: bool = False,
-    units: Mapping[str, str] | None = None,
-    axes: Any = None,
-) -> np.ndarray:
-    """Measured (dots) and simulated (line) by channel and trial; below each, the residuals in standard deviations.
-
-        result = jk.fit.fit(system, trials, ("mass", "damping"))
-        jk.plot.fits(result, ["ride 1", "ride 7"], degrees=True)
-
-    **Arguments:**
-
-    - `fit`: a `jaxkane.fit.Fit`.
-    - `trials`: names or numbers; by default the first, the middle and the last. `channels`: by default all.
-    - `residuals`: whether they are drawn. Their grey band is two standard deviations of the measurement.
-    - `degrees`, `units`: as for `trajectories`.
-    - `axes`: a row for each channel, or two with residuals; a column for each trial.
-
-    **Returns:** the axes (n_rows, n_trials).
-
-    **Raises:** `ValueError` for a trial or a channel that the fit does not have.
-    """
-    names = list(fit.trial_names)
-    if trials is None:
-        chosen = _spread(len(names))
-    else:
-        chosen = [_number(names, trial) for trial in ([trials] if isinstance(trials, (str, int)) else trials)]
-    all_channels = list(fit.problem.channels)
-    channels = all_channels if channels is None else list(as_names(channels))
-    refuse_unknown(channels, all_channels, "fits: there is no channel")
-    if not channels:
-        raise ValueError(f"fits: `channels` is empty; {hint([], all_channels)}")
-    units_by_name = {
-        channel: unit_of(channel, units_of(fit.problem.system) | dict(units or {})) for channel in channels
-    }
-    if degrees:
-        refuse_no_angle(channels, units_by_name.values())
-    each = 1 + residuals
-    heights = {"height_ratios": [3, 1.2][:each] * len(channels)}
-    axes = panels(axes, each * len(channels), len(chosen), size=(4.2, 1.5), sharex="col", sharey="row", **heights)
-    fitted, all_residuals = fit.fitted, fit.residuals
-    for column, k in zip(axes.T, chosen, strict=True):
-        trial = fit.problem.trials[k]
-        column[0].set_title(label_of(names[k]), fontsize="medium")
-        column[-1].set_xlabel("time [s]")
-        for ax, below, channel in zip(column[::each], column[each - 1 :: each], channels, strict=True):
-            if channel not in trial.measured:
-                ax.text(0.5, 0.5, "not measured", ha="center", va="center", color=SOFT, transform=ax.transAxes)
-                continue
-            scale, unit = _scale(units_by_name[channel], degrees)
-            ax.plot(
-                trial.t, scale * trial.measured[channel], ".", color="C0", markersize=3, alpha=0.6, label="measured"
-            )
-            ax.plot(trial.t, scale * fitted[names[k]][channel], color="C1", linewidth=1.2, label="simulated")
-            finish(ax, legend=False)
-            if residuals:
-                below.axhspan(-2.0, 2.0, color=SOFT, alpha=0.2, linewidth=0)
-                below.plot(trial.t, all_residuals[names[k]][channel], ".", color="C0", markersize=2)
-                finish(below, legend=False)
-            if column is axes.T[0] or k == chosen[0]:
-                words = label_of(channel).replace("_", " ")
-                ax.set_ylabel(f"{words}\n[{label_of(unit)}]" if unit else words)
-                if residuals:
-                    below.set_ylabel("residual\n[σ]", fontsize="small")
-    axes[0, 0].legend(frameon=False, fontsize="small", markerscale=2)
-    return axes
-
-
-def _number(names: list[str], trial: str | int) -> int:
-    if isinstance(trial, str) and trial in names:
-        return names.index(trial)
-    if not isinstance(trial, str) and -len(names) <= trial < len(names):
-        return range(len(names))[trial]
-    raise ValueError(f"fits: there is no trial {trial!r}; {hint(str(trial), names)}")
-
-
-def _spread(n: int) -> list[int]:
-    return np.unique(np.linspace(0, n - 1, min(n, _TRIALS)).astype(int)).tolist()

@@ -1,44 +1,15 @@
-"""What control engineers do with a linear model, by scipy and python-control. Knows no mechanics."""
+"""Control theory for linear models, with scipy and python-control. Does not depend on mechanics."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from .._common.lookup import as_names, hint
+from .._common.lookup import as_names
+from ._frequency import place
 from ._linearize import LinearModel
-
-if TYPE_CHECKING:
-    import scipy.signal
-
-
-def transfer_function(model: LinearModel, input: str, output: str) -> scipy.signal.TransferFunction:
-    """G(s) = C (s - A)^-1 B + D from an input to an output, as a `scipy.signal.TransferFunction`.
-
-    Leading coefficients of the numerator that are rounding errors (1e-12 of the largest) are left out. `bode` needs no
-    coefficients and is more accurate for many states.
-
-    **Raises:** `ValueError` for an unknown name.
-    """
-    import scipy.signal  # which imports all of scipy.stats: a second that most have no use for
-
-    A, B, C, D = _single(model, input, output)
-    numerator, denominator = scipy.signal.ss2tf(A, B, C, D)
-    small = np.abs(numerator[0]) <= 1e-12 * np.abs(numerator[0]).max()
-    return scipy.signal.TransferFunction(numerator[0][np.argmin(small) :], denominator)
-
-
-def bode(model: LinearModel, input: str, output: str, frequencies: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Magnitude [dB] and phase [deg, unwrapped] of G(i omega) at `frequencies` (m,) [rad/s], by solving for each.
-
-    **Raises:** `ValueError` for an unknown name.
-    """
-    A, B, C, D = _single(model, input, output)
-    s = 1j * np.asarray(frequencies, dtype=float)[:, None, None]
-    G = (C @ np.linalg.solve(s * np.eye(len(A)) - A, np.broadcast_to(B, (len(s), *B.shape))) + D)[:, 0, 0]
-    return 20 * np.log10(np.abs(G)), np.rad2deg(np.unwrap(np.angle(G)))
 
 
 def lqr(
@@ -48,40 +19,109 @@ def lqr(
 
         A' P + P A - P B R^-1 B' P + Q = 0,   K = R^-1 B' P          (scipy.linalg.solve_continuous_are)
 
-    **Arguments:** `Q` (n, n) or its diagonal (n,); `R` (m, m), its diagonal or a number; `inputs`: names of the inputs
-    to use, by default all.
+    The solution uses scaled states, inputs, time and cost, so that the gains do not depend on units.
+
+    **Arguments:**
+
+    - `model`: the linear model.
+    - `Q`: (n, n) weights of the states, or their diagonal (n,).
+    - `R`: (m, m) weights of the inputs, their diagonal (m,) or a number.
+    - `inputs`: names of the inputs to use; all by default.
 
     **Returns:** K (m, n), P (n, n), and the eigenvalues (n,) of A - B K.
 
-    **Raises:** `ValueError` for wrong shapes and for a model that these inputs cannot stabilize.
+    **Raises:** `ValueError` for wrong shapes, if these inputs cannot stabilize the model, and if the solution does not
+    satisfy the equation.
     """
-    from scipy.linalg import solve_continuous_are
-
     names = model.inputs if inputs is None else as_names(inputs)
-    A, B = np.asarray(model.A), np.asarray(model.B)[:, [_place(model.inputs, k, "input") for k in names]]
+    A = np.asarray(model.A, float)
+    B = np.asarray(model.B, float)[:, [place(model.inputs, k, "input") for k in names]]
     Q, R = _weights(Q, len(A), "Q", "states"), _weights(R, B.shape[1], "R", "inputs")
-    size = max(np.abs(A).max(), np.abs(B).max())
-    for root in np.linalg.eigvals(A):  # Popov, Belevitch and Hautus: [root - A, B] must keep its rank where Re >= 0
-        s = np.linalg.svd(np.hstack([root * np.eye(len(A)) - A, B]), compute_uv=False)
+    d, e, tau, rho = _scales(A, B, Q, R)
+    A1, B1, Q1, R1 = (
+        tau * A * d / d[:, None],
+        tau * B * e / d[:, None],
+        rho * Q * d * d[:, None],
+        rho * R * e * e[:, None],
+    )
+    size = max(np.abs(A1).max(), np.abs(B1).max(initial=0.0))
+    for root in np.linalg.eigvals(A1):  # Popov, Belevitch and Hautus: [root - A, B] must keep its rank where Re >= 0
+        s = np.linalg.svd(np.hstack([root * np.eye(len(A)) - A1, B1]), compute_uv=False)
         if root.real > -1e-9 * size and s[-1] < 1e-9 * size:
             raise ValueError(
-                f"lqr: no regulator of {', '.join(model.states)} by {', '.join(names)} exists: they do not reach the "
-                f"mode with the eigenvalue {root:.4g}, which does not decay. Leave out the states that it moves: "
-                "linearize(..., states=(...)), or add an input."
+                f"lqr: no regulator of {', '.join(model.states)} by {', '.join(names)} exists: these inputs cannot "
+                f"control the mode with the eigenvalue {root / tau:.4g}, which does not decay. Omit the states of this "
+                "mode, linearize(..., states=(...)), or add an input."
             )
-    least_Q, least_R = (float(np.linalg.eigvalsh(0.5 * (W + W.T))[0]) for W in (Q, R))
-    if not (least_Q >= -1e-12 * np.abs(Q).max() and least_R > 0.0):
+    least_Q, least_R = (float(np.linalg.eigvalsh(0.5 * (W + W.T))[0]) for W in (Q1, R1))
+    if not (least_Q >= -1e-12 * np.abs(Q1).max() and least_R > 0.0):
         raise ValueError(
-            "lqr: Q must have no negative eigenvalue and R only positive ones; "
-            f"the least of them are {least_Q:.4g} and {least_R:.4g}."
+            "lqr: Q must be positive semidefinite and R positive definite; "
+            f"their smallest eigenvalues are {np.linalg.eigvalsh(0.5 * (Q + Q.T))[0]:.4g} and "
+            f"{np.linalg.eigvalsh(0.5 * (R + R.T))[0]:.4g}."
         )
-    P = solve_continuous_are(A, B, Q, R)
+    P, K = _riccati(A1, B1, Q1, R1, model.states, names)
+    K, P = K * e[:, None] / d, P * tau / (rho * d * d[:, None])
+    return K, P, np.linalg.eigvals(A1 - B1 @ (K * d / e[:, None])) / tau
+
+
+def _scales(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Units of the states d (n,) and inputs e (m,), of time and of cost in which the entries are of order one.
+
+    The scaled entries are tau A_ij d_j / d_i, tau B_ij e_j / d_i, rho Q_ij d_i d_j and rho R_ij e_i e_j. The logarithms
+    of the nonzero ones have the least sum of absolute values, by reweighted least squares. In a sum of squares, entries
+    that are rounding errors would outweigh the others.
+    """
+    n, m = B.shape
+    of_state, of_input = np.eye(n + m + 2)[:n], np.eye(n + m + 2)[n : n + m]
+    of_time, of_cost = np.eye(n + m + 2)[n + m :]
+    rows, logs = [], []
+    for W, left, right, common in (
+        (A, -of_state, of_state, of_time),
+        (B, -of_state, of_input, of_time),
+        (Q, of_state, of_state, of_cost),
+        (R, of_input, of_input, of_cost),
+    ):
+        for i, j in np.argwhere(W):
+            rows.append(left[i] + right[j] + common)
+            logs.append(-np.log(abs(W[i, j])))
+    rows, logs = np.array(rows).reshape(-1, n + m + 2), np.array(logs)
+    x = np.zeros(n + m + 2)
+    for _ in range(20):
+        weight = 1 / np.sqrt(np.maximum(1.0, np.abs(rows @ x - logs))) if x.any() else np.ones(len(logs))
+        x = np.linalg.lstsq(rows * weight[:, None], logs * weight, rcond=1e-10)[0]
+    x = np.exp2(np.round(x / np.log(2)))  # powers of two add no rounding
+    return x[:n], x[n : n + m], float(x[-2]), float(x[-1])
+
+
+def _riccati(A, B, Q, R, states: Sequence[str], inputs: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """P and K of the Riccati equation. The solution is checked, because SciPy returns wrong ones for bad scaling."""
+    from scipy.linalg import solve_continuous_are
+
+    wrong = f"lqr: the Riccati equation of {', '.join(states)} by {', '.join(inputs)} was not solved"
+    remedy = "Check the weights Q and R and the eigenvalues of the model; or omit states that need no regulator."
+    try:
+        P = solve_continuous_are(A, B, Q, R)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(f"{wrong}: {error} {remedy}") from None
     K = np.linalg.solve(R, B.T @ P)
-    return K, P, np.linalg.eigvals(A - B @ K)
+    terms = np.abs(A.T) @ np.abs(P) + np.abs(P) @ np.abs(A) + np.abs(K.T) @ np.abs(R) @ np.abs(K) + np.abs(Q)
+    size = np.sqrt(np.diag(terms))
+    size = np.where(size > 0, size, 1.0)
+    residual = float(np.abs((A.T @ P + P @ A - K.T @ R @ K + Q) / size / size[:, None]).max())
+    growth = float(np.real(np.linalg.eigvals(A - B @ K)).max())
+    if not (residual < 1e-6 and growth < 0.0):
+        cause = f"the residual is {residual:.3g} of its terms" if growth < 0.0 else "the regulated model does not decay"
+        raise ValueError(f"{wrong}: {cause}. {remedy}")
+    return P, K
 
 
 def to_control(model: LinearModel) -> Any:
-    """The model as a `control.StateSpace` of python-control, with its names. Needs the extra `control`."""
+    """The model as a `control.StateSpace` of python-control, with its names. Needs the extra `control`.
+
+    G = control.tf(to_control(model)["roll", "steer_torque"])
+    control.frequency_response(to_control(model)["roll", "steer_torque"], omega)
+    """
     try:
         import control  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -90,23 +130,13 @@ def to_control(model: LinearModel) -> Any:
     return control.StateSpace(*map(np.asarray, model), **names)
 
 
-def _single(model: LinearModel, input: str, output: str) -> tuple[np.ndarray, ...]:
-    i, o = _place(model.inputs, input, "input"), _place(model.outputs, output, "output")
-    A, B, C, D = map(np.asarray, model)
-    return A, B[:, [i]], C[[o]], D[[o]][:, [i]]
-
-
-def _place(names: Sequence[str], name: str, what: str) -> int:
-    if name not in names:
-        raise ValueError(f"The model has no {what} {name!r}; {hint(name, names, 'it has')}")
-    return list(names).index(name)
-
-
 def _weights(W: Any, n: int, name: str, what: str) -> np.ndarray:
     W = np.asarray(W, dtype=float)
     W = np.diag(np.broadcast_to(W, (n,))) if W.ndim == 0 or W.shape == (n,) else W
     if W.shape != (n, n):
-        raise ValueError(f"lqr: {name} is ({n}, {n}), or ({n},) for a diagonal: one for each of the {what}.")
+        raise ValueError(
+            f"lqr: {name} must be ({n}, {n}), or ({n},) for a diagonal: one weight for each of the {what}."
+        )
     if not np.all(np.isfinite(W)):
         raise ValueError(f"lqr: {name} is not finite.")
     return W

@@ -1,4 +1,4 @@
-"""Values of a parameter at which stability is gained or lost. Knows eigenvalues along a parameter."""
+"""Values of a parameter at which a system becomes stable or unstable. Uses eigenvalues along a parameter."""
 
 from __future__ import annotations
 
@@ -15,26 +15,44 @@ from jaxtyping import Array, Complex, Float, Int
 from .._common.lookup import not_there
 from .._kane.arguments import is_concrete
 from .._scalarjit.cache_key import jit
+from .._scalarjit.components import Numbers
 from .._scalarjit.nan import constant, nan_where
 from .._system.system import System
-from ._eig_of_matrix import Eig, eig
-from ._eigenvalues import MotionAt, eigenvalues, motion_family, names_of_modes, state_matrix, track_modes
+from ._eigenvalue_curves import (
+    MotionAt,
+    eigenvalues,
+    motion_family,
+    names_of_modes,
+    parameter_label,
+    state_matrix,
+    track_modes,
+)
+from ._matrix_eigenvalues import Eig, eig
 
 _MOST = 8
 _GRID = np.linspace(0.0, 20.0, 201)  # [m/s]
-_HALVINGS = 32  # of a step between two values
-_TRIALS = 200  # between two values
-_NEUTRAL = 1e-10  # of the largest eigenvalue: what neither grows nor decays has a real part of rounding errors
-_NOISE = 1e-13  # the same where they stand alone
+_HALVINGS = 32  # at most, of a step between two values
+_TRIALS = 200  # at most, of intervals between two values
+_NEUTRAL = 1e-10  # relative to the largest eigenvalue: the real part of a neutral mode is rounding errors of this size
+_NOISE = 1e-13  # the same for a well-separated eigenvalue
 _MOST_NEUTRAL = 1e-7  # the same where eigenvalues coalesce, which magnifies rounding errors
 
 
 class CriticalSpeeds(eqx.Module):
-    """Values of a parameter where the real part of a mode passes zero, in rising order.
+    """Values of a parameter where the real part of an eigenvalue crosses zero, in rising order.
 
-    Attributes: `values` (m,); `frequency` (m,) [rad/s], zero where the mode does not oscillate; `direction` (m,): 1
-    where the mode becomes unstable, -1 where it becomes stable; `mode` (m,): its place in `modes`, the names.
-    `speeds["weave"]` is the first value of that mode; without one it is `none`, which is NaN with its derivatives.
+    `speeds["weave"]` is the first value of that mode. If the mode does not cross, it is `none`: NaN with NaN
+    derivatives.
+
+    Attributes:
+
+    - `values` (m,): of the parameter.
+    - `frequency` (m,) [rad/s]: zero where the mode does not oscillate.
+    - `direction` (m,): 1 where the mode becomes unstable, -1 where it becomes stable.
+    - `mode` (m,): index of the mode in `modes`.
+    - `none`: a NaN whose derivatives are NaN.
+    - `modes`: the names of the modes.
+    - `parameter`: name and, if known, unit of the parameter.
     """
 
     values: Float[Array, " m"]
@@ -43,6 +61,7 @@ class CriticalSpeeds(eqx.Module):
     mode: Int[Array, " m"]
     none: Float[Array, ""]
     modes: tuple[str, ...] = eqx.field(static=True)
+    parameter: str = eqx.field(static=True, default="parameter")
 
     def __getitem__(self, name: str) -> Float[Array, ""]:
         if name not in self.modes:
@@ -61,57 +80,64 @@ class CriticalSpeeds(eqx.Module):
             f"{self.modes[int(i)]} {'un' * (int(d) > 0)}stable from {float(v):.10g} ({float(w):.4g} rad/s)"
             for v, i, d, w in rows
         )
-        return f"CriticalSpeeds({text or 'none'})"
+        return f"CriticalSpeeds({self.parameter}: {text or 'none'})"
 
 
 def critical_speeds(
     system: System,
-    values: Any = None,
+    values: Numbers = None,
     motion: MotionAt = None,
     *,
     states: Sequence[str] | None = None,
     modes: Sequence[str] | None = None,
     most: int = _MOST,
 ) -> CriticalSpeeds:
-    """Values of a parameter at which a mode becomes stable or unstable: of a bicycle the weave and capsize speeds.
+    """Values of a parameter at which a mode becomes stable or unstable, e.g. the weave and capsize speeds of a bicycle.
 
         Re lambda(p) = 0
 
-    The steps between `values` are halved until no eigenvalue can reach the imaginary axis, or one alone (or a conjugate
-    pair) passes it once, which is bisected to rounding. How far eigenvalues move while A changes by dA is told by
-    Gershgorin's discs of X^-1 dA X about them, X being the eigenvectors.
+    The search bisects intervals between `values` until each contains at most one crossing, which it bisects to
+    rounding. An interval is decided if no eigenvalue can reach the imaginary axis, or if one eigenvalue or conjugate
+    pair alone crosses it once. The change of the eigenvalues for a change dA of A is bounded by Gershgorin's discs of
+    X^-1 dA X; X are the eigenvectors.
 
-    **Arguments:** as `eigenvalues`; the `values` in any order, and there must be a steady motion between them too; for
-    the bicycle they are 0 to 20 m/s by 0.1 by default. `most`: how many are kept under a trace, where their number
-    cannot be known; the rest are NaN.
+    **Arguments:**
+
+    - `system`, `motion`, `states`, `modes`: as in `eigenvalues`.
+    - `values`: as in `eigenvalues`, in any order. A steady motion must exist between them too. Default for a bicycle: 0
+        to 20 m/s in steps of 0.1.
+    - `most`: the length of the result under a trace, where the number of crossings cannot be known; unused entries are
+        NaN.
 
     **Returns:** `CriticalSpeeds`. They are differentiable in the parameters of the system by the implicit function
     theorem,
 
-        dp = -(d Re lambda / d parameters) / (d Re lambda / dp),
+        dp = -(d Re lambda / d parameters) / (d Re lambda / dp).
 
-    with NaN where the mode has no derivative because it coalesces with another. Names are those of `eigenvalues`; under
-    a trace a value is NaN where the name of its mode is not clear.
+    The derivative is NaN where the mode coalesces with another. Names are those of `eigenvalues`. Under a trace a value
+    is NaN if the name of its mode is not clear.
 
-    **Warns:** where more eigenvalues come to grow, or cease to, than pass the axis: a motion without damping becomes
-    neutral, and crosses nothing. Under a trace there is no warning.
+    **Warns:** if the number of growing eigenvalues changes by more than the crossings explain. Example: without damping
+    a motion becomes neutral, and nothing crosses. Under a trace there is no warning.
 
-    **Raises:** `ValueError` as `eigenvalues`, and where some of `values`, or something between them, has no steady
-    motion; under a trace all are NaN then.
+    **Raises:** `ValueError` as `eigenvalues`, and if a steady motion does not exist at some of `values` or between
+    them. Under a trace all values are NaN then.
     """
     if isinstance(most, bool) or not isinstance(most, int) or most < 1:
-        raise ValueError(f"critical_speeds: `most` is how many are kept, at least one; got {most!r}.")
+        raise ValueError(f"critical_speeds: `most` must be a positive number of values to keep; got {most!r}.")
     values, at, states, groups = motion_family(system, _GRID if values is motion is None else values, motion, states)
-    values = jnp.sort(values)  # directions are those of a rising parameter
+    values = jnp.sort(values)  # `direction` is defined for a rising parameter
+    label = parameter_label(system, at)
     if len(values) < 2:
-        names = eigenvalues(system, values, motion, states=states, modes=modes).modes
+        names = eigenvalues(system, values, motion, states=states, modes=modes).modes if len(values) else ()
         empty, none = jnp.zeros(0, values.dtype), jnp.full((), jnp.nan, values.dtype)
-        return CriticalSpeeds(empty, empty, empty.astype(int), empty.astype(int), none, names)
+        return CriticalSpeeds(empty, empty, empty.astype(int), empty.astype(int), none, names, label)
     crossings, state_names = _crossings(system, values, at, states, groups, most)
     known = jax.lax.stop_gradient(crossings)
-    origin = (system, values, crossings.values)  # which follow from what `motion` closes over, too
-    names, unnamed = names_of_modes(state_names, groups, known.clear, modes)
-    # What is decided by numbers that are known is left to NumPy: every operation would be a program of its own.
+    # `motion` may close over traced values: then `crossings` depends on them too
+    origin = (system, values, crossings.values)
+    names, unnamed = names_of_modes(state_names, groups, known.clear, known.number, modes)
+    # Use NumPy for concrete values: with JAX every operation would be compiled as a program.
     as_array: Any = np.asarray if is_concrete(crossings, origin) else jnp.asarray
     columns = (crossings.values, crossings.frequency, known.direction, known.column)
     critical, frequency, direction, column = map(as_array, columns)
@@ -119,8 +145,8 @@ def critical_speeds(
         if known.is_missing:
             raise ValueError(
                 f"critical_speeds({type(system).__name__}): there is no steady motion at {float(known.missing):.6g}, "
-                "so that what becomes stable or unstable beside it would be missed. Give values at which, and between "
-                "which, there is one."
+                "so crossings near it would be missed. Choose `values` at which, and between which, a steady motion "
+                "exists."
             )
         if known.count > most:
             return critical_speeds(system, values, motion, states=states, modes=modes, most=2 * int(known.count))
@@ -128,9 +154,9 @@ def critical_speeds(
             n = int(known.unexplained)
             warnings.warn(
                 f"critical_speeds({type(system).__name__}): between {float(values[0]):.6g} and {float(values[-1]):.6g} "
-                f"the number of eigenvalues that grow {'rises' if n > 0 else 'falls'} by {abs(n)} more than pass the "
-                "imaginary axis: some only reach it, as where nothing damps, or at an end of the values, or pass it "
-                "too flatly to be found. jaxkane.stability.eigenvalues shows where.",
+                f"the number of growing eigenvalues {'rises' if n > 0 else 'falls'} by {abs(n)} more than the detected "
+                "crossings of the imaginary axis. Some eigenvalues only reach the axis (no damping, or at an end of "
+                "the values), or cross it at too small an angle. Plot jaxkane.stability.eigenvalues to see where.",
                 stacklevel=2,
             )
         rows = np.flatnonzero(known.counts)
@@ -143,11 +169,19 @@ def critical_speeds(
     if not is_concrete(crossings, origin):
         none = nan_where(jnp.array(True), jnp.zeros((), values.dtype), origin)
     critical, frequency, direction, column = (jnp.asarray(x[order]) for x in (critical, frequency, direction, column))
-    return CriticalSpeeds(critical, frequency, direction, column, jnp.asarray(none), names)
+    return CriticalSpeeds(critical, frequency, direction, column, jnp.asarray(none), names, label)
 
 
 class _Crossings(NamedTuple):
-    """Of `count` crossings the first k, of which some `counts`; `missing`: a value without a steady motion."""
+    """At most k crossings.
+
+    - `values`, `frequency`, `direction`, `column` (k,): of each crossing.
+    - `counts` (k,): which entries are crossings.
+    - `count`: the number of crossings found, also above k.
+    - `is_missing`, `missing`: whether some value has no steady motion, and the first such value.
+    - `clear`, `number` (n,): as from `track_modes`.
+    - `unexplained`: as from `_unexplained`.
+    """
 
     values: Float[Array, " k"]
     frequency: Float[Array, " k"]
@@ -158,11 +192,18 @@ class _Crossings(NamedTuple):
     is_missing: Any
     missing: Any
     clear: Any
+    number: Any
     unexplained: Any
 
 
 class _Brackets(NamedTuple):
-    """Between `lower` and `upper` (k,) an eigenvalue passes the imaginary axis: the one that is next to `near`."""
+    """Intervals from `lower` to `upper` (k,), in each of which one eigenvalue crosses the imaginary axis.
+
+    - `near` (k,): an estimate of this eigenvalue.
+    - `rises` (k,): whether its real part increases.
+    - `count`: the number of intervals found, also above k.
+    - `is_missing`, `missing`: whether some value has no steady motion, and the first such value.
+    """
 
     lower: Float[Array, " k"]
     upper: Float[Array, " k"]
@@ -173,7 +214,7 @@ class _Brackets(NamedTuple):
     missing: Any
 
     def extended(self, lower, upper, near, rises, is_one) -> _Brackets:
-        """Those of `near` (n,) that are one are added as far as there is room; all are counted."""
+        """Append the entries of `near` (n,) for which `is_one`. Those beyond the k-th are counted but not stored."""
         at = jnp.where(is_one, self.count + jnp.cumsum(is_one) - 1, len(self.lower))
         old = (self.lower, self.upper, self.near, self.rises)
         rows = [x.at[at].set(y, mode="drop") for x, y in zip(old, (lower, upper, near, rises), strict=True)]
@@ -196,7 +237,7 @@ def _crossings(system, values, motion, states, groups, most: int):
     spectra = eig(A)
     brackets = _bracket(at, p, A, spectra.values, most)
     is_one = jnp.arange(most) < brackets.count
-    # Empty places repeat the first, so that nothing there can spoil a derivative.
+    # Unused entries repeat the first one: a NaN there would spoil reverse-mode gradients.
     brackets = jax.tree.map(lambda x: jnp.where(is_one, x, x[0]) if x.ndim else x, brackets)
     roots = _bisect(at, brackets)
     roots, frequency, spectra_at_roots, place = jax.lax.map(
@@ -205,10 +246,10 @@ def _crossings(system, values, motion, states, groups, most: int):
     rows = jnp.concatenate([p, jax.lax.stop_gradient(roots)])
     order = jnp.argsort(rows)
     all_of = jax.tree.map(lambda x, y: jnp.concatenate([x, y])[order], spectra, jax.lax.stop_gradient(spectra_at_roots))
-    columns, clear = track_modes(rows[order], all_of, state_names[0], groups)
+    columns, clear, number = track_modes(rows[order], all_of, state_names[0], groups)
     columns = columns[jnp.argsort(order)][len(p) :]
     column = jnp.argmax(columns == place[:, None].astype(columns.dtype), axis=1)
-    # What is zero at the first or the last value has not passed it.
+    # An eigenvalue that is zero at the first or the last value has not crossed.
     ends, step = p[jnp.array([0, -1])], jnp.abs(p[jnp.array([1, -2])] - p[jnp.array([0, -1])])
     inside = jnp.all(jnp.abs(rows[len(p) :, None] - ends[None, :]) > 1e-9 * step[None, :], axis=1)
     counts = is_one & inside
@@ -216,15 +257,16 @@ def _crossings(system, values, motion, states, groups, most: int):
     counted = brackets.count, brackets.is_missing, brackets.missing
     passed = jnp.sum(jnp.where(counts, direction * jnp.where(frequency > 0, 2, 1), 0))
     unexplained = _unexplained(spectra.values[0], spectra.values[-1], passed)
-    return _Crossings(roots, frequency, direction, column, counts, *counted, clear, unexplained), state_names[0]
+    return _Crossings(roots, frequency, direction, column, counts, *counted, clear, number, unexplained), state_names[0]
 
 
 def _unexplained(first, last, passed):
-    """How many more eigenvalues grow at the last value than at the first one, less those that passed the axis."""
+    """The increase of the number of growing eigenvalues from the first to the last value, less the crossings."""
 
     def growing(x):
         size = x.real / jnp.max(jnp.abs(x))
-        return jnp.sum(size > _MOST_NEUTRAL), jnp.sum(size > _NOISE)  # between them, it may be rounding errors
+        # real parts between these limits may be rounding errors
+        return jnp.sum(size > _MOST_NEUTRAL), jnp.sum(size > _NOISE)
 
     (few, many), (few_last, many_last) = growing(first), growing(last)
     low, high = few_last - many, many_last - few
@@ -232,8 +274,15 @@ def _unexplained(first, last, passed):
 
 
 def _bracket(at, p, A, x, most: int) -> _Brackets:
-    """Where eigenvalues of A = at(p) pass the imaginary axis between the values p (m,), where A is (m, n, n) and has
-    the eigenvalues x (m, n)."""
+    """Intervals of p in which eigenvalues of A = at(p) cross the imaginary axis.
+
+    **Arguments:**
+
+    - `at`: p -> A (n, n).
+    - `p` (m,): values of the parameter, rising.
+    - `A` (m, n, n), `x` (m, n): the matrices at `p`, and their eigenvalues.
+    - `most`: the largest number of intervals.
+    """
     depth = _HALVINGS + 2
     missing = ~jnp.all(jnp.isfinite(A), axis=(1, 2))
     zeros = jnp.zeros(most, p.dtype)
@@ -241,7 +290,7 @@ def _bracket(at, p, A, x, most: int) -> _Brackets:
     brackets = _Brackets(*empty, jnp.any(missing), p[jnp.argmax(missing)])
 
     def within(brackets, step):
-        """The halves of a step that are still to be looked at lie on a stack."""
+        """Bisect one interval. The undecided halves are on a stack, because a while_loop cannot recurse."""
         stack = jax.tree.map(lambda x: jnp.zeros((depth, *x.shape), x.dtype).at[0].set(x), step)
 
         def look(carry):
@@ -274,14 +323,18 @@ def _bracket(at, p, A, x, most: int) -> _Brackets:
 
 
 def _crossing_modes(spectrum: Eig, lower, middle, upper):
-    """Whether it is clear what passes the imaginary axis about A; and the eigenvalues (n,), which of them pass it
-    towards the right, and which pass it at all (of a conjugate pair the upper one)."""
+    """Crossings of the imaginary axis between `lower` and `upper`, by Gershgorin's discs.
+
+    **Returns:** whether the interval is decided; the eigenvalues (n,) of A; which of them cross towards the right; and
+    which cross at all (of a conjugate pair the upper one).
+    """
     (_, A_lower, before), (_, A, x), (_, A_upper, after) = lower, middle, upper
     s = jnp.abs(jnp.sum(spectrum.left.conj() * spectrum.vectors, axis=0))
-    # Both vectors of one length: discs then do not depend on how LAPACK scales them.
+    # Scale both vectors to one length: the discs would otherwise depend on LAPACK's scaling.
     by = (1 / jnp.sqrt(s)).astype(x.dtype)
     Y, X = spectrum.left.conj().T * by[:, None], spectrum.vectors * by[None, :]
-    changes = (A_lower - A, A_upper - A, A_lower - 2 * A + A_upper)  # the last where A is not linear in p
+    # the last one is nonzero where A is not linear in p
+    changes = (A_lower - A, A_upper - A, A_lower - 2 * A + A_upper)
     M = jnp.max(jnp.stack([jnp.abs(Y @ dA.astype(X.dtype) @ X) for dA in changes]), axis=0)
     radius = jnp.sum(M, axis=1)
     before, after = (y[jnp.argmin(jnp.abs(x[:, None] - y[None, :]), axis=1)] for y in (before, after))
@@ -302,7 +355,7 @@ def _crossing_modes(spectrum: Eig, lower, middle, upper):
 
 
 def _crossings_by_order(before, after):
-    """The same where it is not clear: by the order of the real parts, which change continuously."""
+    """The same for an undecided interval, by the order of the real parts, which change continuously."""
     before, after = (x[jnp.lexsort((-x.imag, -x.real))] for x in (before, after))
     rounding = 1e3 * jnp.finfo(before.dtype).eps * jnp.max(jnp.abs(before))
     rises = before.real < after.real
@@ -311,7 +364,7 @@ def _crossings_by_order(before, after):
 
 
 def _bisect(at, brackets: _Brackets):
-    """The critical values (k,), to rounding."""
+    """The critical values (k,), accurate to rounding."""
 
     def half(ends, _):
         lower, upper = ends
@@ -331,7 +384,10 @@ def _nearest(spectrum: Eig, near):
 
 
 def _differentiable(system, motion, states, root, near):
-    """A critical value with its derivatives, its frequency, the eigenvalues there and the place of the critical one."""
+    """A critical value with its derivatives.
+
+    **Returns:** the value, the frequency, all eigenvalues there, and the index of the critical one.
+    """
 
     def spectrum_at(p):
         spectrum = eig(state_matrix(system, p, motion, states)[0])

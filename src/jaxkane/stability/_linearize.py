@@ -15,18 +15,20 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import as_names, hint, refuse_unknown
 from .._integrate.trajectory import refuse_other_system
+from .._kane.api import dependent_speeds
 from .._kane.arguments import as_array, check_is_system, checked_inputs, is_concrete, is_one_number, refuse_incomplete
 from .._kane.checks import check_system
-from .._kane.constraints import SINGULAR_ROUNDING, configuration_residual
-from .._kane.equations import dependent_speeds, diagnosis
-from .._kane.rhs import has_outputs, output_names, outputs_at, rates, values_of
+from .._kane.constraint_residuals import SINGULAR_ROUNDING, configuration_residual
+from .._kane.diagnosis import diagnosis
+from .._kane.right_hand_side import has_outputs, output_names, outputs_at, rates, values_of
 from .._scalarjit.cache_key import jit
-from .._scalarjit.components import Component, solve, stack
-from .._scalarjit.function import ScalarFunction
+from .._scalarjit.components import Component, Numbers, solve, stack
 from .._scalarjit.nan import nan_where
+from .._scalarjit.scalar_function import ScalarFunction
 from .._system.parameters import parameters_in
+from .._system.prints import concrete_numbers, text_of, wrapped
 from .._system.system import NamedVector, State, System
-from ._eig_of_matrix import Eig, eig, eigvals
+from ._matrix_eigenvalues import Eig, eig, eigenvalues_text, eigvals
 from ._steady import (
     SteadyMotion,
     check_dependent,
@@ -43,9 +45,12 @@ Outputs = Sequence[str] | Mapping[str, Callable[..., Any]] | None
 class LinearModel(eqx.Module):
     """x_dot = A x + B w, y = C x + D w for small deviations x, w, y from a motion.
 
-    Attributes: `A` (n, n), `B` (n, m), `C` (p, n), `D` (p, m) in SI units and radians; `states`, `inputs`, `outputs`:
-    their names. `eigenvalues` (n,) of A are differentiable, see `jaxkane.stability.eigenvalues`; a batch has leading
-    axes.
+    Attributes:
+
+    - `A` (n, n), `B` (n, m), `C` (p, n), `D` (p, m): in SI units and radians. A batch has leading axes.
+    - `states`, `inputs`, `outputs`: their names.
+
+    `eigenvalues` (n,) of A are differentiable, see `jaxkane.stability.eigenvalues`.
     """
 
     A: Float[Array, "*batch n n"]
@@ -66,12 +71,18 @@ class LinearModel(eqx.Module):
 
     @property
     def eigenvalues(self) -> Array:
-        """Eigenvalues (n,) alone: of a large batch of small models ten times as fast as `eig`."""
+        """Eigenvalues (n,) without eigenvectors. For a large batch of small models this is ten times as fast as
+        `eig`."""
         return eigvals(self.A)
 
     def __repr__(self) -> str:
         rows = [f"{kind}: {', '.join(getattr(self, kind)) or 'none'}" for kind in ("states", "inputs", "outputs")]
-        return f"LinearModel({'; '.join(rows)})"
+        text, A = wrapped(f"LinearModel({'; '.join(rows)})"), concrete_numbers(self.A)
+        if A is None or A.ndim > 2:
+            return f"{text}\nA: {text_of(self.A, ndim=2)}"
+        # NumPy, because JAX would compile a program. NumPy refuses NaN, as in the model of an impossible motion.
+        values = np.linalg.eigvals(A) if np.isfinite(A).all() else np.full(len(A), np.nan)
+        return f"{text}\n{wrapped(f'Eigenvalues [1/s]: {eigenvalues_text(values)}')}"
 
 
 def linearize(
@@ -90,26 +101,29 @@ def linearize(
         x = (independent coordinates, independent speeds, states of the first order)
         h(q) = 0:  dq_dep = -(dh/dq_dep)^-1 dh/dq_ind dq_ind
 
-    Dependent coordinates follow the constraints to first order, dependent speeds follow by the method; derivatives are
-    those of the equations of motion by `jax.jvp`. Differentiable itself, and usable under jit and vmap.
+    Dependent coordinates satisfy the constraints to first order; dependent speeds are computed by Kane's method. The
+    derivatives of the equations of motion are those of `jax.jvp`. The model is differentiable and can be used under jit
+    and vmap.
 
     **Arguments:**
 
+    - `system`: the system.
     - `motion`: a `SteadyMotion`, or a `State` as from `assemble`.
-    - `inputs`: values about which to linearize; by default those of the `SteadyMotion`, or zero. `t`: time [s].
-    - `states`: names of coordinates, speeds and states of the first order to keep; by default all independent ones
-        without the cyclic coordinates. The deviations of those left out are taken as zero.
-    - `outputs`: names of coordinates, speeds, dependent ones too, states of the first order and outputs of the system;
-        by default the states. Or functions by name, `{"lean_rate": lambda t, q, u: ...}`, that read coordinates and
-        speeds by name.
-    - `dependent`: names of the coordinates that the constraints determine, by default `system.dependent_coordinates`.
-    - `steady`: refuse a state that is not steady. With False the model is that of an instant of any motion.
+    - `inputs`: values by name about which to linearize. Default: those of the `SteadyMotion`, or zero.
+    - `t`: time [s].
+    - `states`: names of coordinates, speeds and states of the first order to keep. Default: all independent ones
+        without the cyclic coordinates. The deviations of omitted ones are zero.
+    - `outputs`: names of coordinates, speeds (also dependent ones), states of the first order and outputs of the
+        system. Default: the states. Or functions by name, `{"lean_rate": lambda t, q, u: ...}`, which read coordinates
+        and speeds by name.
+    - `dependent`: names of the coordinates that the constraints determine. Default: `system.dependent_coordinates`.
+    - `steady`: refuse a state that is not steady. Pass False to linearize at one instant of any motion.
 
-    **Returns:** a `LinearModel`; `A, B, C, D = linearize(...)` works too.
+    **Returns:** a `LinearModel`. It can be unpacked: `A, B, C, D = linearize(...)`.
 
-    **Raises:** `ValueError` for unknown names, a motion that is not steady, coordinates off the constraints, dependent
-    coordinates that the constraints do not determine, a parameter that cannot be, or equations that are singular. Under
-    a trace the matrices are NaN there, with their derivatives.
+    **Raises:** `ValueError` for unknown names, a motion that is not steady, coordinates that violate the constraints,
+    dependent coordinates that the constraints do not determine, an impossible parameter, or singular equations. Under a
+    trace the matrices and their derivatives are NaN instead.
     """
     name = type(system).__name__
     check_is_system(system)
@@ -118,7 +132,9 @@ def linearize(
         inputs = motion.inputs if inputs is None else inputs
         t = motion.t if t is None else t
     elif not isinstance(motion, State):
-        raise TypeError(f"linearize({name}): a motion is a State, as from assemble, or a SteadyMotion; got {motion!r}.")
+        raise TypeError(
+            f"linearize({name}): `motion` must be a State (see assemble) or a SteadyMotion; got {motion!r}."
+        )
     refuse_incomplete(system, motion.q, motion.u)
     q = as_array(motion.q, system.coordinates, f"{name}: q")
     u = as_array(motion.u, system.speeds, f"{name}: u")
@@ -138,7 +154,9 @@ def linearize(
     functions = dict(outputs) if isinstance(outputs, Mapping) else {}
     own = output_names(system) if outputs is not None else ()
     known = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states, *own)
-    refuse_unknown(rows, (*known, *functions), f"{name}: outputs are functions, or by name; it has no output", "it has")
+    refuse_unknown(
+        rows, (*known, *functions), f"{name}: `outputs` must be names or a dict of functions; unknown:", "there are"
+    )
     wrong = jnp.array(False)
     if not is_concrete(*origin):
         wrong = is_not_steady(*origin, steady) | ~_parameters_are_allowed(system)
@@ -149,7 +167,7 @@ def linearize(
 
 
 def _parameters_are_allowed(system: System) -> Array:
-    """Whether each parameter is what it was declared to be, which an error tells where the numbers are known."""
+    """Whether each parameter satisfies its declaration. For concrete numbers an exception reports it instead."""
     limited = [(value, info) for _, value, info in parameters_in(system) if info.is_limited]
     return jnp.all(jnp.stack([jnp.array(True), *(jnp.all(info.allows(value)) for value, info in limited)]))
 
@@ -161,10 +179,10 @@ def _no_linear_model(origin: Any, dependent: tuple[str, ...], follows: bool) -> 
         place = ", ".join(f"{k} = {float(x):.4g}" for k, x in zip(system.coordinates, q, strict=True))
         return (
             f"{name}: the configuration constraints do not determine {', '.join(dependent)} to first order at {place}. "
-            f"Give linearize(..., dependent=(...)) others of {', '.join(system.coordinates)}."
+            f"Pass other coordinates as linearize(..., dependent=(...)): {', '.join(system.coordinates)}."
         )
     return diagnosis(system, t, q, u, values_of(system, x, inputs_by_name(system, w))) or (
-        f"{name}: there is no linear model: the derivatives of its equations or outputs are not finite there."
+        f"{name}: the linear model does not exist: derivatives of the equations or outputs are not finite there."
     )
 
 
@@ -183,7 +201,7 @@ def _state_names(system: System, states: Sequence[str] | None, dependent: tuple[
         )
     twice = [k for k in known if states.count(k) > 1]
     if twice:
-        raise ValueError(f"{type(system).__name__}: {', '.join(twice)} stands twice in `states`.")
+        raise ValueError(f"{type(system).__name__}: {', '.join(twice)} is named twice in `states`.")
     return states
 
 
@@ -195,21 +213,21 @@ class _ModelNames(eqx.Module):
 
 @jit
 def _derivatives(origin, wrong, model_names: _ModelNames, functions: dict[str, Callable[..., Any]]):
-    # Numbers in the place of NaN, which would spoil the gradients of callers who do not use it (0 * NaN).
+    # Replace NaN by numbers: NaN would reach the gradients of callers who do not use the result (0 * NaN).
     at = (origin[0], *(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in origin[1:]))
     q, w = at[2], at[5]
     T = _tangents(*at[:3], model_names)
     x = jnp.zeros(len(model_names.states), q.dtype)
-    # Two loops, so that who wants A alone does not pay for B.
+    # Two loops: XLA removes the second one if only A is used.
     A, C = jacobian(lambda x: _at_deviation(x, w, at, T, model_names, functions), x)
     B, D = jacobian(lambda w: _at_deviation(x, w, at, T, model_names, functions), w)
-    # Multiplied by more than that, a rounding error is as large as what it belongs to.
+    # If entries of T are larger than this, rounding errors are as large as the result.
     follows = jnp.max(jnp.abs(jax.lax.stop_gradient(T)), initial=0.0) < 1 / SINGULAR_ROUNDING
     return nan_where(wrong | ~follows, (A, B, C, D), origin), follows
 
 
 def _at_deviation(x, w, at, T, model_names: _ModelNames, functions: dict[str, Callable[..., Any]]):
-    """Rates of the states (n,) and the outputs (p,), where the states deviate by x (n,), at inputs w (m,)."""
+    """Rates of the states (n,) and the outputs (p,), for deviations x (n,) of the states and inputs w (m,)."""
     system, t, q, u, x1, _ = at
     names, speeds = system.coordinates, (*system.speeds, *system.dependent_speeds)
     moved = dict(zip(model_names.states, x, strict=True))
@@ -240,7 +258,7 @@ def _at_deviation(x, w, at, T, model_names: _ModelNames, functions: dict[str, Ca
 
 @ScalarFunction
 def _tangents(system: System, t, q, model_names: _ModelNames):
-    """T (n_q, n_q), column i: how all coordinates move when the i-th does; zero for dependent ones."""
+    """T (n_q, n_q): column i contains the changes of all coordinates with the i-th one; zero for dependent ones."""
     names = system.coordinates
     d = [names.index(k) for k in model_names.dependent]
     T = [[float(i == j and i not in d) for j in range(len(names))] for i in range(len(names))]
@@ -262,7 +280,7 @@ class _WithSpeeds(System):
     independent: tuple[str, ...] = eqx.field(static=True)
     dependent: tuple[str, ...] = eqx.field(static=True)
 
-    def _in_order(self, u: Any) -> NamedVector:
+    def _in_order(self, u: Numbers) -> NamedVector:
         names = (*self.inner.speeds, *self.inner.dependent_speeds, *self.inner.auxiliary_speeds)
         return NamedVector([u[name] for name in names], names)
 
@@ -309,14 +327,17 @@ class _WithSpeedsAndOutputs(_WithSpeeds):
 def with_speeds(system: System, speeds: Sequence[str]) -> System:
     """The same system with other independent speeds, for motions in which its own do not determine the others.
 
-    A bicycle that pivots about its rear wheel's contact has a yaw rate although neither its rear wheel nor its roll
-    or steer turns: `with_speeds(bicycle, ("roll_rate", "yaw_rate", "steer_rate"))`.
-    `jaxkane.best_dependent_speeds` says which choice is well conditioned.
+    Example: a bicycle pivots about its rear wheel's contact. It has a yaw rate, although the rear wheel, roll and steer
+    do not move: `with_speeds(bicycle, ("roll_rate", "yaw_rate", "steer_rate"))`. `jaxkane.best_dependent_speeds` finds
+    a well-conditioned choice.
 
-    **Arguments:** `speeds`: names of as many speeds as there are independent ones, of the independent and the
-    dependent ones.
+    **Arguments:**
 
-    **Returns:** a system whose parameters are those of `.inner`, and all else is the system's.
+    - `system`: the system.
+    - `speeds`: names of the new independent speeds, as many as before. They may be independent or dependent speeds of
+        `system`.
+
+    **Returns:** a system whose parameters are those of `.inner`. Everything else is unchanged.
 
     **Raises:** `ValueError` for other names, or another number of them.
     """
@@ -324,8 +345,8 @@ def with_speeds(system: System, speeds: Sequence[str]) -> System:
     speeds = as_names(speeds)
     if len(set(speeds)) != len(system.speeds) or not set(speeds) <= set(everything) or len(speeds) != len(set(speeds)):
         raise ValueError(
-            f"{type(system).__name__}: name {len(system.speeds)} different ones of {', '.join(everything)}; got "
-            f"{', '.join(speeds)}."
+            f"{type(system).__name__}: `speeds` must name {len(system.speeds)} different speeds of "
+            f"{', '.join(everything)}; got {', '.join(speeds)}."
         )
     inner: Any = type(system)
     base: Any = _WithSpeedsAndOutputs if has_outputs(system) else _WithSpeeds
@@ -334,5 +355,5 @@ def with_speeds(system: System, speeds: Sequence[str]) -> System:
 
 @functools.lru_cache(maxsize=1000)
 def _class_with(inner: Any, base: Any) -> Any:
-    """A subclass under the name of the inner class, for messages."""
+    """A subclass with the name of the inner class, which messages show."""
     return type(base)(inner.__name__, (base,), {"__doc__": inner.__doc__})

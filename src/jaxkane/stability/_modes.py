@@ -1,4 +1,5 @@
-"""Modes of a bicycle along a parameter: eigenvalues followed through crossings, and named by participation factors."""
+"""Modes of a bicycle along a parameter. Eigenvalues are followed through crossings and named by participation
+factors."""
 
 from __future__ import annotations
 
@@ -10,24 +11,33 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from .._scalarjit.components import Numbers
 from ..catalog import WhippleBicycle
-from ._eig_of_matrix import Eig
+from ._matrix_eigenvalues import Eig
 
 LATERAL = WhippleBicycle.lateral
-"""The states of Meijaard et al. (2007); riding straight, the speed does not notice them to first order."""
+"""The states of Meijaard et al. (2007); riding straight, they do not affect the speed to first order."""
 
 MODES = ("weave", "weave", "capsize", "castering")
 """Names of the modes of `LATERAL`, in the order of `mode_order`."""
 
 Groups = Mapping[str, Sequence[str]]
-_CLEAR = 0.5  # of a mode belongs to its group at least
-_MARGIN = 1.5  # by how much more the modes would have to change if two of them changed places
+_CLEAR = 0.5  # the least share of a mode that must belong to its group
+_MARGIN = 1.5  # two modes may have been exchanged if the exchange has less than this factor times the change
 
 
-def track_modes(values: Any, spectra: Eig, states: tuple[str, ...], groups: Groups | None):
-    """Columns (m, n) that follow each mode along `values` (m,), those with names in their order, and whether (n,) these
-    names are clear."""
-    shapes = (spectra.values.shape, jnp.int32), (spectra.values.shape[-1:], jnp.bool_)
+def track_modes(values: Numbers, spectra: Eig, states: tuple[str, ...], groups: Groups | None):
+    """Columns of the modes along `values` (m,), for `eigenvalues` and `critical_speeds`.
+
+    **Returns:**
+
+    - `order` (m, n): the columns that follow each mode. Modes with names are in the order of `mode_names`.
+    - `clear` (n,): whether the name of each mode is clear.
+    - `number` (n,): the number of each mode, counted from 0. Both eigenvalues of a conjugate pair have the number of
+      the upper one if they are a pair at all values.
+    """
+    n = spectra.values.shape[-1:]
+    shapes = (spectra.values.shape, jnp.int32), (n, jnp.bool_), (n, jnp.int32)
     return jax.pure_callback(
         lambda *numbers: _track_and_name(numbers, states, groups),
         tuple(jax.ShapeDtypeStruct(*shape) for shape in shapes),
@@ -46,19 +56,38 @@ def _track_and_name(numbers: Any, states: tuple[str, ...], groups: Groups | None
         shares = np.take_along_axis(participation_factors(left, right), order[:, None, :], axis=2)[rows]
         columns, clear = _named_order(tracked, shares, confused, states, groups)
         order = order[:, columns]
-    return order.astype(np.int32), clear
+    number = _numbers(np.take_along_axis(values, order, axis=1)[rows])
+    return order.astype(np.int32), clear, number.astype(np.int32)
 
 
-def track(at: Any, values: Any, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The order (m, n) in which each row's eigenvalues (m, n) and vectors (m, n, n) continue those of the row above, at
-    `at` (m,); and whether (n, n) the i-th and the j-th column could as well have changed places somewhere."""
+def _numbers(values: np.ndarray) -> np.ndarray:
+    """The number (n,) of each mode. Two eigenvalues that are a pair in all rows (m, n) get the number of the upper
+    one."""
+    number = np.arange(values.shape[1])
+    upper = conjugate_pairs(values)
+    for i, j in zip(*np.nonzero((upper | upper.swapaxes(1, 2)).all(axis=0) & upper[:1].any(axis=0)), strict=True):
+        number[j] = i
+    return number
+
+
+def track(at: Any, values: Numbers, vectors: Numbers) -> tuple[np.ndarray, np.ndarray]:
+    """Continue eigenvalues and eigenvectors from row to row.
+
+    **Arguments:**
+
+    - `at` (m,): the values of the parameter.
+    - `values` (m, n), `vectors` (m, n, n): eigenvalues and eigenvectors in each row.
+
+    **Returns:** the order (m, n) in which each row continues the row above, and whether (n, n) two columns may have
+    been exchanged somewhere.
+    """
     at, values, vectors = map(np.asarray, (at, values, vectors))
     m, n = values.shape
     order = np.tile(np.arange(n), (m, 1))
     if m:
         order[0] = np.lexsort((-values[0].imag, -values[0].real))
     confused = np.zeros((n, n), bool)
-    finite: list[int] = []  # rows without NaN so far
+    finite: list[int] = []  # rows without NaN
     for k in range(m):
         if not np.all(np.isfinite(values[k])):
             continue
@@ -66,7 +95,8 @@ def track(at: Any, values: Any, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
             i = finite[-1]
             last, X = values[i, order[i]], vectors[i][:, order[i]]
             ahead = last
-            if len(finite) > 1:  # along the line through the last two, where these are not much closer
+            # extrapolate from the last two rows, unless these are much closer together than the new one
+            if len(finite) > 1:
                 j = finite[-2]
                 far, step = at[k] - at[i], at[i] - at[j]
                 ahead = last + far / step * (last - values[j, order[j]]) if abs(far) <= 4 * abs(step) > 0 else last
@@ -74,7 +104,7 @@ def track(at: Any, values: Any, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
             near = np.abs(values[k][None, :] - ahead[:, None]) / size
             alike = np.abs(X.conj().T @ vectors[k])
             change = near + 0.1 * (1.0 - alike)
-            columns = linear_sum_assignment(change)[1]
+            columns = _assigned(change, last, values[k])
             change = change[:, columns]
             own = np.diag(change)
             confused |= change + change.T < _MARGIN * (own[:, None] + own)
@@ -83,8 +113,37 @@ def track(at: Any, values: Any, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
     return order, confused
 
 
-def _pairs_in_order(last: Any, values: Any, order: Any) -> np.ndarray:
-    """Where a pair becomes real, or real ones a pair, its upper one and the larger one are of one column."""
+def _assigned(change: np.ndarray, last: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The indices (n,) in `values` (n,) that continue those of `last` (n,), with the least sum of `change` (n, n).
+
+    A pair is continued by a pair or by two real eigenvalues. If the least sum splits a pair, as in a coarse step, as
+    many pairs as possible are continued by pairs. Example: for Sharp's motorcycle from 10 to 20 m/s, the weave would
+    otherwise be continued by a real eigenvalue and by one of the next pair.
+    """
+    columns = linear_sum_assignment(change)[1]
+    old, new = conjugate_pairs(last), conjugate_pairs(values)
+
+    def is_pair(x: Numbers, i: Numbers, j: Numbers) -> Numbers:
+        return not (x.imag[i] or x.imag[j]) or x[i] == x[j].conj()
+
+    sources = np.argsort(columns)
+    if all(is_pair(values, *columns[[i, j]]) for i, j in np.argwhere(old)) and all(
+        is_pair(last, *sources[[i, j]]) for i, j in np.argwhere(new)
+    ):
+        return columns
+    (upper, lower), (new_upper, new_lower) = np.nonzero(old), np.nonzero(new)
+    of_pairs = change[np.ix_(upper, new_upper)] + change[np.ix_(lower, new_lower)]
+    a, b = linear_sum_assignment(of_pairs)
+    columns = np.full(len(last), -1)
+    columns[upper[a]], columns[lower[a]] = new_upper[b], new_lower[b]
+    others, free = np.flatnonzero(columns < 0), np.setdiff1d(np.arange(len(last)), columns)
+    columns[others] = free[linear_sum_assignment(change[np.ix_(others, free)])[1]]
+    return columns
+
+
+def _pairs_in_order(last: Any, values: Numbers, order: Any) -> np.ndarray:
+    """Order pairs by their upper eigenvalue. If a pair becomes real or conversely, the upper one continues the larger
+    one."""
     either = conjugate_pairs(last) | conjugate_pairs(values[order])
     for i, j in zip(*np.nonzero(either), strict=True):
         new = values[order[[i, j]]]
@@ -98,7 +157,7 @@ def _pairs_in_order(last: Any, values: Any, order: Any) -> np.ndarray:
 def mode_names(states: Sequence[str], groups: Groups) -> tuple[str, ...] | None:
     """Names of the modes of a bicycle that rides straight: those of the bicycle, then one for each state of a group.
 
-    None where the states are not those of `LATERAL` and of the groups, so that nothing is named.
+    None if the states are not those of `LATERAL` and of the groups; modes are then numbered.
     """
     grouped = [k for members in groups.values() for k in members]
     if sorted((*LATERAL, *grouped)) != sorted(states):
@@ -107,26 +166,36 @@ def mode_names(states: Sequence[str], groups: Groups) -> tuple[str, ...] | None:
 
 
 def participation_factors(left: Any, right: Any) -> np.ndarray:
-    """|conj(left) right|, with a sum of one for each mode: (..., states, modes)."""
+    """Participation factors |conj(left) right|, with a sum of one for each mode: (..., states, modes)."""
     factors = np.abs(np.conj(left) * right)
     return factors / np.maximum(factors.sum(axis=-2, keepdims=True), 1e-300)
 
 
-def conjugate_pairs(values: Any) -> np.ndarray:
-    """Whether (..., n, n) the i-th and the j-th of eigenvalues (..., n) are a conjugate pair, its upper one first."""
+def conjugate_pairs(values: Numbers) -> np.ndarray:
+    """Whether (..., n, n) the i-th and j-th of eigenvalues (..., n) are a conjugate pair; the i-th has the positive
+    imaginary part."""
     return (values.imag[..., :, None] > 0) & (values[..., :, None] == values[..., None, :].conj())
 
 
 def _named_order(
     values: np.ndarray, shares: np.ndarray, confused: np.ndarray, states: Sequence[str], groups: Groups
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Columns (n,) of tracked eigenvalues (m, n) in the order of `mode_names`, and whether (n,) each name is clear.
+    """Assign names to tracked eigenvalues.
 
-    `shares` (m, states, modes): participation factors; `confused` (n, n): columns that may have changed places. Groups
-    get their modes at the value at which the smallest share of a group in a mode of its own is largest. Two groups that
-    vibrate with the steer, "wobble" and "front end", are distinguished by their frequencies: the slower one is the
-    wobble. A name is clear where at least half of each of its modes belongs to it, no pair has two names, and no mode
-    of another name may have changed places with one of its own.
+    Modes are assigned to groups at one value of the parameter: where the smallest share of a group in its own modes is
+    largest. Two groups that vibrate with the steer, "wobble" and "front end", are distinguished by their frequencies:
+    the slower one is the wobble. A name is clear if three conditions are met. At least half of each of its modes
+    belongs to it. No pair has two names. None of its modes may have been exchanged with a mode of another name.
+
+    **Arguments:**
+
+    - `values` (m, n): tracked eigenvalues.
+    - `shares` (m, states, modes): participation factors.
+    - `confused` (n, n): columns that may have been exchanged.
+    - `states`: names of the states.
+    - `groups`: names of states by group.
+
+    **Returns:** the columns (n,) in the order of `mode_names`, and whether (n,) each name is clear.
     """
     members = [[states.index(k) for k in group] for group in (LATERAL, *groups.values())]
     owner = np.repeat(np.arange(len(members)), [len(group) for group in members])  # of each slot
@@ -141,8 +210,8 @@ def _named_order(
     names = np.array(mode_names(states, groups))
     differ = names[:, None] != names
     split = conjugate_pairs(values[:, order]) & differ
-    if split[best].any():
-        return order, np.zeros(len(order), bool)
+    if split[best].any():  # keep the order of `track`, in which pairs are adjacent
+        return np.arange(len(order)), np.zeros(len(order), bool)
     apart = split.any(axis=0)
     doubtful = ~sure | np.any((confused[np.ix_(order, order)] | apart | apart.T) & differ, axis=1)
     return order, ~np.isin(names, names[doubtful])
@@ -160,12 +229,12 @@ def _slower_first(order: np.ndarray, values: np.ndarray, groups: Groups) -> np.n
     return order
 
 
-def mode_order(values: Any) -> np.ndarray:
+def mode_order(values: Numbers) -> np.ndarray:
     """Columns of tracked eigenvalues (m, 4) along the speed in the order of `MODES`.
 
-    The pair that oscillates is the weave, and of the others castering decays faster. At the lowest speeds nothing
-    oscillates: where nothing ever does, the two largest are those that would become the weave. Riding backwards is
-    riding forwards with time reversed: all decay is growth, that of castering the fastest.
+    The pair that oscillates is the weave. Of the other two, castering decays faster. At the lowest speeds no mode
+    oscillates. If no mode oscillates at any speed, the two largest are the weave. Riding backwards is riding forwards
+    with time reversed: decay becomes growth, and castering grows fastest.
     """
     oscillating = np.abs(values.imag) > 1e-9
     pairs = oscillating.sum(axis=1)

@@ -1,4 +1,5 @@
-"""Many simulations at once: tables of members, chunks of bounded memory, devices, clusters, files to go on from."""
+"""Parameter sweeps: many simulations in chunks of bounded memory, on several devices or a cluster, resumable from
+files."""
 
 from ._members import Table as Table
 from ._members import grid as grid

@@ -14,23 +14,31 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh
 from jax.sharding import PartitionSpec as P
+from jaxtyping import PyTree
 
 from .._integrate.integrate import solve
 from .._integrate.settings import Settings
 from .._integrate.trajectory import Trajectory
 from .._scalarjit.backends import native as kernels
-from .._scalarjit.cache_key import Cache, jit, version_of
+from .._scalarjit.cache import Cache
+from .._scalarjit.cache_key import jit, version_of
 from .._scalarjit.captured_values import CapturedValues
+from .._scalarjit.components import Numbers
 from .._scalarjit.digest import digest
-from .._system.system import State
+from .._system.system import State, explain_value_of_traced
 from ._members import start_of, system_and_signals
 
 GROUP = 32
 
 
 class ChunkResult(eqx.Module):
-    """The results of some members, with a leading axis: `values` are what `reduce` made of a `Trajectory`, or it, but
-    for its times, and for what stands beside it here."""
+    """The results of some members, with a leading axis.
+
+    - `values`: the result of `reduce`; without `reduce` the `Trajectory`, except its times and the other fields of this
+        record.
+    - `status`, `t_end` [s], `stats`: as of a `Trajectory`.
+    - `events`: names of the events, for the words of a status.
+    """
 
     values: Any
     status: Any
@@ -40,33 +48,34 @@ class ChunkResult(eqx.Module):
 
 
 class Task(eqx.Module):
-    """What all members of a sweep have in common."""
+    """The data that all members of a sweep share."""
 
     shared: Any
-    ts: Any
+    origin: Any
+    taus: Any
     settings: Settings
     reduce: Callable[[Trajectory], Any] | None
     mesh: Mesh | None = eqx.field(static=True)
-    closures: tuple[Any, ...] = ()  # traced numbers that functions among these read by closures
+    closures: tuple[Any, ...] = ()  # traced values that these functions read by closures
 
-    def simulate(self, own: Any) -> ChunkResult:
-        """The motion of one member."""
-        return self.simulate_from(own, start_of(own, self.shared, self.ts[0]))
+    def simulate(self, own: PyTree) -> ChunkResult:
+        """The trajectory of one member."""
+        return self.simulate_from(own, start_of(own, self.shared, self.origin))
 
-    def simulate_from(self, own: Any, start: State) -> ChunkResult:
-        """The motion of one member from its first state."""
+    def simulate_from(self, own: PyTree, start: State) -> ChunkResult:
+        """The trajectory of one member from its initial state."""
         system, signals = system_and_signals(own, self.shared)
-        motion = solve(system, start, self.ts, signals, self.settings, closures=self.closures)
+        motion = solve(system, start, self.origin, self.taus, signals, self.settings, closures=self.closures)
         if self.reduce is None:
             values: Any = dataclasses.replace(motion, t=None, status=None, t_end=None, stats=None)
         else:
-            values = jax.tree.map(jnp.asarray, self.reduce(motion))
+            values = _reduced(self.reduce, motion)
         return ChunkResult(values, motion.status, motion.t_end, motion.stats, motion.events)
 
-    def solve(self, members: Any, size: int) -> ChunkResult:
-        """The motions of a chunk (n, ...), n at most `size`: one program serves every chunk of a size."""
+    def solve(self, members: PyTree, size: int) -> ChunkResult:
+        """The trajectories of a chunk (n, ...), n at most `size`. One program serves every chunk of this size."""
         n = jax.tree.leaves(members)[0].shape[0]
-        # Padded to whole groups on every device with copies of the last member.
+        # Every device gets whole groups; copies of the last member fill them. Other shapes would need another program.
         unit = GROUP * (1 if self.mesh is None else self.mesh.size)
         lanes = size if size <= GROUP and self.mesh is None else unit * -(-size // unit)
         places = np.minimum(np.arange(lanes), n - 1)
@@ -75,24 +84,42 @@ class Task(eqx.Module):
         return result if lanes == n else jax.tree.map(lambda x: x[:n], result)
 
 
+def _reduced(reduce: Callable[[Trajectory], Any], motion: Trajectory) -> PyTree:
+    """The arrays that `reduce` returns for a trajectory.
+
+    **Raises:** `TypeError` if `reduce` needs the value of a traced number, or returns values that are not numbers.
+    """
+    with explain_value_of_traced("sweep: `reduce`"):
+        made = reduce(motion)
+    leaves = jax.tree.leaves(made, is_leaf=lambda x: x is None)
+    wrong = [x for x in leaves if not isinstance(x, (bool, int, float, complex, jax.Array, np.generic, np.ndarray))]
+    wrong += [x for x in leaves if isinstance(x, (np.generic, np.ndarray)) and x.dtype.kind not in "biufc"]
+    if wrong:
+        hint = " Does it end without a `return`?" if made is None else ""
+        raise TypeError(
+            f"sweep: `reduce` must return numbers and arrays, also in dicts and tuples; got {wrong[0]!r}.{hint}"
+        )
+    return jax.tree.map(jnp.asarray, made)
+
+
 def mesh_of(devices: Sequence[Any] | None) -> Mesh | None:
     """The devices of this process as one axis; None for a single one."""
     devices = jax.local_devices() if devices is None else list(devices)
     if not devices or not all(isinstance(device, jax.Device) for device in devices):
-        raise TypeError(f"sweep: `devices` are some of jax.devices(), one at least; got {devices!r}.")
+        raise TypeError(f"sweep: `devices` must contain at least one of jax.devices(); got {devices!r}.")
     if len(devices) < 2:
         return None
     return jax.make_mesh((len(devices),), ("members",), axis_types=(AxisType.Auto,), devices=devices)
 
 
 @jit
-def _starts(members: Any, task: Task) -> State:
-    # A program of its own: lineax, which Newton's method calls, cannot be traced within shard_map.
-    return jax.vmap(lambda own: start_of(own, task.shared, task.ts[0]))(members)
+def _starts(members: PyTree, task: Task) -> State:
+    # A separate program: Newton's method uses lineax, which cannot be traced within shard_map.
+    return jax.vmap(lambda own: start_of(own, task.shared, task.origin))(members)
 
 
 @jit
-def _solve(members: Any, starts: State, task: Task) -> ChunkResult:
+def _solve(members: PyTree, starts: State, task: Task) -> ChunkResult:
     arrays, static = eqx.partition(task, eqx.is_array)
 
     def on_one_device(members, starts, arrays):
@@ -111,45 +138,55 @@ def _solve(members: Any, starts: State, task: Task) -> ChunkResult:
     return across(members, starts, arrays)
 
 
-def trace(task: Task, own: Any) -> tuple[str, ChunkResult]:
-    """The digest of the program for one member, `own` (shapes and types), and the shapes of its result."""
-    numbers, rest = eqx.partition(task, eqx.is_array)  # numbers that are arguments are recorded by name elsewhere
-    simulate = lambda own, numbers: eqx.combine(numbers, rest).simulate(own)  # noqa: E731
+def trace(task: Task, own: PyTree) -> tuple[str, ChunkResult]:
+    """The digest of the program for one member and the shapes of its result.
+
+    **Arguments:**
+
+    - `task`: the data that all members share.
+    - `own`: shapes and types of one member's data.
+    """
+    numbers, rest = eqx.partition(task, eqx.is_array)  # the manifest records numbers that are arguments by name
+
+    def simulate(own: PyTree, numbers: Any) -> ChunkResult:
+        return eqx.combine(numbers, rest).simulate(own)
+
     program, like = jax.make_jaxpr(simulate, return_shape=True)(own, numbers)
     return digest_of(program), like
 
 
 def digest_of(program: Any) -> str:
-    """The digest of a program of JAX; of functions that it calls back, with all that their code reads."""
+    """The digest of a JAX program; callback functions are included, with all that their code reads."""
     return digest(program, lambda f: CapturedValues(f, lasting=True).version)
 
 
 def versions() -> dict[str, str]:
-    """Of what traces and runs a program, by name."""
+    """Versions of the libraries that trace and run a program, by name."""
     libraries = {name: version(name) for name in ("jaxkane", "jax", "jaxlib", "diffrax", "equinox")}
     return libraries | {"python": ".".join(python_version_tuple()[:2])}
 
 
 _FLAGS = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_numpy_rank_promotion")
 _ANOTHER = (
-    "sweep: this worker would compute another program than the one asked for. Functions and classes of a module that "
-    "can be imported travel by name, and here the module has other numbers or other code: a global was changed after "
-    "the import, or the file was. Make it a parameter of the system; or change it on the workers too, "
-    "`client.run(...)`; or start them anew; or let the module travel whole: `cloudpickle.register_pickle_by_value`."
+    "sweep: this worker would compute a different program. Functions and classes of an importable module are sent by "
+    "name. The worker's module has other values or other code: a global was changed after the import, or the file was "
+    "edited. Make the value a parameter of the system, or change it on the workers too (`client.run(...)`), or restart "
+    "the workers, or send the module itself (`cloudpickle.register_pickle_by_value`)."
 )
 
 
 def on_cluster(
     task: Task, starts: list[int], members_at: Callable[[int], Any], size: int, client: Any
 ) -> Iterator[tuple[int, ChunkResult]]:
-    """(start, result) of every chunk, as they are finished. A task whose worker dies is given to another by Dask."""
+    """(start, result) of every chunk, in the order in which they finish. If a worker dies, Dask gives its chunk to
+    another."""
     try:
         import cloudpickle
         from distributed import as_completed
     except ImportError as error:
         raise ImportError("sweep(..., client=...) needs Dask: pip install 'jaxkane[cluster]'") from error
 
-    # Arrays travel as numpy's: JAX's would be read before the worker knows their precision.
+    # Send NumPy arrays: a worker would convert JAX arrays before it has set their precision.
     arrays = jax.tree.map(_as_numpy, dataclasses.replace(task, mesh=None))
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members_at(0))
     common = cloudpickle.dumps((arrays, like))
@@ -160,7 +197,7 @@ def on_cluster(
     finished = as_completed()
 
     def submit() -> None:
-        # Twice as many as there are threads keep all of them busy; a cluster may grow meanwhile.
+        # Two tasks per thread keep all threads busy. The number of threads is read anew, because a cluster may grow.
         while len(futures) < max(2 * sum(client.nthreads().values()), 2):
             start = next(remaining, None)
             if start is None:
@@ -185,9 +222,9 @@ def on_cluster(
 def solve_on_worker(
     common: bytes, own: bytes, size: int, flags: dict[str, Any], native: bool, program: tuple[str, str]
 ) -> ChunkResult:
-    """A chunk, on a worker; arrays of numpy go there and come back.
+    """Compute a chunk on a worker. Arguments and results are NumPy arrays.
 
-    **Raises:** `RuntimeError` where this worker would compute something else than `program`.
+    **Raises:** `RuntimeError` if this worker would compute a program other than `program`.
     """
     import cloudpickle
 
@@ -197,22 +234,22 @@ def solve_on_worker(
     kernels.use(native)
     if native and not kernels.is_on():
         raise RuntimeError(
-            f"This worker has no native kernels, and would round differently: {kernels.why_not()}. Or call "
-            "jaxkane.configure(native=False) where the sweep is started."
+            f"This worker cannot use native kernels: {kernels.why_not()}. Its rounding errors would be different. "
+            "Enable native kernels there, or call jaxkane.configure(native=False) in the process that starts the sweep."
         )
     task, like = _TASKS.get(common, lambda: _received(common))
     libraries, digest_here = _PROGRAMS.get((common, version_of(task)), lambda: _program(task, like))
-    if libraries == program[0] and digest_here != program[1]:  # what another JAX has traced cannot be compared
+    if libraries == program[0] and digest_here != program[1]:  # digests of other JAX versions cannot be compared
         raise RuntimeError(_ANOTHER)
     return jax.tree.map(np.asarray, task.solve(cloudpickle.loads(own), size))
 
 
-def _program(task: Task, like: Any) -> tuple[str, str]:
-    """The libraries with which a program is traced, and the digest of what it computes for one member."""
+def _program(task: Task, like: PyTree) -> tuple[str, str]:
+    """The versions of the libraries that trace the program, and its digest for one member."""
     return repr(versions()), trace(task, like)[0]
 
 
-# On a worker, once for all chunks: functions that are unpickled again would be compiled again.
+# Kept on the worker for all chunks: a function that is unpickled again would be compiled again.
 _TASKS, _PROGRAMS = Cache(8), Cache(8)
 
 
@@ -223,9 +260,9 @@ def _received(common: bytes) -> tuple[Task, Any]:
     return jax.tree.map(_as_jax, task), like
 
 
-def _as_numpy(x: Any) -> Any:
+def _as_numpy(x: Numbers) -> PyTree:
     return np.asarray(x) if isinstance(x, jax.Array) else x
 
 
-def _as_jax(x: Any) -> Any:
+def _as_jax(x: Numbers) -> PyTree:
     return jnp.asarray(x) if isinstance(x, np.ndarray) else x

@@ -1,4 +1,5 @@
-"""Finished chunks as files, under a manifest of what they were computed from. Knows arrays and files."""
+"""Finished chunks as files, with a manifest of the data from which they were computed. Handles arrays and files
+only."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import dataclasses
 import inspect
 import json
 import os
+import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,10 +15,12 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
-from .._common.files import SCRATCH, atomic_write, differences
+from .._common.files import SCRATCH, atomic_write, differences, remove_abandoned
 from .._integrate.settings import Settings
 from .._scalarjit.backends.native import is_on
+from .._scalarjit.components import Numbers
 from .._scalarjit.digest import digest
 from .._system.system import State, System
 from ._chunks import versions
@@ -29,12 +33,12 @@ def manifest_of(
     state: Any,
     inputs: Any,
     table: Table | None,
-    ts: Any,
+    ts: Numbers,
     settings: Settings,
     reduce: Any,
     layout: Any,
 ) -> dict[str, Any]:
-    """All that the results follow from, by name; `program` is the digest of what is computed from it."""
+    """All data that determine the results, by name. `program` is the digest of the compiled program."""
     if isinstance(system, System):
         kind: dict[str, Any] = {"class": type(system).__qualname__}
         parameters = {field.name: _entry(getattr(system, field.name)) for field in dataclasses.fields(system)}
@@ -57,13 +61,14 @@ def manifest_of(
         "program": program,
         "layout": dict(layout),
         "device": jax.default_backend(),
-        "kernels": "native" if is_on() and jax.default_backend() == "cpu" else "XLA",  # they round differently
+        # native kernels and XLA round differently
+        "kernels": "native" if is_on() and jax.default_backend() == "cpu" else "XLA",
         "version": versions(),
     }
 
 
 def _entry(value: Any) -> Any:
-    """Numbers as they are, functions by name (what they compute is in the program), all else by a digest."""
+    """Numbers unchanged, functions by name (`program` covers their code), everything else as a digest."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, (jax.Array, np.ndarray, np.generic)):
@@ -75,52 +80,83 @@ def _entry(value: Any) -> Any:
 
 
 MANIFEST = "sweep.json"
+_MARK = "chunk of"
+_RESUME = "Finished chunks are kept: call sweep again with this folder to resume."
 
 
 class Folder:
     """The chunks of one sweep: `chunk-00000000.npz`, named by the first member of each.
 
-    **Raises:** `ValueError` where the folder holds another sweep, a manifest that cannot be read, or something else.
+    **Raises:** `ValueError` if the folder contains another sweep, an unreadable manifest, or other files.
     """
 
     def __init__(self, path: str | os.PathLike[str], manifest: Mapping[str, Any]):
         self.path = Path(path).expanduser()
-        self.sweep = digest(json.dumps(manifest, sort_keys=True))  # columns have no order
+        self.sweep = digest(json.dumps(manifest, sort_keys=True))  # the order of columns does not matter
         self.damaged: list[str] = []
         if self.path.exists() and not self.path.is_dir():
-            raise ValueError(f"{self.path} is a file: `folder` is the name of a folder.")
-        self.path.mkdir(parents=True, exist_ok=True)
+            raise ValueError(f"sweep: {self.path} is a file. Pass the name of a folder as `folder`.")
         path = self.path / MANIFEST
+        if self.path.exists():
+            remove_abandoned(self.path)
         if not path.exists():
-            # What a writer that was killed left behind holds nothing.
-            if any(not file.name.endswith(SCRATCH) for file in self.path.iterdir() if file.name != MANIFEST):
-                raise ValueError(
-                    f"{self.path} is not empty, and holds no {MANIFEST}: a sweep wants a folder of its own."
-                )
+            self._refuse_foreign_files()
             text = json.dumps(manifest, indent=1).encode()
             if atomic_write(path, lambda file: file.write(text), replace=False):
                 return
         _refuse_other(path, manifest)
 
+    def _refuse_foreign_files(self) -> None:
+        """A folder without a manifest must be empty, or contain chunks of this sweep whose manifest was lost.
+
+        **Raises:** `ValueError` for any other folder.
+        """
+        names = sorted(file.name for file in self.path.glob("*") if not file.name.endswith(SCRATCH))
+        others = [name for name in names if name != MANIFEST and not re.fullmatch(r"chunk-\d{8}\.npz", name)]
+        if others:
+            raise ValueError(
+                f"{self.path} is not empty and does not contain {MANIFEST} (it contains {others[0]}). Choose an "
+                "empty folder, or one that does not exist."
+            )
+        chunks = [name for name in names if name != MANIFEST]
+        owners = {_owner(self.path / name) for name in chunks}
+        if chunks and (self.sweep not in owners or owners - {self.sweep, None}):
+            raise ValueError(
+                f"{self.path} has no {MANIFEST}, and its {len(chunks)} chunks belong to another sweep or cannot be "
+                "read. Choose another folder, or delete this one."
+            )
+
     def file(self, start: int) -> Path:
         return self.path / f"chunk-{start:08d}.npz"
 
     def mark(self, start: int) -> dict[str, str]:
-        """By which a chunk is known whose file was renamed, or came from another folder."""
-        return {"chunk of": f"{self.sweep} from {start}"}
+        """The mark by which a chunk is recognized: it detects a renamed file, or a file from another folder."""
+        return {_MARK: f"{self.sweep} from {start}"}
 
     def write(self, start: int, result: Any) -> None:
-        """Keep the chunk that begins with a member."""
+        """Save the chunk whose first member is `start`."""
+
+        def save(file: Any) -> None:
+            np.savez(file, **self.mark(start), **_by_path(result))
+
         try:
-            atomic_write(self.file(start), lambda file: np.savez(file, **self.mark(start), **_by_path(result)))
+            atomic_write(self.file(start), save, remedy=_RESUME)
         except FileNotFoundError:
-            # Another process was done with the whole sweep, this chunk too, and has tidied up.
+            # Another process has finished the whole sweep, including this chunk, and removed the temporary files.
             if not self.file(start).exists():
                 raise
 
-    def read(self, start: int, like: Any, size: int) -> Any:
-        """The chunk of `size` members that begins with a member, each in the structure of `like`; None where there is
-        none that is whole, which `damaged` lists."""
+    def read(self, start: int, like: PyTree, size: int) -> PyTree:
+        """Read the chunk of `size` members whose first member is `start`.
+
+        **Arguments:**
+
+        - `start`: the index of the first member.
+        - `like`: shapes and types of one member's result.
+        - `size`: the number of members.
+
+        **Returns:** the chunk, or None if the file does not exist or is damaged. `damaged` lists the damaged files.
+        """
         path = self.file(start)
         if not path.exists():
             return None
@@ -132,19 +168,30 @@ class Folder:
             with np.load(path, allow_pickle=False) as arrays:
                 for name, mark in self.mark(start).items():
                     if name not in arrays or str(arrays[name]) != mark:
-                        raise ValueError("it belongs elsewhere: renamed, or of another sweep")
+                        raise ValueError("the file was renamed, or belongs to another sweep")
                 leaves = [_checked(name, arrays[name], leaf, size) for name, leaf in _by_path(like).items()]
         except (MemoryError, PermissionError):
             raise
-        except Exception as error:  # whatever a decoder says of bytes that are not its own
+        except Exception as error:  # decoders raise various exceptions for damaged files
             self.damaged.append(f"{path.name} ({type(error).__name__}: {error})")
             return None
         return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
     def tidy(self) -> None:
-        """Take away what writers that were killed left behind, once every chunk is there."""
+        """Remove the temporary files of interrupted writers. Call when every chunk exists."""
         for scratch in self.path.glob(f"*{SCRATCH}"):
             scratch.unlink(missing_ok=True)
+
+
+def _owner(path: Path) -> str | None:
+    """The digest of the sweep of a chunk; None if the file cannot be read."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return str(arrays[_MARK]).partition(" ")[0]
+    except (MemoryError, PermissionError):
+        raise
+    except Exception:  # decoders raise various exceptions for damaged files
+        return None
 
 
 def _by_path(tree: Any) -> dict[str, Any]:
@@ -152,31 +199,33 @@ def _by_path(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
-def _checked(name: str, array: np.ndarray, like: Any, size: int) -> np.ndarray:
+def _checked(name: str, array: np.ndarray, like: PyTree, size: int) -> np.ndarray:
     if array.shape != (size, *like.shape) or array.dtype != like.dtype:
         raise ValueError(f"{name} is {array.dtype}{list(array.shape)}, not {like.dtype}{[size, *like.shape]}")
     return array
 
 
 def _refuse_other(path: Path, manifest: Mapping[str, Any]) -> None:
-    """**Raises:** `ValueError` where the file holds another manifest, or none."""
+    """**Raises:** `ValueError` if the file contains another manifest, or none."""
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder, not the manifest of a sweep. Choose another folder for the sweep.")
     try:
         stored = json.loads(path.read_bytes())
-    except ValueError as error:  # of JSON, or of its encoding
+    except ValueError as error:  # of the JSON parser, or of the decoder
         raise ValueError(
-            f"{path} cannot be read ({error}): it is damaged, or no manifest of a sweep, so it is unknown whose chunks "
-            "stand beside it. Choose another folder, or delete this one."
+            f"{path} cannot be read ({error}): it is damaged, or not the manifest of a sweep, so it is unknown to "
+            "which sweep the chunks belong. Choose another folder, or delete this file: its chunks are then used."
         ) from None
     if not isinstance(stored, dict) or not {"system", "times", "layout"} <= stored.keys():
-        raise ValueError(f"{path} is no manifest of a sweep. Choose another folder: a sweep wants one of its own.")
+        raise ValueError(f"{path} is not the manifest of a sweep. Choose another folder: a sweep needs its own folder.")
     if "program" not in stored:
         raise ValueError(
-            f"{path} holds a sweep of an earlier version of jaxkane, which kept no account of all that was computed: "
-            "so it is unknown whether it is this one. Choose another folder, or delete this one."
+            f"{path} belongs to a sweep of an earlier version of jaxkane, which did not record the program. It is "
+            "unknown whether that was the same sweep. Choose another folder, or delete this one."
         )
     different = differences(stored, manifest)
     if different:
         raise ValueError(
-            f"{path} holds another sweep. It differs in {different}. Choose another folder, or delete this one. (The "
-            "program is what the description, the inputs and the functions compute, with the numbers that they read.)"
+            f"{path} belongs to another sweep. It differs in {different}. Choose another folder, or delete this one. "
+            "(The program contains the system, the inputs and the functions, with the numbers that they use.)"
         )

@@ -1,4 +1,4 @@
-"""Members of a sweep: tables and grids of what differs, and the system, start and inputs of each member."""
+"""Members of a sweep: tables and grids, and the system, initial state and inputs of each member."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import PyTree
 
 from .._common.lookup import not_there
-from .._integrate.inputs import Samples, as_signals, real_array
-from .._integrate.simulate import as_state, checked_state
+from .._integrate.inputs import Samples, as_signals, real_array, since
+from .._integrate.simulate import as_state, checked_state, clock_of, first_of, refuse_coarse_times
 from .._kane.arguments import is_concrete
-from .._kane.assemble import assemble
 from .._kane.checks import check_system
+from .._kane.consistent_state import assemble
 from .._scalarjit.compat import Tracer
-from .._scalarjit.components import Inputs
+from .._scalarjit.components import Component, Inputs, Numbers
 from .._system.parameters import in_batches, parameters_in, with_parameters
-from .._system.system import State, System
+from .._system.system import State, System, explain_value_of_traced
 
 
 class Table(eqx.Module):
-    """Members of a sweep by name: `table["speed"]`.
+    """The swept values of all members by name: `table["speed"]`.
 
-    - `columns`: by name (n, ...), a row for every member; text labels a member and changes nothing.
-    - `dims`, `shape`: of the results. A grid has an axis for every name, a table the one axis "member".
+    - `columns`: by name (n, ...), one row for each member. A column of text labels a member and has no other effect.
+    - `dims`, `shape`: axes of the results. A grid has one axis for each name, a table has the one axis "member".
     """
 
     columns: dict[str, np.ndarray]
@@ -44,7 +46,7 @@ class Table(eqx.Module):
 
     @property
     def numbers(self) -> dict[str, np.ndarray]:
-        """The columns that are numbers."""
+        """The numerical columns."""
         return {name: column for name, column in self.columns.items() if column.dtype.kind == "f"}
 
     def axis(self, name: str) -> np.ndarray:
@@ -54,30 +56,34 @@ class Table(eqx.Module):
         return grid[(0,) * i + (slice(None),) + (0,) * (len(self.shape) - i - 1)]
 
     def __repr__(self) -> str:
-        if self.dims == ("member",):
-            return f"Table({len(self)} members: {', '.join(self.columns)})"
-        axes = " x ".join(f"{name} ({n})" for name, n in zip(self.dims, self.shape, strict=True))
-        return f"Table({len(self)} members: {axes})"
+        columns = []
+        for name, column in self.columns.items():
+            axis = f" ({self.shape[self.dims.index(name)]})" if name in self.dims else ""
+            is_range = column.dtype.kind == "f" and column.size > 0
+            columns.append(f"{name}{f' {column.min():.6g} to {column.max():.6g}' * is_range}{axis}")
+        return f"Table({len(self)} members: {(', ' if self.dims == ('member',) else ' x ').join(columns)})"
 
 
 def grid(**axes: Any) -> Table:
-    """Every combination of values, the last name running fastest.
+    """All combinations of values; the last name varies fastest.
 
         grid(speed=np.linspace(1, 10, 50), lam=np.linspace(0.2, 0.4, 20))
 
-    **Arguments:** by name, values (k,): of parameters, coordinates, speeds or inputs, or of names that the functions
-    given to `sweep` read.
+    **Arguments:**
 
-    **Returns:** a `Table` of shape (50, 20), which the results of its sweep have too.
+    - `axes`: by name, values (k,). A name is a parameter, coordinate, speed or input, or one that a function given to
+        `sweep` reads.
 
-    **Raises:** `ValueError` where values are not a row of numbers.
+    **Returns:** a `Table`, here of shape (50, 20). The results of its sweep have the same shape.
+
+    **Raises:** `ValueError` if the values of a name are not one-dimensional numbers.
     """
     if not axes:
-        raise ValueError("grid: give values by name, such as grid(speed=[4.0, 5.0], lam=[0.3, 0.4]).")
+        raise ValueError("grid: no values. Pass values by name, such as grid(speed=[4.0, 5.0], lam=[0.3, 0.4]).")
     rows = {name: _column(name, values) for name, values in axes.items()}
     for name, row in rows.items():
         if row.dtype.kind != "f":
-            raise ValueError(f"grid: {name} is text. Labels are columns of a table that is a dict or a DataFrame.")
+            raise ValueError(f"grid: {name} is text. For labels, pass `table` as a dict or a DataFrame.")
         if row.ndim != 1:
             raise ValueError(f"grid: {name} must be a row of numbers (k,), got the shape {row.shape}.")
     full = np.meshgrid(*rows.values(), indexing="ij")
@@ -86,30 +92,30 @@ def grid(**axes: Any) -> Table:
 
 
 def as_table(table: Any) -> Table | None:
-    """A `Table` from what a user has: a `Table`, columns by name, a DataFrame, or None."""
+    """A `Table` from a `Table`, columns by name, a DataFrame, or None."""
     if table is None or isinstance(table, Table):
         return table
     if not (isinstance(table, Mapping) or (hasattr(table, "items") and hasattr(table, "keys"))):
         raise TypeError(
-            f"`table` is jaxkane.sweep.grid(...), a dict of columns or a DataFrame, got {type(table).__name__}."
+            f"`table` must be jaxkane.sweep.grid(...), a dict of columns or a DataFrame; got {type(table).__name__}."
         )
     names = [str(name) for name, _ in table.items()]  # a DataFrame may have two columns of one name
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise ValueError(f"`table` has more than one column of the name {', '.join(twice)}: which is meant?")
+        raise ValueError(f"`table` has more than one column named {', '.join(twice)}. Rename or remove the duplicates.")
     columns = {str(name): _column(str(name), values) for name, values in table.items()}
     lengths = {name: len(column) for name, column in columns.items()}
     if not lengths:
         raise ValueError("`table` has no columns.")
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{name} ({n})" for name, n in lengths.items())
-        raise ValueError(f"The columns of `table` differ in length: {listed}.")
+        raise ValueError(f"The columns of `table` differ in length: {listed}. Pass columns of equal length.")
     return Table(columns, ("member",), (next(iter(lengths.values())),))
 
 
-def _column(name: str, values: Any) -> np.ndarray:
+def _column(name: str, values: Numbers) -> np.ndarray:
     if np.ma.is_masked(values):
-        raise ValueError(f"{name!r} has masked entries: leave these members out, or fill them.")
+        raise ValueError(f"{name!r} has masked entries: remove these members, or fill the entries.")
     try:
         column = np.asarray(values)
         if column.ndim and not len(column):
@@ -117,31 +123,41 @@ def _column(name: str, values: Any) -> np.ndarray:
         if column.dtype.kind in "OUST":
             is_text = column.ndim == 1 and all(isinstance(x, str) for x in column)
             return column.astype(str) if is_text else _refuse(name, values)
-        if column.dtype.kind not in "buif":
-            return _refuse(name, values)  # complex numbers would lose a part, dates become counts of nanoseconds
+        if column.dtype.kind not in "uif" or _has_truth_values(values):
+            # complex numbers would lose a part, and dates would become counts of nanoseconds
+            return _refuse(name, values)
         column = column.astype(float)
     except (TypeError, ValueError):
         return _refuse(name, values)
     return column if column.ndim else _refuse(name, column)
 
 
-def _refuse(name: str, values: Any) -> Any:
+def _has_truth_values(values: Numbers) -> bool:
+    if isinstance(values, (list, tuple)):  # in a list with numbers, NumPy converts booleans to 0 and 1
+        return any(isinstance(x, (bool, np.bool_)) for x in values)
+    return np.asarray(values).dtype.kind == "b"
+
+
+def _refuse(name: str, values: Numbers) -> Any:
     if isinstance(values, Tracer):
         raise TypeError(
-            f"The column {name!r} of a table is traced (by jax.jit, jax.grad or jax.vmap), and tables are read before. "
-            "Give the parameter, the state or the input itself a leading axis of members."
+            f"The column {name!r} of a table is traced (by jax.jit, jax.grad or jax.vmap), but a table needs concrete "
+            "numbers. Omit this column, and add a leading axis of members to the parameter, the state or the input."
         )
-    raise ValueError(f"{name!r} must hold a row of numbers (or of labels), got {type(values).__name__} {values!r:.60}.")
+    hint = " Write booleans as numbers, 0.0 and 1.0." if _has_truth_values(values) else ""
+    raise ValueError(
+        f"{name!r} must be a row of numbers (or of labels), got {type(values).__name__} {values!r:.60}.{hint}"
+    )
 
 
 class Row(Mapping[str, Any]):
-    """One member's numbers by name, for the functions that a user gives; it records which names were read."""
+    """One member's values by name, for functions of the user. It records which names were read."""
 
     def __init__(self, columns: dict[str, Any]):
         self.columns = columns
         self.read: set[str] = set()
 
-    def __getitem__(self, name: str) -> Any:
+    def __getitem__(self, name: str) -> Numbers:
         if name not in self.columns:
             raise not_there(name, self.columns, "the columns of the sweep's table")
         self.read.add(name)
@@ -160,32 +176,40 @@ class Row(Mapping[str, Any]):
         return f"Row({', '.join(self.columns)})"
 
     def of(self, names: Iterable[str], but: Collection[str] = ()) -> dict[str, Any]:
-        """The numbers that take their place by name, which no function need read: `but` those that one did read."""
+        """The values that are set by name, except those that a function has read (`but`)."""
         return {name: self.columns[name] for name in names if name in self.columns and name not in but}
 
     def given_to(self, function: Callable[..., Any], *arguments: Any) -> tuple[Any, set[str]]:
-        """What a function makes of this row, and the names that it read: what these mean is its own affair."""
+        """The return value of `function(*arguments, row)`, and the names that it read. Names that were read are not
+        set."""
         row = Row(self.columns)
-        made = function(*arguments, row)
+        with explain_value_of_traced(f"sweep: the function {getattr(function, '__name__', repr(function))}"):
+            made = function(*arguments, row)
         self.read |= row.read
         return made, row.read
 
 
 class _Leaf:
-    """A number of a tree with an identity of its own: one array may stand in two places."""
+    """A leaf with its own identity, because one array may occur twice in a tree."""
 
-    def __init__(self, x: Any):
+    def __init__(self, x: Numbers):
         self.x = x
 
 
-def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts: Any) -> tuple[Any, Any, int]:
-    """What differs from member to member (b, ...), what is shared, and how many members there are.
+def members_of(
+    system: Any, state: Any, inputs: Inputs, table: Table | None, ts: Numbers, dtype: DTypeLike
+) -> tuple[Any, Any, int]:
+    """Split the data of a sweep.
 
-    **Raises:** `ValueError` when nothing is a batch, when batches differ in length, or for a column that nothing reads.
+    **Returns:** the batched leaves (b, ...), the shared leaves, and the number of members.
+
+    **Raises:** `ValueError` if nothing is batched, if the batches differ in length, or if nothing reads a column.
     """
-    columns = {name: np.asarray(x, dtype=ts.dtype) for name, x in table.numbers.items()} if table is not None else {}
+    columns = {name: np.asarray(x, dtype=dtype) for name, x in table.numbers.items()} if table is not None else {}
     _refuse_twice(columns, system, inputs)
-    signals = inputs if callable(inputs) else _signals(inputs, system, columns, ts)
+    signals = inputs if callable(inputs) else since(first_of(ts), _signals(inputs, system, columns, ts), dtype)
+    if isinstance(system, System):
+        refuse_coarse_times(system, ts, dtype, signals)
     tree = (system, state, signals, columns)
     places = jax.tree.map(_Leaf, tree)
     batches = _batches(places)
@@ -196,24 +220,25 @@ def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts:
     if not jax.tree.leaves(members):
         if table is not None:
             raise ValueError(
-                f"sweep: the columns of `table` ({', '.join(table.columns)}) are text, which labels a member and "
-                "changes nothing: all members would be the same. Give a column of numbers; numbers that were read as "
-                "text are converted by numpy.asarray(column, float)."
+                f"sweep: all columns of `table` ({', '.join(table.columns)}) are text. Text only labels a member, so "
+                "all members would be equal. Add a column of numbers; numbers that were read as text are converted by "
+                "numpy.asarray(column, float)."
             )
         raise ValueError(
-            "sweep: nothing here is a batch. Give a `table`, or a parameter, state.q, state.u or an input a leading "
-            "axis; for one motion call jaxkane.simulate."
+            "sweep: no argument is a batch. Pass a `table`, or add a leading axis to a parameter, state.q, state.u or "
+            "an input. For one trajectory, call jaxkane.simulate."
         )
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{name} ({n})" for name, n in lengths.items())
-        raise ValueError(f"sweep: the batches differ in length: {listed}.")
-    _check(members, shared, ts[0], table)
-    _check_description(members, shared, ts[0])
+        raise ValueError(f"sweep: the batches differ in length: {listed}. Pass batches of equal length.")
+    origin, _ = clock_of(ts, dtype)
+    _check(members, shared, origin, table)
+    _check_description(members, shared, origin)
     return members, shared, next(iter(lengths.values()))
 
 
-def system_and_signals(own: Any, shared: Any) -> tuple[System, Any]:
-    """System and signals of one member."""
+def system_and_signals(own: PyTree, shared: PyTree) -> tuple[System, Any]:
+    """The system and the signals of one member."""
     system, _, signals, columns = eqx.combine(own, shared)
     system, _ = _system(system, Row(columns))
     if not callable(signals):
@@ -221,13 +246,13 @@ def system_and_signals(own: Any, shared: Any) -> tuple[System, Any]:
     return system, signals
 
 
-def start_of(own: Any, shared: Any, t: Any) -> State:
-    """The first state of one member, at the time t."""
+def start_of(own: PyTree, shared: PyTree, t: Component) -> State:
+    """The initial state of one member, at the time t."""
     system, state, _, columns = eqx.combine(own, shared)
     return _start(system, state, Row(columns), t)
 
 
-def _system(system: Any, row: Row) -> tuple[System, dict[str, Any]]:
+def _system(system: System, row: Row) -> tuple[System, dict[str, Any]]:
     """The system of a row, and the parameters that were set by name."""
     read: set[str] = set()
     if not isinstance(system, System):
@@ -239,17 +264,17 @@ def _system(system: Any, row: Row) -> tuple[System, dict[str, Any]]:
 
 def _refuse_no_system(given: Any) -> None:
     if not isinstance(given, System):
-        raise TypeError("sweep: the function `system` has to give a System for each row.")
+        raise TypeError("sweep: the function `system` must return a System for each row.")
 
 
-def _start(system: Any, state: Any, row: Row, t: Any) -> State:
+def _start(system: System, state: Any, row: Row, t: Component) -> State:
     system, parameters = _system(system, row)
     read: set[str] = set()
     if not isinstance(state, State):
         state, read = row.given_to(state, system)
         if not isinstance(state, State):
             raise TypeError(
-                f"sweep: the function `state` gives a jaxkane.State for each row, not {type(state).__name__}: "
+                f"sweep: the function `state` must return a jaxkane.State for each row, got {type(state).__name__}: "
                 "jk.State(q, u), of arrays or of dicts by name."
             )
     state = as_state(system, state)
@@ -257,19 +282,19 @@ def _start(system: Any, state: Any, row: Row, t: Any) -> State:
     q, u, x = (row.of(names, but=read) for names in groups)
     parts = zip((state.q, state.u, state.x), (q, u, x), groups, strict=True)
     state = State(*(_with_columns(values, columns, names) for values, columns, names in parts))
-    if system.dependent_coordinates and (q or parameters):  # they follow from the others
+    if system.dependent_coordinates and (q or parameters):  # they depend on the others
         state = assemble(system, state.q, state.u, state.x, t=t)
     return state
 
 
-def _with_columns(values: Any, columns: dict[str, Any], names: tuple[str, ...]) -> Any:
+def _with_columns(values: Numbers, columns: dict[str, Any], names: tuple[str, ...]) -> Any:
     for name, value in columns.items():
         values = values.at[names.index(name)].set(value)
     return values
 
 
-def _check(members: Any, shared: Any, t: Any, table: Table | None) -> None:
-    """Make one member in the abstract, and refuse what does not fit."""
+def _check(members: PyTree, shared: PyTree, t: Component, table: Table | None) -> None:
+    """Make one member with abstract values, and refuse data that do not match the system."""
 
     def trial(own):
         system, state, signals, columns = eqx.combine(own, shared)
@@ -294,34 +319,36 @@ def _check(members: Any, shared: Any, t: Any, table: Table | None) -> None:
         kinds = [kind for kind, names in known.items() if column in names]
         if len(kinds) > 1:
             raise ValueError(
-                f"sweep: {name}: {column!r} names more than one number ({', '.join(kinds)}), and which of them the "
-                "column means cannot be known. Give it another name, and read that in `state` as a function of "
-                "(system, row), or in `system` as a function of (row)."
+                f"sweep: the column {column!r} is ambiguous: {name} has more than one number of that "
+                f"name ({', '.join(kinds)}). Rename the column, and read it in `state` as a function of (system, row), "
+                "or in `system` as a function of (row)."
             )
         if kinds and column not in row:
             raise ValueError(
-                f"sweep: the column {column!r} is text, and {name} has a number of that name ({kinds[0]}). "
-                "Numbers that were read as text are converted by numpy.asarray(column, float); labels have other names."
+                f"sweep: the column {column!r} is text, but {name} has a number of that name ({kinds[0]}). "
+                "Convert numbers that were read as text by numpy.asarray(column, float), or rename a column of labels."
             )
     applied = row.of(itertools.chain(*known.values())).keys()
     applied -= {*system.dependent_coordinates, *system.dependent_speeds}
     if callable(signals) and applied & set(system.inputs):
         listed = ", ".join(sorted(applied & set(system.inputs)))
-        raise ValueError(f"sweep: {listed} is a column of the table, and `inputs` is a function that gives it too.")
+        raise ValueError(f"sweep: {listed} is a column of the table and is also returned by `inputs`. Remove one.")
     follow = {*system.dependent_coordinates, *system.dependent_speeds} & set(row) - row.read
     if follow:
-        raise ValueError(f"sweep: {name}: {', '.join(sorted(follow))} follows from the others; it cannot be a column.")
+        listed = ", ".join(sorted(follow))
+        raise ValueError(f"sweep: {name}: {listed} is computed from the others. Remove this column.")
     unused = [column for column in row if column not in applied | row.read]
     if unused:
         raise ValueError(
-            f"sweep: the table's {', '.join(unused)} changes nothing: {name} has no parameter, independent coordinate, "
-            "independent speed, state or input of that name. Give `state` as a function of (system, row), or `system` "
+            f"sweep: the columns {', '.join(unused)} have no effect: {name} has no parameter, independent coordinate, "
+            "independent speed, state or input of that name. Pass `state` as a function of (system, row), or `system` "
             f"as a function of (row), which reads row[{unused[0]!r}]."
         )
 
 
-def _check_description(members: Any, shared: Any, t: Any) -> None:
-    """Refuse a description that contradicts itself, by the first member; a bad body is its member's own."""
+def _check_description(members: PyTree, shared: PyTree, t: Component) -> None:
+    """Refuse a contradictory system, checked with the first member. An impossible body makes only its member
+    invalid."""
     if any(x.shape[0] == 0 for x in jax.tree.leaves(members)):
         return
     system, state, _, columns = eqx.combine(jax.tree.map(lambda x: x[0], members), shared)
@@ -332,9 +359,9 @@ def _check_description(members: Any, shared: Any, t: Any) -> None:
     check_system(system, t, q, bodies=False)
 
 
-def _signals(inputs: Inputs, system: Any, columns: dict[str, Any], ts: Any) -> Any:
-    """Signals as `simulate` takes them; samples may have a leading axis of members."""
-    if not isinstance(system, System):  # a function of the row: only to know the names
+def _signals(inputs: Inputs, system: System, columns: dict[str, Any], ts: Numbers) -> Any:
+    """Signals as in `simulate`; samples may have a leading axis of members."""
+    if not isinstance(system, System):  # a function of the row: only its names are needed
         system = jax.eval_shape(lambda row: system(Row(row)), {k: jnp.zeros(x.shape[1:]) for k, x in columns.items()})
         _refuse_no_system(system)
     assert not callable(inputs)
@@ -343,26 +370,32 @@ def _signals(inputs: Inputs, system: Any, columns: dict[str, Any], ts: Any) -> A
         if isinstance(value, Samples):
             samples[name] = value
             continue
-        array = None if callable(value) else real_array(value, f"The input {name!r}", ts.dtype)
+        array = None if callable(value) else real_array(value, f"The input {name!r}", jnp.result_type(ts.dtype))
         if array is None or array.shape in ((), ts.shape):
             single[name] = value
         elif array.ndim == 2 and array.shape[1] in (1, ts.shape[0]):
             batches[name] = array
         else:
             raise ValueError(
-                f"The input {name!r} of a sweep is a number, samples (n_t,), or a batch (b, n_t) or (b, 1) with n_t = "
-                f"{ts.shape[0]}; got the shape {array.shape}."
+                f"The input {name!r} of a sweep must be a number, samples (n_t,), or a batch (b, n_t) or (b, 1) with "
+                f"n_t = {ts.shape[0]}; got the shape {array.shape}."
             )
     known = as_signals(single | dict.fromkeys([*batches, *samples], 0.0), system.inputs, ts, type(system).__name__)
     for name, array in batches.items():
-        # Samples that are not finite make one member invalid, and no error for all.
-        of_ones = lambda x: eqx.tree_at(lambda s: s.values, Samples(ts, jnp.ones_like(x)), x)  # noqa: E731
-        known[name] = array[:, 0] if array.shape[1] == 1 else of_ones(array)
+        # Check with ones: samples that are not finite make only their member invalid, and raise nothing.
+        known[name] = array[:, 0] if array.shape[1] == 1 else _samples_of_members(ts, array)
     return known | samples
 
 
-def _refuse_twice(columns: dict[str, Any], system: Any, inputs: Inputs) -> None:
-    """A column takes the place of the one value that all members have, but not of values of their own."""
+def _samples_of_members(ts: Numbers, values: Numbers) -> Samples:
+    return eqx.tree_at(lambda samples: samples.values, Samples(ts, jnp.ones_like(values)), values)
+
+
+def _refuse_twice(columns: dict[str, Any], system: System, inputs: Inputs) -> None:
+    """A column may replace a value that all members share, but not a batch.
+
+    **Raises:** `ValueError` if a column is also a batch or an input.
+    """
     twice = {name: "`inputs`" for name in columns if isinstance(inputs, Mapping) and name in inputs}
     if isinstance(system, System):
         for name in in_batches(system):
@@ -370,7 +403,7 @@ def _refuse_twice(columns: dict[str, Any], system: Any, inputs: Inputs) -> None:
                 twice[name] = f"a batch of {type(system).__name__}"
     if twice:
         listed = ", ".join(f"{name} (a column of the table, and in {where})" for name, where in twice.items())
-        raise ValueError(f"sweep: given twice: {listed}. Leave one of them out.")
+        raise ValueError(f"sweep: passed twice: {listed}. Remove one of them.")
 
 
 def _batches(places: Any) -> dict[_Leaf, str]:

@@ -1,4 +1,4 @@
-"""The result of a sweep: arrays by name with an axis for every swept name."""
+"""The result of a sweep: arrays by name, with an axis for each swept name."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from .._common.lookup import not_there
 from .._integrate.status import Status, reason
 from .._integrate.trajectory import Trajectory
 from .._scalarjit.compat import Tracer
+from .._scalarjit.components import Numbers
 from ._chunks import ChunkResult
 from ._members import Table
 
-_NO_MOTION = "This sweep kept what `reduce` made of the motions, in `values`, and no motion."
+_NO_MOTION = "This sweep has no trajectories, because `reduce` was passed. Its results are in `values`."
 
 
 def _of_trajectory(name: str) -> Any:
@@ -30,18 +31,21 @@ def _of_trajectory(name: str) -> Any:
 
 
 class Sweep(eqx.Module):
-    """The motions of a sweep's members, by name: `rides["roll"]` (*shape, n_t), `rides["speed"]` (*shape).
+    """The trajectories of a sweep's members, by name: `rides["roll"]` (*shape, n_t), `rides["speed"]` (*shape).
 
-    The leading axes are those of the table: of a grid one for each name, of anything else the one of the members. What
-    a member did not reach is NaN.
+    A grid gives one leading axis for each name. Any other table, or a batch, gives one axis of members. Values are NaN
+    from the time at which a member ended early.
 
     Attributes:
 
-    - `trajectory`: all motions as one `Trajectory` with leading axes, for whatever wants such (`constraint_forces`);
-        `t`, `q`, `u`, `u_dep`, `x`, `inputs`, `outputs`, `names` are its own. None where `reduce` was given.
-    - `values`: what `reduce` made of every motion, with leading axes; else None.
-    - `status`, `t_end` [s], `stats`: how, when and in how many steps each ended; `ok`, `reason`: as of a `Trajectory`.
-    - `table`: what was swept; `dims`, `shape`: names and lengths of the leading axes.
+    - `trajectory`: all trajectories as one `Trajectory` with leading axes, e.g. for `constraint_forces`. `t`, `q`, `u`,
+        `u_dep`, `x`, `inputs`, `outputs`, `names`, `jumps` are its attributes. None if `reduce` was passed.
+    - `values`: the results of `reduce`, with leading axes; None without `reduce`.
+    - `status`: the status code of each member; `ok` and `reason` as of a `Trajectory`.
+    - `t_end`: the time [s] at which each member ended.
+    - `stats`: numbers of steps and evaluations of each member.
+    - `table`: the swept values.
+    - `dims`, `shape`: names and lengths of the leading axes.
     """
 
     trajectory: Trajectory | None
@@ -60,12 +64,19 @@ class Sweep(eqx.Module):
     inputs = _of_trajectory("inputs")
     outputs = _of_trajectory("outputs")
     names = _of_trajectory("names")
+    jumps = _of_trajectory("jumps")
 
     @classmethod
-    def of(cls, result: ChunkResult, table: Table, ts: Any, reduced: bool) -> Sweep:
+    def of(cls, result: ChunkResult, table: Table, ts: Numbers, reduced: bool) -> Sweep:
         """The results (b, ...) of all members, with the axes of their table."""
         result = jax.tree.map(lambda x: x.reshape(*table.shape, *x.shape[1:]), result)
         own = {"status": result.status, "t_end": result.t_end, "stats": result.stats}
+        if not isinstance(ts, jax.Array):  # times that the dtype of the state cannot resolve: see `clock_of`
+            own["t_end"] = ts[0] + np.asarray(result.t_end, np.float64)
+            jumps = None if reduced else getattr(result.values, "jumps", None)
+            if jumps is not None:
+                jumps = dataclasses.replace(jumps, t=ts[0] + np.asarray(jumps.t, np.float64))
+                result = dataclasses.replace(result, values=dataclasses.replace(result.values, jumps=jumps))
         trajectory, values = None, result.values
         if not reduced:
             t = ts if isinstance(ts, Tracer) else np.asarray(ts)
@@ -86,7 +97,7 @@ class Sweep(eqx.Module):
         return self.shape[0]
 
     @property
-    def ok(self) -> Any:
+    def ok(self) -> np.ndarray:
         """Whether the last time was reached (*shape)."""
         return self.status == Status.COMPLETED
 
@@ -95,9 +106,18 @@ class Sweep(eqx.Module):
         """The status in words, a list in the order of the members."""
         return [reason(int(code), self.events) for code in np.ravel(self.status)]
 
-    def __getitem__(self, name: str) -> Any:
-        """A coordinate, speed, state, input or output (*shape, n_t), what `reduce` called so, or a column of the table
-        (*shape)."""
+    def __getitem__(self, name: str) -> Numbers:
+        """The values of a name.
+
+        **Arguments:**
+
+        - `name`: a coordinate, speed, state, input or output; a key of the result of `reduce`; or a column of the
+            table.
+
+        **Returns:** (*shape, n_t) for a trajectory, (*shape) for a column.
+
+        **Raises:** `KeyError` for an unknown name.
+        """
         if self.trajectory is not None and name in _names(self.trajectory):
             return self.trajectory[name]
         if isinstance(self.values, Mapping) and name in self.values:
@@ -109,25 +129,32 @@ class Sweep(eqx.Module):
         raise not_there(name, [*known, *_names(self.trajectory), *self.table.columns], "this sweep")
 
     def member(self, *place: int) -> Trajectory:
-        """The motion of one member, by its place along every axis."""
+        """The trajectory of one member.
+
+        **Arguments:**
+
+        - `place`: one index for each leading axis.
+
+        **Raises:** `ValueError` if the number of indices is wrong, `AttributeError` if `reduce` was passed.
+        """
         if len(place) != len(self.shape):
-            raise ValueError(f"A member is found by {len(self.shape)} places ({', '.join(self.dims)}), got {place}.")
+            raise ValueError(f"`member` needs {len(self.shape)} indices ({', '.join(self.dims)}); got {place}.")
         if self.trajectory is None:
             raise AttributeError(_NO_MOTION)
         return jax.tree.map(lambda x: x[place], self.trajectory)
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many members ended in which way, the most frequent first."""
+        """The number of members with each status, the most frequent first."""
         codes, n = np.unique(np.asarray(self.status), return_counts=True)
         order = np.argsort(-n, kind="stable")
         return {reason(int(codes[i]), self.events): int(n[i]) for i in order}
 
     def to_xarray(self) -> Any:
-        """An `xarray.Dataset`: a variable for every name, coordinates for the times and the table.
+        """Convert to an `xarray.Dataset`: a variable for every name, coordinates for the times and the table.
 
-        A swept initial value of a coordinate or speed becomes the coordinate "initial ..."; a swept input is a
-        coordinate only. Needs xarray: pip install 'jaxkane[xarray]'.
+        A swept initial value of a coordinate or speed becomes the coordinate "initial ...". A swept input is only a
+        coordinate. Needs xarray: pip install 'jaxkane[xarray]'.
         """
         try:
             import xarray

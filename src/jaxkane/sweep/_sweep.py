@@ -1,4 +1,4 @@
-"""`sweep`: chunk by chunk, in this process or on a cluster, into arrays and files."""
+"""`sweep`: simulations in chunks, in this process or on a cluster, with results as arrays and files."""
 
 from __future__ import annotations
 
@@ -12,31 +12,42 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 from tqdm import tqdm
 
 from .._common.lookup import refuse_unknown
 from .._integrate.integrate import refuse_captured
 from .._integrate.settings import resolve_adjoint, settings_for, without_derivatives
-from .._integrate.simulate import as_state, checked_times
+from .._integrate.simulate import as_state, checked_times, clock_of
 from .._integrate.status import Status
 from .._integrate.trajectory import Trajectory
 from .._kane.arguments import is_concrete
 from .._scalarjit.cache_key import captured_tracers
-from .._scalarjit.components import Inputs
+from .._scalarjit.components import Inputs, Numbers
 from .._system.system import State, System
 from ._chunks import GROUP, ChunkResult, Task, mesh_of, on_cluster, trace
 from ._files import Folder, manifest_of
 from ._members import Row, Table, as_table, members_of
 from ._result import Sweep
 
-_OPTIONS = ("rtol", "atol", "solver", "step", "adjoint", "max_steps", "project", "stabilize")  # of `simulate`
-_MEMBERS, _MEMBERS_ON_GPU = 256, 16_384  # in a chunk; an H200 takes half as long for these as for 65 536
+_OPTIONS = (
+    "rtol",
+    "atol",
+    "solver",
+    "step",
+    "adjoint",
+    "max_steps",
+    "max_jumps",
+    "project",
+    "stabilize",
+)  # of `simulate`
+_MEMBERS, _MEMBERS_ON_GPU = 256, 16_384  # per chunk; measured on an H200: half the time of 65 536
 
 
 def sweep(
     system: System | Callable[[Row], System],
     state: State | Callable[[System, Row], State],
-    ts: Any,
+    ts: Numbers,
     inputs: Inputs = None,
     *,
     table: Any = None,
@@ -48,62 +59,76 @@ def sweep(
     progress: bool = False,
     **options: Any,
 ) -> Sweep:
-    """`simulate` for many members: systems, initial states or inputs that differ, in chunks of bounded memory.
+    """Simulate many members with different systems, initial states or inputs, in chunks of bounded memory.
 
         rides = sweep(bicycle, start, ts, table=grid(lam=np.linspace(0.2, 0.4, 20), roll_rate=[0.1, 0.5]))
         rides["roll"]  # (20, 2, n_t)
 
+    A column of `table` with the name of a parameter, coordinate, independent speed or input sets its value. Dependent
+    coordinates are then computed again (`assemble`). Other columns are read by functions `state` or `system`:
+
+        def start(bicycle, row):
+            return assemble(bicycle, {}, {"rear_wheel_rate": -row["speed"] / bicycle.rR})
+
+    Both functions are compiled. A column that a function reads does not set a value by its name. Columns of text are
+    labels.
+
     **Arguments:**
 
-    - `system`: any parameter may have a leading axis (b, ...) of members.
-    - `state`: `q` (b, n_q) or (n_q,), `u` (b, n_u) or (n_u,).
-    - `ts` (n_t,): times [s], the same for all.
-    - `inputs`: as for `simulate`; samples may be (b, n_t), and numbers that differ from member to member (b, 1).
-    - `table`: what differs, by name: `grid(...)`, a dict of columns (b,) or a DataFrame. Columns that are called as
-        parameters, coordinates, independent speeds or inputs of the system take their place, and coordinates that
-        depend on the others are found anew (`assemble`). Columns of text are labels, which have names of their own.
-    - `state` may be a function (system, row) -> State, and `system` a function (row) -> System, for columns with
-        other names: `lambda bicycle, row: assemble(bicycle, {}, {"rear_wheel_rate": -row["speed"] / bicycle.rR})`. They
-        are compiled, with `system` as this member has it. What a function makes stands as it is: a column that it reads
-        takes no place there by its name.
-    - `reduce`: a function of one member's `Trajectory` that gives the few arrays to keep, such as
-        `lambda ride: {"largest": jnp.max(jnp.abs(ride["roll"]))}`; it is compiled too. A million motions need not be
-        kept to look at a million numbers.
-    - `chunk`: members in one call of a compiled program, rounded up to whole groups of 32; by default 256, and 16 384
-        where JAX does not compute on the CPU. The results of a chunk fill its memory.
-    - `folder`: keep every finished chunk there, as a file. A sweep that was stopped, or killed, goes on from there when
-        it is called again, and gives the same bytes as one that was not. It is known again by what it computes and the
-        numbers that it computes from; a folder of another sweep is refused.
-    - `client`: a `dask.distributed.Client`: its workers, here or elsewhere, compute the chunks; workers of one thread
-        are best. A worker that dies costs its chunk's time. Where workers have other processors or libraries than this
-        machine, the last bits differ. Needs Dask: pip install 'jaxkane[cluster]'.
-    - `devices`: among which every chunk is divided; by default all of this process (`jax.local_devices()`).
+    - `system`: a system, whose parameters may have a leading axis (b, ...) of members; or a function (row) -> System.
+    - `state`: `q` (b, n_q) or (n_q,), `u` (b, n_u) or (n_u,); or a function (system, row) -> State.
+    - `ts`: (n_t,) times [s], the same for all members.
+    - `inputs`: as for `simulate`. Samples may be (b, n_t); constants that differ between members are (b, 1).
+    - `table`: the swept values by name: `grid(...)`, a dict of columns (b,) or a DataFrame.
+    - `reduce`: a function of one member's `Trajectory` that returns the arrays to keep, e.g. `lambda trajectory:
+        {"largest": jnp.max(jnp.abs(trajectory["roll"]))}`. It is compiled. The trajectories themselves are not kept.
+    - `chunk`: members in one call of a compiled program, rounded up to whole groups of 32. Default: 256 on the CPU, 16
+        384 on other devices. Memory grows with it.
+    - `folder`: save every finished chunk there as a file. Call again to resume an interrupted sweep. The result is
+        bit-identical to that of an uninterrupted sweep. A folder belongs to one program and its numbers; the folder of
+        another sweep is refused.
+    - `client`: a `dask.distributed.Client`, whose workers compute the chunks. Use workers of one thread. If a worker
+        dies, its chunk is computed again. With other processors or libraries on the workers, the last bits may differ.
+        Needs Dask: pip install 'jaxkane[cluster]'.
+    - `devices`: the devices among which every chunk is divided. Default: all of this process (`jax.local_devices()`).
     - `progress`: show a progress bar.
-    - `options`: those of `simulate`: rtol, atol, solver, step, adjoint, max_steps, project, stabilize.
+    - `options`: those of `simulate`: rtol, atol, solver, step, adjoint, max_steps, max_jumps,
+        project, stabilize.
 
-    **Returns:** a `Sweep`. A member that is not finite, has a parameter that must be positive and is not, a mass or an
-    inertia that no body has, or violates a constraint gets the status `Status.INVALID`; one that falls or breaks down
-    its own status; all with NaN from there on. After Ctrl-C what is finished comes back, the rest as `INTERRUPTED`.
+    **Returns:** a `Sweep`. Its `status` states how each member ended; values after an early end are NaN.
+    `Status.INVALID` means: a value is not finite, a positive parameter is not positive, a body is impossible, or a
+    constraint is violated. After Ctrl-C the finished members are returned, the others have the status `INTERRUPTED`.
+    Without `folder` this also holds for any other exception after the first chunk.
 
-    **Raises:** `ValueError` when nothing is a batch, two batches differ in length, a column changes nothing, or the
-    folder holds another sweep: the message says in what it differs.
+    **Raises:** `ValueError` if nothing is a batch, two batches differ in length, a column has no effect, or the folder
+    contains another sweep; the message names the difference. With `folder` every exception is raised, with a note that
+    the finished chunks are saved.
+
+    **Warns:** `RuntimeWarning` if an exception ended a sweep without `folder` after its first chunk.
     """
     if chunk is None:
         chunk = _MEMBERS if jax.default_backend() == "cpu" else _MEMBERS_ON_GPU
     if not isinstance(chunk, int | np.integer) or chunk < 1:
-        raise ValueError(f"sweep: `chunk` is a number of members, at least one; got {chunk!r}.")
+        raise ValueError(f"sweep: `chunk` must be a positive number of members; got {chunk!r}.")
     refuse_unknown(options, _OPTIONS, "sweep has no option")
+    if reduce is not None and not callable(reduce):
+        raise TypeError(
+            f"sweep: `reduce` must be a function of a Trajectory, e.g. lambda trajectory: trajectory['roll'][-1]; "
+            f"got {reduce!r}."
+        )
     table = as_table(table)
     if isinstance(state, State) and isinstance(system, System):
         state = as_state(system, state)
-    ts = checked_times(ts, getattr(state.q, "dtype", float) if isinstance(state, State) else float)
-    settings = settings_for(ts, progress=False, rising=is_concrete(ts), check_bodies=True, **options)
+    dtype = jnp.result_type(getattr(state.q, "dtype", float) if isinstance(state, State) else float)
+    ts = checked_times(ts, dtype)
+    settings = settings_for(dtype, progress=False, rising=is_concrete(ts), check_bodies=True, **options)
     if isinstance(system, System):
         refuse_captured(system)
-    members, shared, n = members_of(system, state, inputs, table, ts)
+    members, shared, n = members_of(system, state, inputs, table, ts, dtype)
     axes = table if table is not None else Table({}, ("member",), (n,))
     closures = captured_tracers(shared, reduce)
-    task = Task(shared, ts, settings, reduce, None if client is not None else mesh_of(devices), closures)
+    origin, taus = clock_of(ts, dtype)
+    task = Task(shared, origin, taus, settings, reduce, None if client is not None else mesh_of(devices), closures)
     own = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members)
     if n == 0:
         like = jax.eval_shape(task.simulate, own)
@@ -111,9 +136,9 @@ def sweep(
     if not is_concrete(members, shared, ts, closures):  # inside jit, grad or vmap
         if folder is not None or client is not None:
             raise ValueError("sweep: `folder` and `client` cannot be used inside jit, grad or vmap.")
-        arguments = members, shared, ts, closures
-        settings, (members, shared, ts, closures) = resolve_adjoint(settings, options.get("adjoint", "auto"), arguments)
-        task = Task(shared, ts, settings, reduce, task.mesh, closures)
+        adjoint, arguments = options.get("adjoint", "auto"), (members, shared, origin, taus, closures)
+        settings, (members, shared, origin, taus, closures) = resolve_adjoint(settings, adjoint, arguments)
+        task = Task(shared, origin, taus, settings, reduce, task.mesh, closures)
         return Sweep.of(task.solve(members, n), axes, ts, reduce is not None)
 
     task = dataclasses.replace(task, settings=without_derivatives(settings))
@@ -129,7 +154,7 @@ def sweep(
 
 def _in_chunks(
     task: Task,
-    members: Any,
+    members: PyTree,
     n: int,
     size: int,
     files: Folder | None,
@@ -137,9 +162,12 @@ def _in_chunks(
     client: Any,
     progress: bool,
 ) -> ChunkResult:
-    """The results of n members, `size` at a time: those that stand in the folder, then the rest, in this process or on
-    a cluster. What is missing after Ctrl-C has the status `INTERRUPTED`."""
-    members_at = lambda start: jax.tree.map(lambda x: x[start : start + size], members)  # noqa: E731
+    """Compute n members, `size` at a time: read the chunks of the folder, then compute the others, here or on a
+    cluster. After Ctrl-C the missing members have the status `INTERRUPTED`."""
+
+    def members_at(start: int) -> Any:
+        return jax.tree.map(lambda x: x[start : start + size], members)
+
     results = _Results(n)
     with tqdm(total=n, disable=not progress, unit="member", file=sys.stderr) as bar:
         try:
@@ -147,7 +175,7 @@ def _in_chunks(
             for start, result in _finished(files, remaining, like, n, size):
                 remaining.remove(start)
                 bar.update(results.put(start, result))
-            bar.initial = bar.n  # chunks that were read from files say nothing about the speed
+            bar.initial = bar.n  # chunks that were read from files would falsify the speed
             if client is None:
                 chunks = ((start, task.solve(members_at(start), size)) for start in remaining)
             else:
@@ -160,6 +188,21 @@ def _in_chunks(
         except KeyboardInterrupt:
             if results.arrays is None:
                 raise
+        except Exception as error:
+            finished = f"{int(results.reached.sum())} of {n} members are finished"
+            if results.arrays is None:
+                raise
+            if files is not None:
+                error.add_note(
+                    f"sweep: {finished} and saved in {files.path}. Call sweep again with this folder to resume."
+                )
+                raise
+            warnings.warn(
+                f"sweep: {finished} and returned; the others have the status INTERRUPTED, because of "
+                f"{type(error).__name__}: {str(error).rstrip(chr(46))}. Pass `folder` to make a sweep resumable.",
+                RuntimeWarning,
+                stacklevel=3,
+            )
     if files is not None and results.reached.all():
         files.tidy()
     return results.filled()
@@ -168,7 +211,7 @@ def _in_chunks(
 def _finished(
     files: Folder | None, starts: list[int], like: ChunkResult | None, n: int, size: int
 ) -> Iterator[tuple[int, ChunkResult]]:
-    """(start, result) of the chunks that stand in the folder, each member of the shapes of `like`."""
+    """(start, result) of the chunks in the folder; each member has the shapes of `like`."""
     if files is None:
         return
     for start in tuple(starts):
@@ -184,13 +227,13 @@ def _finished(
 
 
 class _Results:
-    """The results of all members, filled chunk by chunk."""
+    """The results of all members, filled in chunk by chunk."""
 
     def __init__(self, n: int):
         self.n, self.reached, self.arrays = n, np.zeros(n, bool), None
 
     def put(self, start: int, result: ChunkResult) -> int:
-        """Fill in the chunk that begins with a member. **Returns:** its size."""
+        """Insert the chunk whose first member is `start`. **Returns:** its size."""
         if self.arrays is None:
             self.arrays = jax.tree.map(lambda x: np.empty((self.n, *x.shape[1:]), x.dtype), result)
         size = result.status.shape[0]
@@ -200,7 +243,7 @@ class _Results:
         return size
 
     def filled(self) -> ChunkResult:
-        """With NaN, and the status `INTERRUPTED`, for members that were not reached."""
+        """The results, with NaN and the status `INTERRUPTED` for members that were not reached."""
         assert self.arrays is not None
         for x in jax.tree.leaves(self.arrays):
             x[~self.reached] = np.nan if jnp.issubdtype(x.dtype, jnp.inexact) else 0

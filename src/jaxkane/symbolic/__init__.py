@@ -1,6 +1,6 @@
-"""Equations that can be read: formulas of SymPy, in the declared names. Knows formulas; computes no numbers.
+"""Equations of motion as formulas of SymPy, in the declared names. Not used for numerical work.
 
-They are written from the graph of scalars that the library computes with, so that there is no second description.
+The formulas are written from the graph of scalars that the library computes with, so the model is defined only once.
 """
 
 from ._equations import Equations as Equations

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from .._kane.formulas import Formulas
+from .._kane.expression_graph import Formulas
 from .._scalarjit.backends.source import count_operations, uses
 from .._scalarjit.graph import needed, reads
 from .._system.system import System
 from ._sympy import (
+    Expression,
     SymbolicModel,
     Symbols,
     aligned,
@@ -28,10 +29,10 @@ from ._sympy import (
     too_long,
 )
 
-WHOLE_UP_TO = 3000  # operations of all formulas, each written out wherever it is read
+WHOLE_UP_TO = 3000  # operations of all formulas, if each intermediate result is written out wherever it is used
 _SHOWN_UP_TO = 400  # operations that a notebook shows
 
-# Of `Equations`: the function of formulas and its output.
+# Attribute of `Equations`: the function of formulas and its output.
 _QUANTITIES = {
     "q_dot": ("coordinate_rates", "q_dot"),
     "configuration_constraints": ("configuration_residuals", "h"),
@@ -47,23 +48,23 @@ _QUANTITIES = {
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Equations(SymbolicModel):
-    """Kane's equations of a system, M u_dot = f, with all that they are made of, as matrices of SymPy.
+    """Kane's equations of a system, M u_dot = f, and their terms, as matrices of SymPy.
 
     Attributes:
 
-    - `q_dot` (n_q, 1): rates of the coordinates, by all speeds.
-    - `velocity_constraints` (k, 1), `configuration_constraints` (h, 1): zero in the motion.
-    - `J` (k, n), `J_dot` (k, n): u_dep = J u for constraints without a term of their own in time, and its rate.
+    - `q_dot` (n_q, 1): rates of the coordinates, as functions of all speeds.
+    - `velocity_constraints` (k, 1), `configuration_constraints` (h, 1): residuals, which are zero.
+    - `J` (k, n), `J_dot` (k, n): u_dep = J u for constraints without an explicit term in time, and the rate of J.
     - `V`, `W`: partial velocities of the mass centres, and partial angular velocities, one (3, n) for each body, in N.
     - `M` (n, n), `f` (n, 1).
-    - `replacements`: pairs (symbol, expression) in the order in which they can be evaluated, as `sympy.cse` gives them:
-        the dependent speeds, which stand in formulas by their names; and, of a large system, every intermediate result
-        that is read more than once.
-    - `symbols`: by name, as they were declared; `t`, `q`, `u`, `u_dep`, `inputs`, `parameters`: tuples of them. Behind
-        the inputs stand the states of the first order, which loads read as they do.
-    - `operations`: scalar operations by quantity, each intermediate result counted once; "all" together.
+    - `replacements`: pairs (symbol, expression) in the order of evaluation, as from `sympy.cse`: the dependent speeds,
+        which occur by name in formulas; and, for a large system, each intermediate result that is used more than once.
+    - `symbols`: by their declared names.
+    - `t`, `q`, `u`, `u_dep`, `inputs`, `parameters`: tuples of symbols. `inputs` ends with the states of the first
+        order, which loads use like inputs.
+    - `operations`: scalar operations by quantity, each intermediate result counted once; "all" is the total.
 
-    Formulas are those of generic finite numbers: x / x is 1, and 0 x is 0.
+    Formulas hold for generic finite numbers: x / x is 1, and 0 x is 0.
     """
 
     q_dot: Any
@@ -87,21 +88,22 @@ class Equations(SymbolicModel):
 
     @property
     def arguments(self) -> tuple[Any, ...]:
-        """All symbols that stand for numbers: time, coordinates, independent speeds, inputs, parameters."""
+        """All symbols for numbers: time, coordinates, independent speeds, inputs, parameters."""
         return (self.t, *self.q, *self.u, *self.inputs, *self.parameters)
 
     def simplified(self) -> Equations:
-        """The same, each formula simplified by `sympy.simplify`: some seconds for textbook systems.
+        """The same equations, each formula simplified by `sympy.simplify`. This takes some seconds for textbook
+        systems.
 
         **Raises:** `ValueError` for a system that is too large to be written out.
         """
         sp = import_sympy()
         if not self.is_whole:
             raise ValueError(
-                f"{self.name}: {self.operations['all']} operations are too many for sympy.simplify, which would write "
-                "out each intermediate result wherever it is read. The formulas are `replacements`, evaluated one "
-                "after the other, and what is made of them. equations(system, whole=True) has them written out, which "
-                "for a few hundred operations may take minutes; jaxkane.symbolic.linearize stays smaller."
+                f"{self.name}: {self.operations['all']} operations are too many for sympy.simplify, because each "
+                "intermediate result would be written out wherever it is used. Evaluate `replacements` in their order, "
+                "or use equations(system, whole=True), which may take minutes for a few hundred operations. "
+                "jaxkane.symbolic.linearize has shorter formulas."
             )
         simplify = functools.cache(sp.simplify)
         matrices: dict[str, Any] = {name: getattr(self, name) for name in _QUANTITIES}
@@ -119,8 +121,13 @@ class Equations(SymbolicModel):
         if self.operations["all"] > _SHOWN_UP_TO or not self.is_whole:
             return too_long(self)
         names = {x: name_in_latex(_word(x)) for x in self.symbols.values() if x.is_Symbol}
-        dotted = lambda xs: sp.Matrix([sp.Symbol(name_in_latex(_word(x), 1)) for x in xs])  # noqa: E731
-        show = lambda x: in_latex(x, names)  # noqa: E731
+
+        def dotted(xs: Expression) -> Expression:
+            return sp.Matrix([sp.Symbol(name_in_latex(_word(x), 1)) for x in xs])
+
+        def show(x: Expression) -> str:
+            return in_latex(x, names)
+
         lines = [(show(dotted(self.q)), show(self.q_dot))]
         lines += [(show(h), "0") for h in self.configuration_constraints]
         lines += [(show(c), "0") for c in self.velocity_constraints]
@@ -129,8 +136,8 @@ class Equations(SymbolicModel):
         return aligned(lines)
 
 
-def _word(x: Any) -> str:
-    """What a symbol, or a function of time, is called."""
+def _word(x: Expression) -> str:
+    """The name of a symbol, or of a function of time."""
     return x.name if x.is_Symbol else str(x.func)
 
 
@@ -140,20 +147,21 @@ def equations(system: System, *, of_time: bool = False, whole: bool | None = Non
         equations = jk.symbolic.equations(jk.catalog.DoublePendulum())
         equations.M[0, 0], equations.simplified().f
 
-    They are those that the library evaluates, taken from the same graph of scalar operations.
+    The formulas are those that the library evaluates, from the same graph of scalar operations.
 
     **Arguments:**
 
-    - `of_time`: coordinates, speeds and inputs are functions of the time, `theta(t)`, rather than symbols.
-    - `whole`: write every formula out; with False what is read more than once is named in `replacements`. By default
-        whole as long as that takes no more than 3000 operations: the bicycle's would never end.
+    - `system`: the system.
+    - `of_time`: write coordinates, speeds and inputs as functions of time, `theta(t)`, instead of symbols.
+    - `whole`: write out every formula. With False, results that are used more than once are named in `replacements`.
+        Default: True if this takes at most 3000 operations; the bicycle's equations would take too long.
 
-    **Raises:** `ImportError` without sympy; `ValueError` for a batch of systems, a description that contradicts itself,
-    and operations that cannot be written as formulas of single numbers.
+    **Raises:** `ImportError` without sympy; `ValueError` for a batch of systems, a contradictory system, and operations
+    that are not formulas of scalars.
     """
     formulas = Formulas(system)
     symbols = symbols_of(formulas, of_time)
-    # First, so that they stand first among the replacements: formulas read them by their names.
+    # First, so that they are the first replacements: other formulas use them by name.
     u_dep = formulas.nodes("dependent_speeds")["u_dep"] if symbols["u_dep"] else np.zeros(0, np.int64)
     quantities = _quantities(formulas)
     outputs = list(quantities.values())
@@ -174,7 +182,7 @@ def equations(system: System, *, of_time: bool = False, whole: bool | None = Non
 
 
 def _quantities(formulas: Formulas) -> dict[str, np.ndarray]:
-    """Nodes by the names of `_QUANTITIES`; empty arrays for what a system has not."""
+    """Nodes by the names of `_QUANTITIES`; empty arrays for quantities that the system does not have."""
     n, k = len(formulas.system.speeds), len(formulas.system.dependent_speeds)
     empty = {"velocity_constraints": (0,), "J": (0, n), "J_dot": (0, n)}
     return {
@@ -184,7 +192,7 @@ def _quantities(formulas: Formulas) -> dict[str, np.ndarray]:
 
 
 def _size_written_out(formulas: Formulas, outputs: list[np.ndarray], named: np.ndarray) -> int:
-    """How many operations there are where each is written wherever it is read; those that are named count once."""
+    """The number of operations if each is written out wherever it is used; those of named nodes count once."""
     nodes, stops = formulas.graph.nodes, {int(k) for k in named.flat}
     size: dict[int, int] = {}
     for k in needed(nodes, [*outputs, named]):
@@ -195,8 +203,8 @@ def _size_written_out(formulas: Formulas, outputs: list[np.ndarray], named: np.n
 def _expressions(
     formulas: Formulas, symbols: Symbols, u_dep: np.ndarray, outputs: list[np.ndarray], is_whole: bool
 ) -> tuple[list[tuple[Any, Any]], dict[int, Any]]:
-    """Replacements, and nodes as expressions: dependent speeds, and what is read more than once unless all is written
-    out, by symbols."""
+    """Replacements, and nodes as expressions. Dependent speeds are symbols; unless everything is written out, so are
+    results that are used more than once."""
     sp = import_sympy()
     outputs = [*outputs, u_dep]
     count = uses(formulas.graph, needed(formulas.graph.nodes, outputs), outputs)
@@ -205,7 +213,7 @@ def _expressions(
     speeds = dict(zip((int(k) for k in u_dep), symbols["u_dep"].values(), strict=True))
     replacements: list[tuple[Any, Any]] = []
 
-    def replaced(k: int, x: Any) -> Any:
+    def replaced(k: int, x: Expression) -> Expression:
         if k not in speeds and (is_whole or count[k] < 2 or x.is_Atom or isinstance(x, sp.logic.boolalg.Boolean)):
             return x
         symbol = speeds[k] if k in speeds else next(fresh)
@@ -213,7 +221,7 @@ def _expressions(
         return symbol
 
     expressions = expressions_of(formulas, outputs, symbols, replaced)
-    # A dependent speed that is a speed, or a number, itself.
+    # A dependent speed that is itself a speed or a number has no replacement.
     named = {symbol for symbol, _ in replacements}
     for k, symbol in zip(u_dep, symbols["u_dep"].values(), strict=True):
         if symbol not in named:

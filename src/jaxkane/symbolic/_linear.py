@@ -1,19 +1,20 @@
-"""Linear models as matrices of formulas of the parameters, at a steady motion."""
+"""Linear models at a steady motion, as matrices of formulas of the parameters."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from .._common.lookup import as_names, refuse_unknown
-from .._kane.formulas import Formulas
+from .._kane.expression_graph import Formulas
 from .._system.system import System
 from ..stability._steady import check_dependent, cyclic_coordinates
 from ._equations import WHOLE_UP_TO
 from ._sympy import (
+    Expression,
     SymbolicModel,
     aligned,
     exact,
@@ -28,7 +29,7 @@ from ._sympy import (
     too_long,
 )
 
-_TOLERANCE = 1e-9  # of residuals and rates that are to be zero, beside numbers of order one
+_TOLERANCE = 1e-9  # of residuals and rates that should be zero, compared with numbers of order one
 _SHOWN_UP_TO = 500  # operations that a notebook shows
 
 
@@ -36,9 +37,13 @@ _SHOWN_UP_TO = 500  # operations that a notebook shows
 class LinearEquations(SymbolicModel):
     """x_dot = A x + B w for small deviations x, w from a motion, as matrices of SymPy.
 
-    Attributes: `A` (n, n), `B` (n, m); `replacements`: pairs (symbol, expression) that stand for what is read more than
-    once where the matrices would be long, in the order in which they can be evaluated; `states`, `inputs`: their names;
-    `symbols`: by name.
+    Attributes:
+
+    - `A` (n, n), `B` (n, m).
+    - `replacements`: pairs (symbol, expression) in the order of evaluation, for results that are used more than once in
+        long matrices.
+    - `states`, `inputs`: their names.
+    - `symbols`: by name.
     """
 
     A: Any
@@ -49,12 +54,12 @@ class LinearEquations(SymbolicModel):
 
     @property
     def operations(self) -> int:
-        """Of both matrices and the replacements."""
+        """The number of operations of both matrices and the replacements."""
         sp = import_sympy()
         return int(sum(sp.count_ops(x) for x in (*(x for _, x in self.replacements), *self.A, *self.B)))
 
     def simplified(self) -> LinearEquations:
-        """The same, each entry by `sympy.simplify`.
+        """The same model, each entry simplified by `sympy.simplify`.
 
         **Raises:** `ValueError` for matrices that are too long to be written out.
         """
@@ -71,7 +76,10 @@ class LinearEquations(SymbolicModel):
         if self.operations > _SHOWN_UP_TO:
             return too_long(self)
         names = {x: name_in_latex(x.name) for m in (self.A, self.B) for x in m.free_symbols}
-        column = lambda words, dots=0: sp.latex(sp.Matrix([sp.Symbol(name_in_latex(w, dots)) for w in words]))  # noqa: E731
+
+        def column(words: Iterable[str], dots: int = 0) -> str:
+            return sp.latex(sp.Matrix([sp.Symbol(name_in_latex(w, dots)) for w in words]))
+
         right = in_latex(self.A, names) + column(self.states)
         if self.inputs:
             right += "+" + in_latex(self.B, names) + column(self.inputs)
@@ -89,37 +97,40 @@ def linearize(
     """The linear model of a system about a steady motion, as formulas of its parameters.
 
         jk.symbolic.linearize(pendulum, {"theta1": 0, "theta2": 0}).simplified().A
-        jk.symbolic.linearize(bicycle, {"rear_wheel_rate": "-v/rR"}).A  # with a symbol of one's own, v
+        jk.symbolic.linearize(bicycle, {"rear_wheel_rate": "-v/rR"}).A  # with a symbol of your own, v
 
-    The derivatives are those of `jaxkane.stability.linearize`; the motion is put in before anything is written out, so
-    that what is zero there goes at once.
+    The derivatives are those of `jaxkane.stability.linearize`. The motion is substituted before anything is written
+    out, so that zero terms disappear at once.
 
     **Arguments:**
 
+    - `system`: the system.
     - `at`: coordinates, speeds, inputs, the time and parameters by name, as numbers, expressions of SymPy, or strings.
-        Coordinates, speeds, inputs and the time that are left out are zero, parameters stay symbols.
-    - `states`: names of coordinates and speeds to keep; by default all independent ones without the cyclic coordinates.
-    - `dependent`: names of the coordinates that the constraints determine, by default `system.dependent_coordinates`.
-    - `steady`: refuse a motion that is not steady, or off the constraints, as its numbers say with the system's own
-        parameters and, for symbols of one's own, any values.
+        Omitted parameters remain symbols; everything else is zero by default.
+    - `states`: names of coordinates and speeds to keep. Default: all independent ones without the cyclic coordinates.
+    - `dependent`: names of the coordinates that the constraints determine. Default: `system.dependent_coordinates`.
+    - `steady`: refuse a motion that is not steady or violates the constraints. This is checked with the system's own
+        parameters, and with arbitrary values for your own symbols.
 
-    **Raises:** `ImportError` without sympy; `ValueError` for unknown names, a motion that is not steady or where the
-    equations are singular, and as `jaxkane.symbolic.equations`.
+    **Raises:** `ImportError` without sympy; `ValueError` for unknown names, a motion that is not steady, or singular
+    equations, and as `jaxkane.symbolic.equations`.
     """
     formulas = Formulas(system)
     if system.states:
         raise ValueError(
-            f"{formulas.name} has states of the first order ({', '.join(system.states)}), which no linear model in "
-            "symbols holds: jaxkane.stability.linearize gives its numbers."
+            f"{formulas.name} has states of the first order ({', '.join(system.states)}), which are not "
+            "supported here. Use jaxkane.stability.linearize for a numerical linear model."
         )
     at_motion = _FormulasAtMotion(formulas, dict(at or {}))
     names = (*system.coordinates, *system.speeds)
     dependent = system.dependent_coordinates if dependent is None else as_names(dependent)
-    refuse_unknown(dependent, system.coordinates, f"{formulas.name}: `dependent` names", "the coordinates are")
+    refuse_unknown(
+        dependent, system.coordinates, f"{formulas.name}: `dependent` contains unknown names:", "the coordinates are"
+    )
     free = [x for x in names if x not in dependent]
     cyclic = cyclic_coordinates(system) if states is None or steady else ()
     states = tuple(x for x in free if x not in cyclic) if states is None else as_names(states)
-    refuse_unknown(states, free, f"{formulas.name}: no state can be", "independent coordinates and speeds are")
+    refuse_unknown(states, free, f"{formulas.name}: not a possible state:", "independent coordinates and speeds are")
     if steady:
         at_motion.check_steady(cyclic)
     T = at_motion.tangents(names, dependent)
@@ -134,7 +145,7 @@ def linearize(
 
 
 class _FormulasAtMotion:
-    """Functions of a system in which a motion's numbers and expressions stand for the variables."""
+    """Functions of a system, in which numbers and expressions of a motion replace the variables."""
 
     def __init__(self, formulas: Formulas, at: dict[str, Any]):
         zero = import_sympy().Integer(0)
@@ -149,8 +160,8 @@ class _FormulasAtMotion:
             read = sorted(variable for variable, symbol in variables.items() if symbol in x.free_symbols)
             if read:
                 raise ValueError(
-                    f"{formulas.name}: `at` says {name} = {x}, but {', '.join(read)} has a value of its own there. "
-                    "Expressions are of parameters and of symbols that the system does not have."
+                    f"{formulas.name}: `at` defines {name} = {x}, but {', '.join(read)} has its own value there. "
+                    "Expressions may contain parameters, and symbols that the system does not have."
                 )
         self.values = {kind: {name: values.get(name, zero) for name in of_kind} for kind, of_kind in symbols.items()}
         self.values["u_dep"] = symbols["u_dep"]
@@ -158,8 +169,8 @@ class _FormulasAtMotion:
             name: symbol if name in variables else values.get(name, symbol) for name, symbol in self.parameters.items()
         }
 
-    def _value(self, name: str, x: Any) -> Any:
-        """A number, an expression, or a string in which the declared names are the declared symbols."""
+    def _value(self, name: str, x: Any) -> Expression:
+        """A number, an expression, or a string in which declared names are the declared symbols."""
         sp = import_sympy()
         try:
             value = exact(x, "float64") if isinstance(x, float) else sp.sympify(x, locals=dict(self.symbols))
@@ -175,20 +186,21 @@ class _FormulasAtMotion:
 
     def _no_value(self, name: str, x: Any) -> str:
         return (
-            f"{self.formulas.name}: `at` says {name} = {x!r}, which is neither a finite number nor an expression of "
-            'SymPy; one is {"%s": "-v/radius"}.' % name
+            f"{self.formulas.name}: `at` has {name} = {x!r}, which is neither a finite number nor an expression of "
+            'SymPy. Example: {"%s": "-v/radius"}.' % name
         )
 
-    def expressions(self, nodes: np.ndarray) -> Any:
+    def expressions(self, nodes: np.ndarray) -> Expression:
         return matrix_of(nodes, expressions_of(self.formulas, [nodes], self.values))
 
-    def jacobian(self, kinds: tuple[str, ...]) -> Any:
+    def jacobian(self, kinds: tuple[str, ...]) -> Expression:
         """The derivatives of (q_dot, u_dot)."""
         blocks = self.formulas.derivatives("rates", self.formulas.directions(*kinds))
         return self.expressions(np.concatenate([*blocks.values()]))
 
     def tangents(self, names: tuple[str, ...], dependent: tuple[str, ...]) -> Any:
-        """T (n_q + n, n_free): how all coordinates and speeds move with the free ones, on the constraints."""
+        """T (n_q + n, n_free): derivatives of all coordinates and speeds with respect to the free ones, on the
+        constraints."""
         sp = import_sympy()
         free = [x for x in names if x not in dependent]
         T = sp.Matrix(len(names), len(free), lambda i, j: int(names[i] == free[j]))
@@ -206,7 +218,7 @@ class _FormulasAtMotion:
         return T
 
     def check_steady(self, cyclic: Sequence[str]) -> None:
-        """Refuse what is not steady, or off the constraints, as numbers say."""
+        """Refuse a motion that is not steady or violates the constraints, by its numerical values."""
         rates, system = self.formulas.nodes("rates"), self.formulas.system
         (h,) = self.formulas.nodes("configuration_residuals").values()
         still = [i for i, name in enumerate(system.coordinates) if name not in cyclic]
@@ -223,11 +235,11 @@ class _FormulasAtMotion:
         if wrong:
             raise ValueError(
                 f"{self.formulas.name}: this motion is not steady: {', '.join(wrong)}, with the system's own "
-                "parameters. Name other values in `at`; or ask for the linear model of an instant with steady=False."
+                "parameters. Pass other values as `at`, or linearize at one instant with steady=False."
             )
 
     def _numbers(self, expressions: Any) -> list[float]:
-        """Values at the system's own parameters, and at some number for every other symbol."""
+        """Values for the system's own parameters, and for an arbitrary number for each other symbol."""
         arrays = self.formulas.values().values()
         own = np.concatenate([np.ravel(x) for x in arrays]) if self.parameters else []
         values = dict(zip(self.parameters.values(), map(float, own), strict=True))
@@ -236,17 +248,17 @@ class _FormulasAtMotion:
         f = import_sympy().lambdify([*numbers], [*expressions], "numpy", cse=True)
         return [float(x) for x in f(*numbers.values())]
 
-    def refuse_singular(self, matrix: Any) -> None:
+    def refuse_singular(self, matrix: Expression) -> None:
         sp = import_sympy()
         if {sp.nan, sp.zoo, sp.oo, -sp.oo} & _sizes(matrix).keys():
             raise ValueError(
-                f"{self.formulas.name}: its equations are singular at this motion, where something is divided by zero; "
-                "name other coordinates or speeds in `at`."
+                f"{self.formulas.name}: the equations are singular at this motion (division by zero). Pass other "
+                "coordinates or speeds as `at`."
             )
 
 
 def _with_replacements(*matrices: Any) -> tuple[tuple[tuple[Any, Any], ...], list[Any]]:
-    """Matrices as they are, or with replacements where they would be long."""
+    """Matrices unchanged, or with replacements if they would be long."""
     sp = import_sympy()
     pairs, sizes = [], _sizes(*matrices)
     if sum(sizes[x] for m in matrices for x in m) > WHOLE_UP_TO:
@@ -256,10 +268,11 @@ def _with_replacements(*matrices: Any) -> tuple[tuple[tuple[Any, Any], ...], lis
 
 
 def _sizes(*matrices: Any) -> dict[Any, int]:
-    """The number of operations of every expression in matrices, each looked at once however often it stands there."""
+    """The number of operations of each expression in matrices. An expression that occurs several times is counted
+    once."""
     sizes: dict[Any, int] = {}
 
-    def size(x: Any) -> int:
+    def size(x: Expression) -> int:
         if x not in sizes:
             sizes[x] = max(len(x.args) - 1, 0) + sum(map(size, x.args))
         return sizes[x]

@@ -9,19 +9,23 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from .._kane.formulas import Formulas
+from .._kane.expression_graph import Formulas
 from .._scalarjit.backends.source import as_objects
 from .._scalarjit.graph import OPERATORS, NotScalarError, needed
 
+Expression: TypeAlias = Any
+"""An expression or a matrix of SymPy, which is an optional dependency."""
+
 Symbols = Mapping[str, Mapping[str, Any]]
-"""Symbols, or what is put in their place, by kind ("t", "q", "u", "u_dep", "inputs", "parameters") and name."""
+"""Symbols, or their replacements, by kind ("t", "q", "u", "u_dep", "inputs", "parameters") and name."""
 
 
-def import_sympy() -> Any:
+def import_sympy() -> ModuleType:
     try:
         import sympy
     except ImportError as error:
@@ -30,9 +34,9 @@ def import_sympy() -> Any:
 
 
 def symbols_of(formulas: Formulas, of_time: bool) -> dict[str, dict[str, Any]]:
-    """Symbols by kind and name: real numbers, positive where a parameter is declared so; or functions of time.
+    """Symbols by kind and name: real numbers, positive if a parameter is declared so; or functions of time.
 
-    A parameter that is called like a coordinate, a speed, an input, or the time, gets an underscore behind its name.
+    A parameter with the name of a coordinate, a speed, an input, or the time gets an underscore at the end.
     """
     sp = import_sympy()
     t = sp.Symbol("t", real=True)
@@ -56,7 +60,8 @@ def symbols_of(formulas: Formulas, of_time: bool) -> dict[str, dict[str, Any]]:
 
 
 def symbols_by_name(symbols: Symbols) -> dict[str, Any]:
-    """Symbols by their declared names; a parameter that shares its name with a variable has an underscore behind it."""
+    """Symbols by their declared names. A parameter that shares its name with a variable has an underscore at the
+    end."""
     return {
         symbol.name if kind == "parameters" else name: symbol
         for kind, of_kind in symbols.items()
@@ -70,9 +75,9 @@ def expressions_of(
     symbols: Symbols,
     replaced: Callable[[int, Any], Any] = lambda k, x: x,
 ) -> dict[int, Any]:
-    """Nodes, and all that they read, as expressions; `replaced` may put a symbol in the place of a node's expression.
+    """Nodes, and all nodes that they use, as expressions. `replaced` may replace a node's expression by a symbol.
 
-    **Raises:** `ValueError` for operations that are none of single numbers.
+    **Raises:** `ValueError` for operations that are not formulas of scalars.
     """
     inputs = {
         int(k): symbols[a.kind][element]
@@ -83,11 +88,11 @@ def expressions_of(
     try:
         return as_objects(graph, needed(graph.nodes, outputs), inputs, _operations(), exact, "SymPy", replaced)
     except NotScalarError as error:
-        raise ValueError(f"{formulas.name}: its equations hold {error}.") from None
+        raise ValueError(f"{formulas.name}: its equations contain {error}.") from None
 
 
-def matrix_of(nodes: np.ndarray, expressions: Mapping[int, Any]) -> Any:
-    """An array of nodes as a matrix, a column where it has one axis; a tuple of matrices where it has three."""
+def matrix_of(nodes: np.ndarray, expressions: Mapping[int, Any]) -> Expression:
+    """An array of nodes as a matrix: a column for one axis, a tuple of matrices for three axes."""
     if nodes.ndim == 3:
         return tuple(matrix_of(x, expressions) for x in nodes)
     rows = nodes.reshape(-1, 1) if nodes.ndim == 1 else nodes
@@ -95,20 +100,20 @@ def matrix_of(nodes: np.ndarray, expressions: Mapping[int, Any]) -> Any:
 
 
 def fresh_symbols(reserved: Iterable[str]) -> Iterator[Any]:
-    """x0, x1, ... without those whose names are reserved."""
+    """x0, x1, ... without reserved names."""
     names, sp = {*reserved}, import_sympy()
     return (sp.Symbol(f"x{i}", real=True) for i in itertools.count() if f"x{i}" not in names)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class SymbolicModel:
-    """Formulas of the system `name`, some of which stand in `replacements`: pairs (symbol, expression)."""
+    """Formulas of the system `name`, with `replacements`: pairs (symbol, expression)."""
 
     name: str
     replacements: tuple[tuple[Any, Any], ...]
 
     def cse(self, expressions: Any) -> tuple[list[tuple[Any, Any]], Any]:
-        """`replacements` and the expressions, as the argument `cse` of `sympy.lambdify` takes them:
+        """`replacements` and the expressions, in the form of the argument `cse` of `sympy.lambdify`:
 
         lambdify(equations.arguments, [equations.M, equations.f], cse=equations.cse)
         lambdify([*model.symbols.values()], model.A, cse=model.cse)
@@ -119,8 +124,9 @@ class SymbolicModel:
 _LARGEST_DENOMINATOR = 10_000
 
 
-def exact(value: float | bool, dtype: str) -> Any:
-    """The number of small numerator and denominator, or the multiple of pi, that rounds to a float; else the float."""
+def exact(value: float | bool, dtype: str) -> Expression:
+    """The rational number with small numerator and denominator, or the multiple of pi, that rounds to a float; else the
+    float."""
     sp = import_sympy()
     if dtype == "bool":
         return sp.true if value else sp.false
@@ -143,12 +149,15 @@ def exact(value: float | bool, dtype: str) -> Any:
 def _operations() -> dict[str, Any]:
     """SymPy's functions for the operations of graphs, for real and finite numbers."""
     sp = import_sympy()
-    # What is divided by zero is in no order with anything; SymPy raises there.
-    ordered = lambda f: lambda x, y: sp.false if sp.nan in (x, y) else f(x, y)  # noqa: E731
+    # SymPy raises if it compares a result of a division by zero.
+
+    def ordered(f: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        return lambda x, y: sp.false if sp.nan in (x, y) else f(x, y)
+
     own = "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log erf sqrt floor".split()
     return {name: getattr(sp, name) for name in own} | {
         **OPERATORS,
-        "rem": lambda x, y: sp.sign(x) * sp.Mod(sp.Abs(x), sp.Abs(y)),  # of the sign of x
+        "rem": lambda x, y: sp.sign(x) * sp.Mod(sp.Abs(x), sp.Abs(y)),  # with the sign of x
         "pow": lambda x, y: x**y,
         "exp2": lambda x: 2**x,
         "expm1": lambda x: sp.exp(x) - 1,
@@ -166,7 +175,7 @@ def _operations() -> dict[str, Any]:
         "and": sp.And,
         "or": sp.Or,
         "xor": sp.Xor,
-        # Where a description has no value, NaN, a formula needs none.
+        # A branch that is NaN marks a missing value; a formula can omit it.
         "select": lambda c, x, y: x if y is sp.nan else y if x is sp.nan else sp.Piecewise((x, c), (y, True)),
         "convert": lambda x: sp.Piecewise((1, x), (0, True)) if isinstance(x, sp.logic.boolalg.Boolean) else x,
     }
@@ -179,8 +188,8 @@ _GREEK = frozenset(
 
 
 def name_in_latex(name: str, dots: int = 0) -> str:
-    r"""theta1 as \theta_{1}, theta1_dot as \dot{\theta}_{1}, mB as m_{B}, engine_mass as \mathit{engine\_mass};
-    `dots` more for time derivatives."""
+    r"""theta1 as \theta_{1}, theta1_dot as \dot{\theta}_{1}, mB as m_{B}, engine_mass as \mathit{engine\_mass}. `dots`:
+    the number of additional time derivatives."""
     dotted = re.fullmatch(r"(.+)_dot", name)
     base = dotted[1] if dotted else name
     parts = re.fullmatch(r"([A-Za-z]+?)_?(\d*)", base)
@@ -206,10 +215,10 @@ def escaped(word: str) -> str:
     return re.sub(r"([_#$%&{}])", r"\\\1", word)
 
 
-def in_latex(expression: Any, names: dict[Any, str]) -> str:
+def in_latex(expression: Expression, names: dict[Any, str]) -> str:
     return import_sympy().latex(expression, symbol_names=names)
 
 
 def aligned(lines: Iterable[tuple[str, str]]) -> str:
-    """Equations one below the other."""
+    """Equations in a column."""
     return "$\\displaystyle \\begin{aligned}" + r"\\ ".join(f"{a} &= {b}" for a, b in lines) + "\\end{aligned}$"

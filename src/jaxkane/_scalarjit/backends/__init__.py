@@ -1,1 +1,1 @@
-"""What a program of scalars becomes: NumPy calls, LLVM kernels, source in another language."""
+"""The forms of a program of scalars: NumPy calls, LLVM kernels, XLA functions, source code in another language."""

@@ -1,72 +1,49 @@
-"""Graphs of scalars as LLVM's text, and the wrapper by which XLA calls a kernel. Compiles nothing.
+"""Graphs of scalars as LLVM text, and the wrapper by which XLA calls a kernel. Does not compile.
 
-The places of XLA's structures are written down here, as numbers. Three things stand between a jaxlib that moves them
-and a wild pointer: a test reads them from the header that jaxlib ships, the probe calls a kernel in another process
-before this one does, and every call compares the sizes that the structures state of themselves.
+The wrapper reads and writes XLA's structures at fixed offsets (`ffi_layout`). Each call first compares the sizes that
+the structures state, and returns an error to XLA if they differ.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence, Set
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..graph import LIBRARY, Graph, NotScalarError, needed, symbol
+from .ffi_layout import LAYOUT
 
-
-class Layout(NamedTuple):
-    """Bytes from the beginning of the structures of xla/ffi/api/c_api.h, major version 0, where addresses have eight.
-
-    `*_size` are the sizes of structures, as they state them in their first field.
-    """
-
-    frame_size: int = 168
-    frame_extension: int = 8
-    frame_api: int = 16
-    frame_arguments: int = 40
-    frame_results: int = 80
-    list_size: int = 40  # of the arguments, and of the results
-    list_count: int = 16
-    list_items: int = 32
-    buffer_size: int = 48
-    buffer_data: int = 24
-    extension_type: int = 8
-    extension_metadata: int = 24
-    metadata_major: int = 24
-    metadata_minor: int = 28
-    metadata_traits: int = 32
-    api_error_create: int = 48
-    error_size: int = 28
-    error_message: int = 16
-    error_code: int = 24
-
-
-LAYOUT = Layout()
 _METADATA = 1
 _API_VERSION = (0, 1)
 _INTERNAL = 13
 _MOVED = (
-    "jaxkane: this jaxlib calls native kernels in another way than they expect. "
-    "Leave the work to XLA: jaxkane.configure(native=False)."
+    "jaxkane: this version of jaxlib uses another calling convention than the native kernels. "
+    "Disable native kernels: jaxkane.configure(native=False)."
 )
 
 
 def wrapper_text(
     kernel: str,
     sizes: Sequence[int],
-    where: Sequence[Sequence[bool]],
+    batch_mask: Sequence[Sequence[bool]],
     n_in: int,
     bytes_of: Sequence[int],
     of_kernel: str = "",
 ) -> str:
-    """The function that XLA calls: for every place in the outer dimensions, the kernel on the lanes of the last. The
-    kernel has this name, in the program or in the text `of_kernel`, which becomes a part of this one.
+    """The function that XLA calls. For each index of the outer dimensions it calls the kernel for the lanes of the last
+    dimension. If a structure has an unexpected size, it returns an error to XLA.
 
-    Of the dimensions `sizes`, the `n_in` arguments and the results behind them have those that `where` says of each; an
-    element of each is so many bytes. Where a structure is not as large as it is taken to be, XLA is handed an error.
+    **Arguments:**
+
+    - `kernel`: the name of the kernel.
+    - `sizes`: of the batch dimensions.
+    - `batch_mask`: for each argument and then each result, which dimensions it has.
+    - `n_in`: the number of arguments.
+    - `bytes_of`: for each argument and result, the size of an element.
+    - `of_kernel`: the text of the kernel, which becomes a part of this one; empty if it is a separate function.
     """
-    n_out = len(where) - n_in
+    n_out = len(batch_mask) - n_in
     lines = [
         f"%in = alloca ptr, i64 {max(n_in, 1)}",
         f"%out = alloca ptr, i64 {max(n_out, 1)}",
@@ -94,7 +71,7 @@ def wrapper_text(
             lines += _load(f"{b}.buffer", "ptr", f"{side}.list", 8 * i)
             lines += _load(f"{b}.data", "ptr", f"{b}.buffer", LAYOUT.buffer_data)
             lines.append(f"%{b}.slot = getelementptr ptr, ptr %{side}, i64 {i}")
-    lines += [*_calls(kernel, sizes, where, n_in, bytes_of), *_refusal()]
+    lines += [*_calls(kernel, sizes, batch_mask, n_in, bytes_of), *_refusal()]
     body = "\n".join(["entry:", *lines])
     message = "".join(f"\\{byte:02X}" for byte in _MOVED.encode())
     return (
@@ -114,7 +91,8 @@ def _store(name: str, value: str, base: str, place: int) -> list[str]:
 
 
 def _checks(n_in: int, n_out: int) -> list[str]:
-    """Go on to %run, or to %wrong: sizes and counts first, since pointers may be followed only if these are right."""
+    """Branch to %run or to %wrong. Sizes and counts are checked first, because pointers may be followed only if these
+    are right."""
     lines: list[str] = []
 
     def need(name: str, condition: str, base: str, place: int) -> None:
@@ -129,15 +107,15 @@ def _checks(n_in: int, n_out: int) -> list[str]:
         need(f"{side}.size", f"eq {LAYOUT.list_size}", "frame", place)
         need(f"{side}.count", f"eq {count}", "frame", place + LAYOUT.list_count)
         lines.extend(_load(f"{side}.list", "ptr", "frame", place + LAYOUT.list_items))
-        if count:  # all are made alike
+        if count:  # all elements have the same structure
             lines.extend(_load(f"{side}.first", "ptr", f"{side}.list", 0))
             need(f"{side}.first.size", f"uge {LAYOUT.buffer_size}", f"{side}.first", 0)
     return [*lines, "br label %run"]
 
 
 def _refusal() -> list[str]:
-    """An error made by XLA's own function. Where that is not at its place either, the process ends, rather than go on
-    with results that nobody has written."""
+    """An error made by XLA's function. If that function is not at its offset either, the process is terminated, because
+    the results were not written."""
     return [
         "wrong:",
         *_load("api", "ptr", "frame", LAYOUT.frame_api),
@@ -159,19 +137,19 @@ def _refusal() -> list[str]:
 
 
 def _calls(
-    kernel: str, sizes: Sequence[int], where: Sequence[Sequence[bool]], n_in: int, bytes_of: Sequence[int]
+    kernel: str, sizes: Sequence[int], batch_mask: Sequence[Sequence[bool]], n_in: int, bytes_of: Sequence[int]
 ) -> list[str]:
-    """Every place in the outer dimensions, one after the other."""
+    """The loop over the indices of the outer dimensions."""
     outer, lanes = sizes[:-1], (sizes[-1] if sizes else 1)
     lines = ["br label %outer", "outer:", "%k = phi i64 [0, %run], [%k.next, %outer]"]
-    for i in range(len(where)):
+    for i in range(len(batch_mask)):
         b = f"%in{i}" if i < n_in else f"%out{i - n_in}"
         offset = f"{b}.0"
         lines.append(f"{offset} = add i64 0, 0")
-        stride = bytes_of[i] * (lanes if sizes and where[i][-1] else 1)
+        stride = bytes_of[i] * (lanes if sizes and batch_mask[i][-1] else 1)
         later = 1
         for d in reversed(range(len(outer))):
-            if where[i][d]:
+            if batch_mask[i][d]:
                 lines.append(f"{b}.{d}.q = udiv i64 %k, {later}")
                 lines.append(f"{b}.{d}.r = urem i64 {b}.{d}.q, {outer[d]}")
                 lines.append(f"{b}.{d}.s = mul i64 {b}.{d}.r, {stride}")
@@ -192,7 +170,7 @@ def _calls(
     ]
 
 
-# Operations of graphs as LLVM writes them.
+# Operations of graphs in LLVM's language.
 TYPES = {"float64": "double", "float32": "float", "bool": "i1"}
 BINARY = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv", "rem": "frem"}
 LOGIC = {"and": "and", "or": "or", "xor": "xor"}
@@ -200,19 +178,19 @@ COMPARISONS = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", 
 INTRINSICS = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "max": "maximum", "min": "minimum"}
 
 
-# LLVM's time for a block grows faster than its length: in blocks of some such number of nodes, a long kernel takes two
-# thirds of it.
+# LLVM's time for a block grows faster than its length. With blocks of about this number of nodes, a long kernel
+# compiles in two thirds of the time.
 _BLOCK = 1000
 
 
 class Writer:
     """The text of one function: `void it(ptr in, ptr out, i64 n)`, with pointers to n lanes of every argument.
 
-    An argument that `varies` and a result that `out_varies` hold their elements lane after lane; others are read or
-    written once. The last lanes of the last group repeat lane n - 1, so that what a lane gives never depends on its
-    place.
+    An argument that `varies` and a result that `out_varies` contain their elements lane after lane. Others are read or
+    written once. The last lanes of the last group repeat lane n - 1, so that the result of a lane never depends on its
+    position.
 
-    `is_derivative`: sums of products along several directions may be added up in any order, which saves an eighth.
+    `is_derivative`: sums of products along several directions may be added in any order, which saves an eighth.
     """
 
     def __init__(
@@ -230,7 +208,8 @@ class Writer:
         self.lines: list[str] = []
         self.declared: set[str] = set()
         self.bases: set[str] = set()
-        # What lanes share goes through memory, whence it is broadcast for nothing: its places there, and its vectors.
+        # Values that lanes share are stored in memory, from where a broadcast costs nothing: their places there, and
+        # vectors.
         self.wide: set[int] = set()
         self.places: dict[int, int] = {}
         self.splats: dict[int, str] = {}
@@ -242,10 +221,10 @@ class Writer:
         shared = {k for k in used if k not in wide and nodes[k].operation != "constant"}
         read = {i for k in wide if nodes[k].operation != "input" for i in nodes[k].operands}
         read |= {int(k) for out, varies in zip(outputs, self.out_varies, strict=True) if varies for k in out.flat}
-        for where, n in (("in", len(self.varies)), ("out", len(outputs))):
+        for side, n in (("in", len(self.varies)), ("out", len(outputs))):
             for i in range(n):
-                self.lines.append(f"%{where}{i}.at = getelementptr ptr, ptr %{where}, i64 {i}")
-                self.lines.append(f"%{where}{i} = load ptr, ptr %{where}{i}.at")
+                self.lines.append(f"%{side}{i}.at = getelementptr ptr, ptr %{side}, i64 {i}")
+                self.lines.append(f"%{side}{i} = load ptr, ptr %{side}{i}.at")
         self.lines.append(f"%kept = alloca double, i64 {max(len(shared & read), 1)}, align 64")
         self.lines.append("%is.empty = icmp eq i64 %n, 0")
         for k in self._in_blocks("entry", shared):
@@ -276,8 +255,8 @@ class Writer:
         )
 
     def _in_blocks(self, label: str, nodes: Set[int]) -> Iterator[int]:
-        """The nodes one after the other, with a branch that is never taken between blocks of them, lest LLVM join them:
-        the first block has this label, `self.block` is the last."""
+        """The nodes in order. Between blocks is a branch that is never taken, so that LLVM does not join them. The
+        first block has this label; `self.block` is the last one."""
         self.block = label
         size = -(-len(nodes) // max(1, len(nodes) // _BLOCK))
         for i, k in enumerate(sorted(nodes)):
@@ -287,7 +266,7 @@ class Writer:
             yield k
 
     def _wide(self, used: Sequence[int]) -> set[int]:
-        """Those that may differ from lane to lane."""
+        """The nodes that may differ between lanes."""
         wide: set[int] = set()
         for k in used:
             node = self.graph.nodes[k]
@@ -301,7 +280,7 @@ class Writer:
         return TYPES[dtype] if lanes == 1 else f"<{lanes} x {TYPES[dtype]}>"
 
     def _alone(self, k: int) -> str:
-        """What node k is called among those that all lanes share."""
+        """The name of node k among the values that all lanes share."""
         node = self.graph.nodes[k]
         if node.operation != "constant":
             return f"%v{k}"
@@ -309,7 +288,7 @@ class Writer:
         return str(number).lower() if node.dtype == "bool" else _digits(number, node.dtype)
 
     def _in_lanes(self, k: int) -> str:
-        """What node k is called as a vector of all lanes."""
+        """The name of node k as a vector of all lanes."""
         node, lanes = self.graph.nodes[k], self.lanes
         kind = TYPES[node.dtype]
         if node.operation == "constant":
@@ -317,7 +296,7 @@ class Writer:
         if k not in self.places:
             return f"%v{k}"
         if k not in self.splats:
-            # LLVM would move an address that is made outside the loop into it, and takes long for it.
+            # LLVM would move an address that is computed outside the loop into it, which takes long.
             self.lines.append(f"%s{k} = load {kind}, ptr {self._kept(k, 'read')}")
             self.splats[k] = self._splat(f"%s{k}", kind, lanes)
         return self.splats[k]
@@ -337,7 +316,7 @@ class Writer:
         return f"{scalar}.n"
 
     def _node(self, k: int, lanes: int) -> None:
-        """Node k, of one lane for all or of all lanes."""
+        """Node k, as one value for all lanes or as a vector of all lanes."""
         node = self.graph.nodes[k]
         name, kind = node.operation, self._type(node.dtype, lanes)
         if name == "input":
@@ -385,17 +364,17 @@ class Writer:
             return self._call(vector, kind, xs)
         scalar, results = TYPES[node.dtype], []
         for lane in range(lanes):
-            parts = []
+            elements = []
             for i, x in enumerate(xs):
                 self.lines.append(f"%c{k}.{lane}.{i} = extractelement {kind} {x}, i64 {lane}")
-                parts.append(f"%c{k}.{lane}.{i}")
-            self.lines.append(f"%c{k}.{lane} = {self._call(one, scalar, parts)}")
+                elements.append(f"%c{k}.{lane}.{i}")
+            self.lines.append(f"%c{k}.{lane} = {self._call(one, scalar, elements)}")
             results.append(f"%c{k}.{lane}")
         self._gathered(results, scalar, f"%c{k}.g", f"%c{k}.all")
         return f"freeze {kind} %c{k}.all"
 
     def _at(self, pointer: str, element: int, size: int, lane: int | None, kind: str, tag: str) -> str:
-        """The address of an element of an argument or a result in a lane; None where it does not vary."""
+        """The address of an element of an argument or a result in a lane; `lane` is None if it does not vary."""
         base = f"%{pointer}" if lane is None else f"%{pointer}.{lane}"
         if lane is not None and base not in self.bases:
             self.bases.add(base)
@@ -414,21 +393,21 @@ class Writer:
             at = self._at(f"in{argument}", element, size, None, kind, f"a{k}")
             self.lines.append(f"{whole} = load {kind}, ptr {at}")
         else:
-            parts = []
+            elements = []
             for lane in range(lanes):
                 at = self._at(f"in{argument}", element, size, lane, kind, f"a{k}.{lane}")
-                parts.append(whole if lanes == 1 else f"%l{k}.{lane}")
-                self.lines.append(f"{parts[-1]} = load {kind}, ptr {at}")
+                elements.append(whole if lanes == 1 else f"%l{k}.{lane}")
+                self.lines.append(f"{elements[-1]} = load {kind}, ptr {at}")
             if lanes > 1:
-                self._gathered(parts, kind, f"%g{k}", whole)
+                self._gathered(elements, kind, f"%g{k}", whole)
         if dtype == "bool":
             self.lines.append(f"%v{k} = icmp ne {vector} {whole}, {'0' if vector == 'i8' else 'zeroinitializer'}")
 
-    def _gathered(self, parts: Sequence[str], kind: str, tag: str, whole: str) -> None:
-        vector, so_far = f"<{len(parts)} x {kind}>", "poison"
-        for lane, part in enumerate(parts):
-            name = whole if lane == len(parts) - 1 else f"{tag}.{lane}"
-            self.lines.append(f"{name} = insertelement {vector} {so_far}, {kind} {part}, i64 {lane}")
+    def _gathered(self, elements: Sequence[str], kind: str, tag: str, whole: str) -> None:
+        vector, so_far = f"<{len(elements)} x {kind}>", "poison"
+        for lane, element in enumerate(elements):
+            name = whole if lane == len(elements) - 1 else f"{tag}.{lane}"
+            self.lines.append(f"{name} = insertelement {vector} {so_far}, {kind} {element}, i64 {lane}")
             so_far = name
 
     def _store_outputs(self, outputs: Sequence[np.ndarray], varying: bool) -> None:
@@ -438,7 +417,7 @@ class Writer:
                     self._store(f"out{j}", element, array.size, k, varying)
 
     def _store(self, pointer: str, element: int, size: int, k: int, varies: bool) -> None:
-        """Node k, in each lane or, where the result does not vary, once."""
+        """Store node k in each lane, or once if the result does not vary."""
         dtype, lanes = self.graph.nodes[k].dtype, self.lanes if varies else 1
         tag, kind, value = f"{pointer}.e{element}", TYPES[dtype], self._in_lanes(k) if varies else self._alone(k)
         if dtype == "bool":
@@ -455,6 +434,6 @@ class Writer:
 
 
 def _digits(value: Any, dtype: str) -> str:
-    """A float as LLVM writes it: the bits of a double, also for a float32."""
+    """A float in LLVM's notation: the bits of a double, also for a float32."""
     number = np.float64(value) if dtype == "float64" else np.float64(np.float32(value))
     return f"0x{number.view(np.uint64):016X}"

@@ -1,7 +1,7 @@
 """A program of scalars evaluated by NumPy, node by node.
 
-A few calls are done so before XLA has begun to compile: a node costs a tenth of a microsecond. The results agree with
-those of compiled programs to rounding errors.
+A few evaluations take less time than XLA needs to begin its compilation: a node costs a tenth of a microsecond. The
+results agree with those of compiled programs within rounding.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ NUMPY_NAMES = {name: name for name in LIBRARY} | {
     "atanh": "arctanh", "pow": "power", "abs": "abs", "sqrt": "sqrt", "floor": "floor", "rem": "fmod",
     "max": "maximum", "min": "minimum",
 }  # fmt: skip
-"""NumPy's functions, by JAX's names of them; it has no erf."""
+"""NumPy's functions by JAX's names. NumPy has no erf."""
 
 _FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(np, word) for name, word in NUMPY_NAMES.items() if name != "erf"},
@@ -34,13 +34,13 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
 
 
 class NumPyProgram:
-    """A program of scalars, ready to be evaluated. Raises `NotScalarError` for any other."""
+    """A program of scalars, ready to be evaluated. **Raises:** `NotScalarError` for other programs."""
 
     def __init__(self, program: ClosedJaxpr):
         graph, self.outputs = graph_of(program)
         self.types = [a.dtype for a in types_of(program)[1]]
-        self.start: list[Any] = [None] * len(graph.nodes)  # with what is constant
-        self.inputs: list[tuple[int, int, int, int]] = []  # node; argument, element, how many the argument has
+        self.start: list[Any] = [None] * len(graph.nodes)  # contains the constants
+        self.inputs: list[tuple[int, int, int, int]] = []  # node; argument, element, number of elements of the argument
         self.steps: list[tuple[int, Callable[..., Any], tuple[int, ...]]] = []
         for k in needed(graph.nodes, self.outputs):
             operation, operands, dtype = graph.nodes[k]
@@ -51,11 +51,12 @@ class NumPyProgram:
             else:
                 function = np.dtype(dtype).type if operation == "convert" else _FUNCTIONS[operation]
                 self.steps.append((k, function, operands))
+        self.reads = sorted({argument for _, argument, *_ in self.inputs})
 
     def __call__(self, args: Sequence[Any], lanes: tuple[int, ...] = ()) -> list[np.ndarray]:
-        """The outputs; with `lanes`, along a last axis that some of the arguments have."""
+        """The outputs. `lanes`: the last axis that some of the arguments have."""
         values = self.start.copy()
-        rows = [np.asarray(x) for x in args]
+        rows = {i: np.asarray(args[i]) for i in self.reads}  # a model has hundreds of parameters, and each takes 1 us
         for k, argument, element, size in self.inputs:
             row = rows[argument]
             values[k] = row.flat[element] if row.size == size else row.reshape((size, *lanes))[element]

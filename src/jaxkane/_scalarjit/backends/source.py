@@ -1,7 +1,7 @@
-"""Graphs of scalars in another language: as objects of a library, or as lines of source. Knows no language itself.
+"""Graphs of scalars in another language: as objects of a library, or as lines of source. Independent of the language.
 
-A language is a table of the operations that graphs have (`graph.py`): of functions, for objects; of `Form`s, for text.
-What a table lacks is refused by name.
+A language is a table of the operations of graphs (`graph.py`): of functions, for objects; of `Form`s, for text. An
+operation that a table lacks is refused by name.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..graph import Graph, Node, NotScalarError, needed, reads
 
 Table = Mapping[str, Callable[..., Any]]
 Constant = Callable[[Any, str], Any]
-"""A number and its dtype -> what stands for it."""
+"""(a number, its dtype) -> its representation."""
 
 
 def as_objects(
@@ -28,10 +28,16 @@ def as_objects(
     language: str,
     named: Callable[[int, Any], Any] = lambda k, x: x,
 ) -> dict[int, Any]:
-    """Nodes, each after those that it reads, as objects of a library.
+    """Nodes as objects of a library.
 
-    `objects`: those of inputs, and of other nodes that are not to be opened. `named` may put another object, such as a
-    name, in the place of the one that was made for a node.
+    **Arguments:**
+
+    - `graph`, `nodes`: the graph, and nodes in an order in which each follows those that it uses.
+    - `objects`: those of inputs, and of other nodes that should not be expanded.
+    - `table`: functions by operation.
+    - `constant`: (number, dtype) -> object.
+    - `language`: its name, for messages.
+    - `named`: (node, object) -> the object to use instead, e.g. a name.
     """
     made: dict[int, Any] = {}
     for k in nodes:
@@ -48,12 +54,12 @@ def as_objects(
 
 def operation_in(table: Mapping[str, Any], node: Node, language: str) -> Any:
     if node.operation not in table:
-        raise NotScalarError(f"`{node.operation}` of {node.dtype}, which {language} has not")
+        raise NotScalarError(f"`{node.operation}` of {node.dtype}, which {language} does not have")
     return table[node.operation]
 
 
 def uses(graph: Graph, nodes: Sequence[int], outputs: Iterable[np.ndarray]) -> dict[int, int]:
-    """How often each node is read, by other nodes and by outputs."""
+    """How often each node is used, by other nodes and by outputs."""
     count = dict.fromkeys(nodes, 0)
     for k in nodes:
         for i in reads(graph.nodes[k]):
@@ -66,14 +72,17 @@ def uses(graph: Graph, nodes: Sequence[int], outputs: Iterable[np.ndarray]) -> d
 
 
 def count_operations(graph: Graph, outputs: Sequence[np.ndarray]) -> int:
-    """Scalar operations, each counted once however often its result is read."""
+    """The number of scalar operations; each counts once, however often its result is used."""
     return sum(graph.nodes[k].operation not in ("input", "constant") for k in needed(graph.nodes, outputs))
 
 
 class Form(NamedTuple):
-    """How an operation is written: `text` with places {0}, {1} for the operands, {s} for the suffix of the result's
-    type and {type} for the type itself; how tightly it binds; and how tightly each operand must, not to need
-    parentheses."""
+    """The form of an operation in a language.
+
+    - `text`: with {0}, {1} for the operands, {s} for the suffix of the result's type and {type} for the type itself.
+    - `binds`: how tightly it binds.
+    - `operands`: how tightly each operand must bind to need no parentheses.
+    """
 
     text: str
     binds: int
@@ -81,7 +90,7 @@ class Form(NamedTuple):
 
 
 LOOSE, COMPARED, SUM, PRODUCT, SIGNED, TIGHT = range(6)
-"""How tightly forms bind. Sums and products are grouped from the left, as every language reads them."""
+"""How tightly forms bind. Sums and products are grouped from the left, as in every language."""
 
 ARITHMETIC = {
     "add": Form("{0} + {1}", SUM, (SUM, PRODUCT)),
@@ -103,8 +112,13 @@ def call(function: str, n: int = 1) -> Form:
 
 @dataclasses.dataclass(frozen=True)
 class Language:
-    """`forms` by operation; `constant` writes a number, `declared` a line that names one: (name, text, dtype) -> line.
-    `suffix` and `types` stand for {s} and {type} in forms, by dtype."""
+    """A language.
+
+    - `forms`: by operation.
+    - `constant`: (number, dtype) -> text.
+    - `declared`: (name, text, dtype) -> a line that names an expression.
+    - `suffix`, `types`: the texts for {s} and {type} in forms, by dtype.
+    """
 
     name: str
     forms: Mapping[str, Form]
@@ -114,7 +128,7 @@ class Language:
     suffix: Mapping[str, str] = dataclasses.field(default_factory=lambda: {"float64": "", "float32": "", "bool": ""})
 
 
-_WIDE = 70  # characters that are still read at a glance
+_WIDE = 70  # characters; longer expressions get a line of their own
 
 
 def as_source(
@@ -122,7 +136,7 @@ def as_source(
 ) -> tuple[list[str], list[list[str]]]:
     """The lines before the outputs, and the outputs' elements as expressions.
 
-    What is read more than once, or would be long, has a line and a name of its own; `names` are those of inputs.
+    An expression that is used more than once, or is long, has its own line and name. `names` are those of inputs.
     """
     nodes = needed(graph.nodes, outputs)
     count = uses(graph, nodes, outputs)

@@ -1,18 +1,18 @@
 """A program as one function of XLA.
 
-XLA cuts a program of scalars into many kernels, and repeats in each what several divisions read: two thousand
-operations become eight thousand. There are two ways around that. XLA does not cut the function by which
-`reduce_window` combines the elements of a window: a program is that function, for windows of one element, the members
-of a batch (`Windows`). And a call that carries the frontend attribute `xla_cpu_small_call` is compiled as one function
+XLA splits a program of scalars into many kernels, and repeats in each kernel the operations that several kernels need:
+two thousand operations become eight thousand. Two methods avoid this. XLA does not split the function by which
+`reduce_window` combines the elements of a window. A program can be this function, with windows of one element, the
+members of a batch (`Windows`). And a call with the frontend attribute `xla_cpu_small_call` is compiled as one function
 (`as_one_function`).
 
 Measured on the nonlinear bicycle (jax 0.12), as small calls and as windows: compilation 0.43 and 0.26 s; 0.35 and 0.22
-us an evaluation; in a batch of 128, 0.72 and 0.22 us. Its derivative along 27 directions, in a loop: 5.8 and 1.5 s; 6.5
-and 12.7 us. Whatever is executed with windows in it takes 0.1 us longer for each of their operations, once and not in
-each step of a loop.
+us for an evaluation; in a batch of 128, 0.72 and 0.22 us. Its derivative along 27 directions, in a loop: 5.8 and 1.5 s;
+6.5 and 12.7 us. An executed program with windows takes 0.1 us longer for each of their operations, once and not in each
+step of a loop.
 
-XLA:GPU compiles windows too (jax 0.11, H200): 65 536 rides of the bicycle first take 4.8 s instead of 9.6, and then
-97 ms instead of 125. A derivative of 4700 operations did not compile within a minute.
+XLA:GPU compiles windows too (jax 0.11, H200): the first run of 65 536 simulations of the bicycle takes 4.8 s instead of
+9.6, later runs 97 ms instead of 125. A derivative of 4700 operations did not compile within a minute.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..compat import ClosedJaxpr, jaxpr_as_fun, one_function
 from ..graph import ARITHMETIC, COMPARISONS, DTYPES, LIBRARY, LOGIC, SIMPLE, NotScalarError, graph_of, needed
@@ -37,13 +38,13 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
 }
 
 
-_SHORT = 1000  # equations: without a batch, the arrays that windows take cost a shorter program more than XLA's cuts
+_SHORT = 1000  # equations: without a batch, the arrays of windows cost a shorter program more than XLA's splitting
 _LONG = 3000  # nodes: outside of loops, XLA computes a longer program several times, unless it is one function
-_MOST_LANES = 128  # with more, intermediates no longer stay in the cache
+_MOST_LANES = 128  # with more, intermediate results no longer fit in the cache
 
 
 class Windows:
-    """A program of scalars as the function that combines windows. Raises `NotScalarError` for any other."""
+    """A program of scalars as the function that combines windows. **Raises:** `NotScalarError` for other programs."""
 
     def __init__(self, program: ClosedJaxpr):
         self.graph, self.outputs = graph_of(program)
@@ -53,7 +54,7 @@ class Windows:
         self.order = needed(nodes, self.outputs)
         inputs = [k for k in self.order if nodes[k].operation == "input"]
         results = [*dict.fromkeys(int(k) for array in self.outputs for k in array.flat)]
-        # Input, result and type of each element: what is combined keeps its type.
+        # Input, result and type of each element. Combined elements keep their type.
         self.elements: list[tuple[int | None, int | None, str]] = []
         for dtype in DTYPES:
             of_type = ([k for k in group if nodes[k].dtype == dtype] for group in (inputs, results))
@@ -63,20 +64,31 @@ class Windows:
         self,
         args: Sequence[Any],
         sizes: tuple[int, ...],
-        where: Sequence[Sequence[bool]],
-        out_where: Sequence[Sequence[bool]],
+        batch_mask: Sequence[Sequence[bool]],
+        out_batch_mask: Sequence[Sequence[bool]],
     ) -> list[Any]:
-        """The results over a batch with leading axes `sizes`, of which argument i has those in `where[i]`, and result j
-        those in `out_where[j]`. What all members share is computed for each of them, since that compiles sooner.
+        """The results over a batch.
+
+        **Arguments:**
+
+        - `args`: the arguments.
+        - `sizes`: of the leading axes.
+        - `batch_mask`, `out_batch_mask`: for each argument and each result, which of these axes it has.
+
+        Values that all members share are computed for each member, because this compiles faster.
         """
         shape, rows = sizes or (1,), []
-        for x, has in zip(jax.lax.optimization_barrier([*args]), where, strict=True):  # which hides constants
-            own = x.shape[sum(has) :]
-            x = x.reshape(*(n if is_there else 1 for n, is_there in zip(sizes, has, strict=True)), *own)
+        # the barrier hides constants from XLA
+        for x, mask in zip(jax.lax.optimization_barrier([*args]), batch_mask, strict=True):
+            own = x.shape[sum(mask) :]
+            x = x.reshape(*(n if is_there else 1 for n, is_there in zip(sizes, mask, strict=True)), *own)
             rows.append(jnp.broadcast_to(x, (*sizes, *own)).reshape(*shape, math.prod(own)))
         elements = [self._element(rows, shape, k, dtype) for k, _, dtype in self.elements]
         starts, ones = tuple(np.zeros((), dtype)[()] for *_, dtype in self.elements), (1,) * len(shape)
-        combine = lambda *xs: jax.lax.reduce_window(xs, starts, self._combined, ones, ones, "VALID")  # noqa: E731
+
+        def combine(*xs: Any) -> Sequence[Array]:
+            return jax.lax.reduce_window(xs, starts, self._combined, ones, ones, "VALID")
+
         if self.is_long:
             with one_function():
                 combined = jax.jit(combine)(*elements)
@@ -86,15 +98,15 @@ class Windows:
         stacked = [jnp.stack([results[int(k)] for k in array.flat], axis=-1) for array in self.outputs]
         whole = [x.reshape(*sizes, *array.shape) for x, array in zip(stacked, self.outputs, strict=True)]
         return [
-            x[tuple(slice(None) if is_there else 0 for is_there in has)]
-            for x, has in zip(whole, out_where, strict=True)
+            x[tuple(slice(None) if is_there else 0 for is_there in mask)]
+            for x, mask in zip(whole, out_batch_mask, strict=True)
         ]
 
     @property
     def is_long(self) -> bool:
         return len(self.order) > _LONG
 
-    def _element(self, rows: Sequence[Any], shape: tuple[int, ...], node: int | None, dtype: str) -> Any:
+    def _element(self, rows: Sequence[Any], shape: tuple[int, ...], node: int | None, dtype: str) -> Array:
         if node is None:
             return jnp.zeros(shape, dtype)
         argument, element, _ = self.graph.nodes[node].operands
@@ -114,12 +126,12 @@ class Windows:
 
 
 def pays_as_windows(program: ClosedJaxpr, sizes: tuple[int, ...]) -> bool:
-    """Whether windows are the faster way."""
+    """Whether windows are faster."""
     return (0 if sizes else _SHORT) <= len(program.jaxpr.eqns) and 0 not in sizes
 
 
 def chunks_of(sizes: tuple[int, ...]) -> tuple[int, ...]:
-    """The sizes of the chunks in which a large batch is evaluated, some of its first axis at a time; () for others."""
+    """The sizes of the chunks along the first axis in which a large batch is evaluated; () if it is not split."""
     if math.prod(sizes) <= _MOST_LANES or sizes[0] == 1:
         return ()
     return (max(1, min(sizes[0], _MOST_LANES // math.prod(sizes[1:]))), *sizes[1:])
@@ -133,26 +145,32 @@ def one_chunk_at_a_time(
     in_batch: Sequence[bool],
     out_in_batch: Sequence[bool],
 ) -> list[Any]:
-    """`f` of a batch, in chunks of this size; the last one begins earlier, so that all are alike.
+    """`f` over a batch, in chunks of this size. The last chunk begins earlier, so that all have the same size.
 
-    **Arguments:** the types of the `outputs`; which arguments and outputs have the axis of the batch.
+    **Arguments:**
+
+    - `f`: the function.
+    - `args`: the arguments.
+    - `outputs`: types of the results.
+    - `size`: of a chunk.
+    - `in_batch`, `out_in_batch`: which arguments and results have the axis of the batch.
     """
     n = next(x.shape[0] for x, is_in in zip(args, in_batch, strict=True) if is_in)
 
     def chunk(i: Any, outputs: list[Any]) -> list[Any]:
         start = jnp.minimum(i * size, n - size)
-        part = [jax.lax.dynamic_slice_in_dim(x, start, size) if b else x for x, b in zip(args, in_batch, strict=True)]
+        slices = [jax.lax.dynamic_slice_in_dim(x, start, size) if b else x for x, b in zip(args, in_batch, strict=True)]
         put = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=start, axis=0)
-        each = zip(outputs, f(*part), out_in_batch, strict=True)
+        each = zip(outputs, f(*slices), out_in_batch, strict=True)
         return [put(whole, piece) if is_in else piece for whole, piece, is_in in each]
 
     return jax.lax.fori_loop(0, -(-n // size), chunk, [jnp.zeros(a.shape, a.dtype) for a in outputs])
 
 
 def as_one_function(program: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
-    """The results of a program, compiled as one function."""
-    # XLA aborts on a parameter that its simplified program no longer reads. The sum reads them all, and the barrier
-    # hides constant arguments, which XLA would write into the program in the parameter's stead.
+    """The results of a program that is compiled as one function."""
+    # XLA aborts on a parameter that its simplified program no longer uses. The sum uses all of them. The barrier hides
+    # constant arguments, which XLA would otherwise substitute for the parameter.
     places = [i for i, x in enumerate(args) if x.size]
 
     def values_and_sum(*some):

@@ -1,0 +1,321 @@
+"""The integration loop: the steps of `diffrax.diffeqsolve`, compiled in half the time, or `diffeqsolve` itself.
+
+This is the only file that uses `equinox.internal`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._scalarjit.nan import constant
+from .discontinuities import rounding
+from .settings import with_scan_kind
+from .solvers import rates_at_ends
+from .status import Status
+from .step_control import ControllerState, StepSizeController, almost
+
+# How the loop of equinox is differentiated, by adjoint.
+_KINDS: dict[type, str] = {
+    diffrax.ForwardMode: "lax",
+    diffrax.RecursiveCheckpointAdjoint: "checkpointed",
+    diffrax.DirectAdjoint: "bounded",
+}
+
+
+class JumpRecord(NamedTuple):
+    """The jumps of a simulation, at most m; entries from `count` on are unused.
+
+    Fields: their times `t` (m,) since the start [s], their `events` (m,) as floats, the packed states `before` and
+    `after` them (m, n), whether all of this is a `smooth` (m,) function of the arguments, and their number `count`.
+    """
+
+    t: Array
+    events: Array
+    before: Array
+    after: Array
+    smooth: Array
+    count: Array
+
+    @classmethod
+    def empty(cls, m: int, y: Array) -> JumpRecord:
+        times, states = jnp.zeros(m, y.dtype), jnp.zeros((m, *y.shape), y.dtype)
+        return cls(times, times, states, states, times, jnp.zeros((), int))
+
+    @property
+    def buffers(self) -> list[Array]:
+        return [self.t, self.events, self.before, self.after, self.smooth]
+
+    def with_(self, *values: Array) -> JumpRecord:
+        """The record with one more jump: the values of its fields."""
+        # JAX drops a row that does not fit.
+        rows = [x.at[self.count].set(value) for x, value in zip(self.buffers, values, strict=True)]
+        return JumpRecord._make([*rows, jnp.minimum(self.count + 1, self.t.shape[0])])
+
+
+class Jump(NamedTuple):
+    """A jump of the state: its time `t` [s], the packed states `before` and `after` it, whether it is `smooth`, and
+    whether it `is_possible`."""
+
+    t: Array
+    before: Array
+    after: Array
+    smooth: Array
+    is_possible: Array
+
+
+class Jumps(NamedTuple):
+    """How the loop treats jumps: `jump` (t, y, event, reach) -> `Jump`, from a time near the event; and the largest
+    number of jumps `most`."""
+
+    jump: Callable[[Array, Array, Array, Array], Jump]
+    most: int
+
+
+class Steps(NamedTuple):
+    """The result of a loop.
+
+    Fields:
+
+    - `motion` (n_t, n): packed states at the requested times. `reached` (n_t,): whether the steps reached each of them.
+    - `t`, `y`: time since the start [s] and packed state where the steps end. `rates` (n,): the rates there, None if
+      the solver does not evaluate them.
+    - `state`: the state of the controller.
+    - `taken`, `accepted`: numbers of steps.
+    - `jumps`: the jumps, or None if no event changes the state.
+    """
+
+    motion: Array
+    reached: Array
+    t: Array
+    y: Array
+    rates: Array | None
+    state: ControllerState
+    taken: Array
+    accepted: Array
+    jumps: JumpRecord | None = None
+
+
+class Carry(NamedTuple):
+    """The loop-carried values of the fast loop.
+
+    Fields:
+
+    - `t0`, `t1`: start and end of the next step [s].
+    - `y`, `rates`: the packed state at the start, and its rates; None if they are not needed.
+    - `solver_state`, `controller_state`: as in diffrax.
+    - `made_jump`: whether the step begins at a discontinuity.
+    - `running`: whether the steps continue.
+    - `steps` (2,): numbers of steps, taken and accepted.
+    - `motion` (n_t, n), `count`: the saved states, and their number.
+    - `jumps`: the jumps so far, or None.
+    """
+
+    t0: Array
+    t1: Array
+    y: Array
+    rates: Array | None
+    solver_state: Any
+    controller_state: Any
+    made_jump: Any
+    running: Array
+    steps: Array
+    motion: Array
+    count: Array
+    jumps: JumpRecord | None
+
+
+class AtJump(NamedTuple):
+    """What a jump changes. Fields as in `Carry`; `t`: the time of the jump, infinity if none is due."""
+
+    is_due: Array
+    t: Array
+    t1: Array
+    y: Array
+    rates: Array | None
+    solver_state: Any
+    controller_state: Any
+    running: Array
+    jumps: JumpRecord
+
+
+def is_supported(solver: Any, controller: StepSizeController, adjoint: Any, progress: bool) -> bool:
+    """Whether the fast loop takes these steps."""
+    return type(adjoint) in _KINDS and solver.term_structure is diffrax.AbstractTerm and not (
+        progress or controller.inner
+    )  # fmt: skip
+
+
+def fast_loop(
+    rates: Callable[..., Array],
+    solver: Any,
+    controller: StepSizeController,
+    y0: Array,
+    args: Any,
+    ts: Array,
+    adjoint: Any,
+    max_steps: int | None,
+    may_begin: Array,
+    jumps: Jumps | None,
+) -> Steps:
+    """The steps of `diffeqsolve`, to the last digit. No steps are taken unless the simulation `may_begin`."""
+    kind = _KINDS[type(adjoint)]
+    checkpoints = getattr(adjoint, "checkpoints", None)
+    kind = "lax" if max_steps is None and checkpoints is None else kind
+    solver = solver if kind == "checkpointed" else with_scan_kind(solver, kind)
+    term = diffrax.ODETerm(rates)  # pyright: ignore[reportArgumentType]
+    start, order = jnp.zeros_like(controller.duration), solver.error_order(term)
+    end, state = controller.init(term, start, controller.duration, y0, None, args, solver.func, order)
+    needs_rates = bool(controller.events.names) and rates_at_ends(solver)
+    restart = controller.discontinuities is not None and controller.discontinuities.restart
+    carry = Carry(
+        start, end, y0, jnp.zeros_like(y0) if needs_rates else None, solver.init(term, start, end, y0, args), state,
+        jnp.array(False) if restart else None, may_begin, jnp.zeros(2, int), jnp.zeros((len(ts), *y0.shape), y0.dtype),
+        jnp.zeros((), int), None if jumps is None else JumpRecord.empty(jumps.most, y0),
+    )  # fmt: skip
+    n_events = len(controller.events.names)
+
+    def step(c: Carry) -> Carry:
+        # False must be a Python constant here: as an array, the loop would carry it and evaluate both cases.
+        jump = c.made_jump if restart else False
+        y1, error, dense, solver_state, result = solver.step(term, c.t0, c.t1, c.y, args, c.solver_state, jump)
+        if not getattr(solver, "always_succeeds", False):
+            failed = result != diffrax.RESULTS.successful
+            y1, error = jax.tree.map(lambda x: jnp.where(failed, jnp.inf, x), (y1, error))
+        keep, t0, t1, jumped, state, ended = controller.adapt_step_size(
+            c.t0, c.t1, c.y, y1, args, error, order, c.controller_state
+        )
+
+        def chosen(new: Any, old: Any) -> Any:
+            return jax.tree.map(functools.partial(jnp.where, keep), new, old)
+
+        k: Any = constant(dense["k"]) if needs_rates else None
+        interpolation = solver.interpolation_cls(t0=c.t0, t1=c.t1, **dense)
+        running, y_next = ended == diffrax.RESULTS.successful, chosen(y1, c.y)
+        rates_next = chosen(k[-1], k[0]) / (c.t1 - c.t0) if needs_rates else None
+        solver_state, record, cut = chosen(solver_state, c.solver_state), c.jumps, None
+        if jumps is not None and c.jumps is not None:
+            # The loop runs once if a jump is due. In a batch it runs if a jump is due in any member: a condition would
+            # be evaluated in every step.
+            base = AtJump(
+                ControllerState.unpacked(state[0], n_events).jump >= 0, jnp.full_like(t1, jnp.inf), t1, y_next,
+                rates_next, solver_state, state, running, c.jumps,
+            )  # fmt: skip
+
+            def jumped_at(a: AtJump, jumps: Jumps = jumps) -> AtJump:
+                now, start = ControllerState.unpacked(a.controller_state[0], n_events), jnp.where(keep, c.t1, c.t0)
+                jump, fits = jumps.jump(start, a.y, now.jump, now.reach), a.jumps.count < jumps.most
+                # A state that is not finite must not reach the solver.
+                jump = jump._replace(after=jnp.where(fits & jump.is_possible, jump.after, jump.before))
+                end, changed = controller.after_jump(a.controller_state, jump.t, jump.after, args)
+                restarted = solver.init(term, jump.t, end, jump.after, args)
+                after = ControllerState.unpacked(changed[0], n_events)
+                status = jnp.where(jump.is_possible, after.status, float(Status.IMPOSSIBLE_JUMP))
+                status = jnp.where(fits, status, float(Status.MAX_JUMPS))
+                changed = (changed[0].at[0].set(status), changed[1])
+                # The step may have ended at the duration, within the resolution after the jump.
+                is_last = jump.t >= almost(controller.duration)
+                goes_on = (status == float(Status.COMPLETED)) & ~is_last
+                begin = jnp.where(is_last, controller.duration, jump.t)
+                record = a.jumps.with_(jump.t, now.jump, jump.before, jump.after, jump.smooth)
+                rates_after = None if a.rates is None else jnp.zeros_like(a.rates)
+                return AtJump(
+                    jnp.zeros_like(a.is_due), begin, end, jump.after, rates_after, restarted, changed, goes_on, record
+                )
+
+            after = loop(lambda a: a.is_due, jumped_at, base, 1, 1, lambda a: a.jumps.buffers)
+            t0, cut = jnp.where(base.is_due, after.t, t0), constant(after.t)
+            cut = cut - 16 * rounding(jnp.where(base.is_due, cut, 0.0), controller.duration)
+            t1, y_next, rates_next, solver_state, state = (
+                after.t1, after.y, after.rates, after.solver_state, after.controller_state
+            )  # fmt: skip
+            running, record = after.running, after.jumps
+
+        def is_due(kept: tuple[Array, Array]) -> Array:
+            due = keep & (kept[1] < len(ts)) & (ts[kept[1]] <= c.t1)
+            # A sample at the time of a jump gets the state after it.
+            return due if cut is None else due & (ts[kept[1]] < cut)
+
+        def sampled(kept: tuple[Array, Array]) -> tuple[Array, Array]:
+            return kept[0].at[kept[1]].set(interpolation.evaluate(ts[kept[1]])), kept[1] + 1
+
+        motion, count = loop(is_due, sampled, (c.motion, c.count), len(ts), len(ts), lambda kept: kept[0])
+        steps = c.steps + jnp.stack([jnp.ones_like(count), keep.astype(count.dtype)])
+        return Carry(
+            t0, t1, y_next, rates_next, solver_state, state, chosen(jumped, c.made_jump) if restart else None,
+            running if max_steps is None else running & (steps[0] < max_steps), steps, motion, count, record,
+        )  # fmt: skip
+
+    loop = functools.partial(_while_loop, kind)
+
+    def buffers(c: Carry) -> Any:
+        # Not `c.jumps is None`: equinox calls this with wrapped leaves.
+        return [c.motion, *(() if jumps is None else c.jumps.buffers)]  # pyright: ignore[reportOptionalMemberAccess]
+
+    last = loop(lambda c: c.running, step, carry, max_steps, checkpoints, buffers)
+    reached = jnp.arange(len(ts)) < last.count
+    state = ControllerState.unpacked(last.controller_state[0], n_events)
+    return Steps(last.motion, reached, last.t0, last.y, last.rates, state, last.steps[0], last.steps[1], last.jumps)
+
+
+def diffrax_loop(
+    rates: Callable[..., Array],
+    solver: Any,
+    controller: StepSizeController,
+    y0: Array,
+    args: Any,
+    ts: Array,
+    adjoint: Any,
+    max_steps: int | None,
+    may_begin: Array,
+    progress: bool,
+) -> Steps:
+    """The same steps by `diffrax.diffeqsolve`, with all of its features.
+
+    For an implicit-explicit solver, all equations are implicit.
+    """
+    term: Any = diffrax.ODETerm(rates)  # pyright: ignore[reportArgumentType]
+    if solver.term_structure is not diffrax.AbstractTerm:
+        term = diffrax.MultiTerm(diffrax.ODETerm(lambda t, y, args: jnp.zeros_like(y)), term)
+    start, order = jnp.zeros_like(controller.duration), solver.error_order(term)
+    _, (state, inner) = controller.init(term, start, controller.duration, y0, None, args, solver.func, order)
+    # If the initial check failed, the simulation ends after its first step.
+    state = state.at[0].set(jnp.where(may_begin, state[0], float(Status.INVALID)))
+    whole = not isinstance(adjoint, diffrax.BacksolveAdjoint)  # BacksolveAdjoint can save states at given times only
+    saveat = diffrax.SaveAt(ts=ts)
+    if whole:
+        subs = [diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)]
+        saveat = diffrax.SaveAt(subs=subs, controller_state=True)
+    solution: Any = diffrax.diffeqsolve(
+        term, solver, start, controller.duration, None, y0, args, saveat=saveat, stepsize_controller=controller,
+        adjoint=adjoint, max_steps=max_steps, throw=False, controller_state=(state, inner),
+        progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
+    )  # fmt: skip
+    stats = (solution.stats["num_steps"], solution.stats["num_accepted_steps"])
+    if whole:
+        (kept_at, last_at), (motion, last) = solution.ts, solution.ys
+        state = ControllerState.unpacked(solution.controller_state[0], len(controller.events.names))
+        return Steps(motion, jnp.isfinite(kept_at), last_at[0], last[0], None, state, *stats)
+    reached = jnp.isfinite(solution.ts)
+    i = jnp.maximum(jnp.sum(reached) - 1, 0)
+    long = solution.result == diffrax.RESULTS.max_steps_reached
+    early = jnp.where(long, float(Status.MAX_STEPS), float(Status.STEP_TOO_SMALL))
+    status = jnp.where(reached[-1], state[0], early)
+    state = ControllerState.unpacked(state, len(controller.events.names))._replace(status=status)
+    return Steps(solution.ys, reached, ts[i], solution.ys[i], None, state, *stats)
+
+
+def _while_loop(
+    kind: Any, condition: Any, body: Any, carry: Any, max_steps: int | None, checkpoints: int | None, buffers: Any
+) -> Any:
+    """The loop of diffrax. It counts its steps if the derivative requires it."""
+    more: dict[str, Any] = {} if kind == "lax" else {"max_steps": max_steps}
+    more |= {"checkpoints": checkpoints} if kind == "checkpointed" else {}
+    return eqxi.while_loop(condition, body, carry, buffers=buffers, kind=kind, **more)

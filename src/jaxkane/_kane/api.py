@@ -1,0 +1,270 @@
+"""The public functions of Kane's method, which return arrays.
+
+Each function runs as one compiled program (`_scalarjit.scalar_function`), also inside `jax.jit` and for derivatives of
+any order. `KaneEquations` contains the equations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._scalarjit.components import Component, Numbers, as_vector, matvec, stack, sub
+from .._scalarjit.scalar_function import ScalarFunction
+from .._system.motion import kinetic_energy_of
+from .._system.system import System
+from .arguments import (
+    as_array,
+    as_row,
+    check_is_system,
+    check_time,
+    checked_values,
+    is_concrete,
+    refuse_incomplete,
+)
+from .checks import check_system
+from .constraint_residuals import check_left_out
+from .diagnosis import diagnosis
+from .kanes_method import KaneEquations, as_one_program, motion_rates, rates_and_equations
+
+InputValues = Mapping[str, Component] | None
+
+
+def checked_arrays(system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None):
+    """Check the arguments of a public function and return them as arrays of one dtype."""
+    check_is_system(system)
+    name = type(system).__name__
+    refuse_incomplete(system, q, u)
+    left_out = [c for c in system.coordinates if c not in q] if isinstance(q, Mapping) else []
+    q = as_array(q, system.coordinates, f"{name}: q")
+    u = as_array(u, system.speeds, f"{name}: u")
+    check_time(name, t)
+    t = jnp.asarray(t, dtype=q.dtype)
+    checked_values(system, inputs)
+    if left_out:
+        q = check_left_out(system, t, q, left_out)
+    check_system(system, t, q)
+    return system, t, q, u, {name: jnp.asarray(x, dtype=q.dtype) for name, x in (inputs or {}).items()}
+
+
+def equations_of_motion(
+    system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None
+) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    """The generalized mass matrix M and the right side f of Kane's equations M u_dot = f.
+
+    **Arguments:**
+
+    - `system`: a `System`.
+    - `t`: time [s].
+    - `q`: coordinates (n_q,), or a dict by name. They must satisfy the configuration constraints (see `assemble`).
+    - `u`: independent speeds (n,), or a dict by name.
+    - `inputs`: a dict of numbers by name. Omitted inputs are zero.
+
+    **Returns:** M (n, n) and f (n,).
+
+    **Raises:** `ValueError` for wrong shapes and for an unknown input. Also if the numbers of velocity residuals and
+    dependent speeds differ, or if the methods of the system contradict each other.
+    """
+    arrays = checked_arrays(system, t, q, u, inputs)
+    return as_one_program(rates_and_equations, system)(*arrays)[1:]
+
+
+def accelerations(
+    system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None
+) -> Float[Array, " n"]:
+    """u_dot (n,) = M^-1 f: time derivatives of the independent speeds. Arguments as `equations_of_motion`.
+
+    **Raises:** `ValueError` as `equations_of_motion`. Also if the equations of motion have no solution: for example, if
+    a speed moves no mass, or if the constraints cannot be solved for the dependent speeds. If the arguments are traced,
+    the result is NaN or infinite instead.
+    """
+    arrays = checked_arrays(system, t, q, u, inputs)
+    return finite_or_explained(as_one_program(motion_rates, system)(*arrays)[1], arrays)
+
+
+def finite_or_explained(result: PyTree, arrays: PyTree) -> PyTree:
+    """Return `result` unchanged, or explain why it is not finite.
+
+    **Arguments:**
+
+    - `result`: numbers that were computed from `arrays`. A traced result is returned unchanged.
+    - `arrays`: the checked arguments, as `checked_arrays` returns them.
+
+    **Raises:** `ValueError` if the result is not finite and `diagnosis` finds the reason.
+    """
+    numbers = jax.tree.leaves(result)
+    if is_concrete(*numbers) and not all(np.all(np.isfinite(x)) for x in numbers):
+        wrong = diagnosis(*arrays)
+        if wrong:
+            raise ValueError(wrong)
+    return result
+
+
+def mass_matrix(
+    system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None
+) -> Float[Array, "n n"]:
+    """The generalized mass matrix M (n, n) of the independent speeds. Arguments as `equations_of_motion`."""
+    return equations_of_motion(system, t, q, u, inputs)[0]
+
+
+def forcing(system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None) -> Float[Array, " n"]:
+    """The right side f (n,) of M u_dot = f. Arguments as `equations_of_motion`."""
+    return equations_of_motion(system, t, q, u, inputs)[1]
+
+
+def partial_velocities(
+    system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None
+) -> tuple[Float[Array, "b 3 n"], Float[Array, "b 3 n"]]:
+    """Partial velocities V (b, 3, n) of the mass centres and partial angular velocities W (b, 3, n) of the b bodies.
+
+    Components are in N. The dependent speeds are eliminated, so the columns belong to the n independent speeds.
+    Arguments as `equations_of_motion`.
+    """
+    return _partial_velocities(*checked_arrays(system, t, q, u, inputs))
+
+
+@ScalarFunction
+def _partial_velocities(system, t, q, u, inputs):
+    kane = KaneEquations(system, t, q, u, inputs)
+    motion, partials = kane.motion(kane.t, kane.q, kane.u_all), kane.partial_velocities()
+    V, W = [], []
+    for i, body in enumerate(motion.bodies):
+        for columns, j, frame in ((V, 0, body.center.velocity.frame), (W, 1, body.frame)):
+            vectors = [frame.vector(*bodies[i][j]).components_in(motion.N) for bodies, _ in partials]
+            columns.append(stack(vectors).astype(q.dtype).T)
+    return jnp.stack(V), jnp.stack(W)
+
+
+def generalized_active_forces(
+    system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None
+) -> Float[Array, " n"]:
+    """Generalized active forces F_r (n,): the sum of F . V_r + T . W_r over all loads.
+
+    Arguments as `equations_of_motion`.
+    """
+    return _generalized_active_forces(*checked_arrays(system, t, q, u, inputs))
+
+
+@ScalarFunction
+def _generalized_active_forces(system, t, q, u, inputs):
+    kane = KaneEquations(system, t, q, u, inputs)
+    return as_vector(kane.active_forces(kane.partial_velocities()), q)
+
+
+def generalized_inertia_forces(
+    system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None, *, u_dot: Numbers = None
+) -> Float[Array, " n"]:
+    """Generalized inertia forces F*_r (n,): minus the sum of V_r . dp/dt + W_r . dH/dt over all bodies.
+
+    Kane's equations are F_r + F*_r = 0, with F_r from `generalized_active_forces` and `u_dot=accelerations(...)`.
+
+    **Arguments:** as `equations_of_motion`, and
+
+    - `u_dot`: accelerations (n,), or a dict by name. The default is zero.
+    """
+    arrays = checked_arrays(system, t, q, u, inputs)
+    if u_dot is not None:
+        u_dot = as_array(u_dot, system.speeds, f"{type(system).__name__}: u_dot")
+    return _generalized_inertia_forces(*arrays, u_dot)
+
+
+@ScalarFunction
+def _generalized_inertia_forces(system, t, q, u, inputs, u_dot):
+    kane = KaneEquations(system, t, q, u, inputs)
+    partials = kane.partial_velocities()
+    Fr_star = kane.inertia_forces(partials)
+    if u_dot is not None:
+        M_u_dot = matvec(kane.mass_matrix(partials), [u_dot[r] for r in range(kane.n)])
+        Fr_star = [sub(x, y) for x, y in zip(Fr_star, M_u_dot, strict=True)]
+    return as_vector(Fr_star, q)
+
+
+def coordinate_rates(system: System, t: Component, q: Numbers, u: Numbers) -> Float[Array, " n_q"]:
+    """Rates q_dot (n_q,) of all coordinates, for your own integrators and controllers.
+
+    Arguments as `equations_of_motion`, without `inputs`.
+    """
+    return _coordinate_rates(*checked_arrays(system, t, q, u))
+
+
+@ScalarFunction
+def _coordinate_rates(system, t, q, u, inputs):
+    return as_vector(KaneEquations(system, t, q, u).q_dot, q)
+
+
+def dependent_speeds(system: System, t: Component, q: Numbers, u: Numbers) -> Float[Array, " k"]:
+    """Dependent speeds u_dep (k,) from the velocity residuals: C_dep u_dep = -(C_ind u + c0).
+
+    Arguments as `equations_of_motion`, without `inputs`.
+    """
+    return _dependent_speeds(*checked_arrays(system, t, q, u))
+
+
+@ScalarFunction
+def _dependent_speeds(system, t, q, u, inputs):
+    return as_vector(KaneEquations(system, t, q, u).u_dep, q)
+
+
+def dependent_accelerations(
+    system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None
+) -> Float[Array, " k"]:
+    """Dependent accelerations u_dep_dot (k,) = J u_dot - C_dep^-1 (dc/dt at constant speeds).
+
+    Arguments as `equations_of_motion`.
+    """
+    arrays = checked_arrays(system, t, q, u, inputs)
+    u_dot = as_one_program(motion_rates, system)(*arrays)[1]
+    return finite_or_explained(_dependent_accelerations(*arrays, u_dot), arrays)
+
+
+@ScalarFunction
+def _dependent_accelerations(system, t, q, u, inputs, u_dot):
+    kane = KaneEquations(system, t, q, u, inputs)
+    return as_vector(kane.dependent_accelerations(as_row(u_dot, system.speeds, "u_dot")), q)
+
+
+def constraint_jacobian(system: System, t: Component, q: Numbers) -> Float[Array, "k n"]:
+    """The Jacobian J (k, n) = -C_dep^-1 C_ind of the velocity residuals C_ind u + C_dep u_dep + c0.
+
+    With c0 = 0, u_dep = J u. Arguments as `equations_of_motion`, without `u` and `inputs`.
+    """
+    return _constraint_jacobian(*checked_arrays(system, t, q, (0.0,) * len(system.speeds)))
+
+
+@ScalarFunction
+def _constraint_jacobian(system, t, q, u, inputs):
+    return stack(KaneEquations(system, t, q, u).J).astype(q.dtype).T
+
+
+def constraint_jacobian_rate(system: System, t: Component, q: Numbers, u: Numbers) -> Float[Array, "k n"]:
+    """J_dot (k, n), the time derivative of J along the motion.
+
+        J_dot = -C_dep^-1 (C_ind_dot + C_dep_dot J)
+
+    This is the derivative of J(t, q) along (1, q_dot). The textbook prints a minus sign before C_dep_dot (Example 7).
+    Arguments as `equations_of_motion`, without `inputs`.
+    """
+    return _constraint_jacobian_rate(*checked_arrays(system, t, q, u))
+
+
+@ScalarFunction
+def _constraint_jacobian_rate(system, t, q, u, inputs):
+    return stack(KaneEquations(system, t, q, u).J_dot()).astype(q.dtype).T
+
+
+def kinetic_energy(system: System, t: Component, q: Numbers, u: Numbers) -> Float[Array, ""]:
+    """Kinetic energy [J] of all bodies. The dependent speeds are computed from the constraints.
+
+    Arguments as `equations_of_motion`, without `inputs`.
+    """
+    return _kinetic_energy(*checked_arrays(system, t, q, u))
+
+
+@ScalarFunction
+def _kinetic_energy(system, t, q, u, inputs):
+    kane = KaneEquations(system, t, q, u)
+    return as_vector([kinetic_energy_of(kane.motion(kane.t, kane.q, kane.u_all))], q)[0]

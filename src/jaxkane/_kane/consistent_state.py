@@ -1,0 +1,409 @@
+"""Assembly: compute a state that satisfies the configuration constraints, by Newton's method."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Mapping, Sequence
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from .._common.lookup import as_names, refuse_unknown
+from .._scalarjit.cache import Cache
+from .._scalarjit.cache_key import jit
+from .._scalarjit.compat import concretely
+from .._scalarjit.components import Component, Numbers
+from .._scalarjit.nan import nan_where
+from .._system.system import State, System
+from .api import constraint_jacobian, dependent_speeds
+from .arguments import as_array, check_is_system, check_time, is_concrete
+from .checks import check_system
+from .constraint_residuals import (
+    configuration_residual,
+    configuration_tolerance,
+    implied_residual,
+    residual_sizes,
+    scales_along,
+    scales_by_unit,
+    violations,
+)
+from .description import at_random_point, structure_of
+from .scaling import SMALLEST_SIZE
+
+
+class AssemblyProblem(NamedTuple):
+    """Which coordinates are solved for, and the initial guess.
+
+    - `moved`: names of the coordinates that are solved for.
+    - `named`: names of the coordinates that the caller has passed.
+    - `guess`: initial values by name, for omitted coordinates that do not start at zero.
+    - `lenient`: whether a constraint that does not depend on the `moved` coordinates is only checked, not solved.
+    """
+
+    moved: tuple[str, ...]
+    named: tuple[str, ...]
+    guess: dict[str, float]
+    lenient: bool
+
+    @classmethod
+    def of(cls, system: System, q: Numbers, free: Sequence[str] | None = None) -> AssemblyProblem:
+        names = tuple(system.coordinates)
+        named = tuple(q) if isinstance(q, Mapping) else names
+        quaternions = euler_parameters(system) if isinstance(q, Mapping) else []
+        guess = {names[four[3]]: 1.0 for four in quaternions if names[four[3]] not in named}
+        if free is not None:
+            free = as_names(free)
+            refuse_unknown(free, names, f"{type(system).__name__} has no coordinate", "it has")
+            return cls(tuple(c for c in names if c in free), named, guess, lenient=True)
+        left_out = [c for c in names if c not in named]
+        is_named = any(c in named for c in system.dependent_coordinates)
+        # Named dependent coordinates are fixed, and omitted ones are solved for, unless all relevant ones are named.
+        if system.dependent_coordinates and not (left_out and is_named and _reads_any(system, left_out)):
+            return cls(tuple(system.dependent_coordinates), named, guess, lenient=False)
+        if not isinstance(q, Mapping):
+            return cls(names, named, guess, lenient=False)
+        # If the scalar Euler parameter is given, the constraint does not determine the axis of the rotation. Do not
+        # solve for the other three: omitted ones are zero.
+        still = {names[i] for four in quaternions if names[four[3]] in named for i in four}
+        return cls(tuple(c for c in left_out if c not in still), named, guess, lenient=True)
+
+
+_EULER_PARAMETERS = Cache()  # indices of Euler parameters by structure
+
+
+def euler_parameters(system: System) -> list[tuple[int, ...]]:
+    """Indices of each four consecutive coordinates for which a constraint states that their norm is one."""
+    return _EULER_PARAMETERS.get(structure_of(system), lambda: _search_euler_parameters(system))
+
+
+def _search_euler_parameters(system: System) -> list[tuple[int, ...]]:
+    rng = np.random.default_rng(0)
+    probe = rng.uniform(0.2, 0.9, len(system.coordinates)).astype(jnp.result_type(float))
+    with concretely():
+        trial = at_random_point((system, np.zeros((), probe.dtype), probe), rng)
+        values = np.abs(configuration_residual.numpy(*trial))
+    return [
+        (i, i + 1, i + 2, i + 3)
+        for i, square in enumerate(np.convolve(probe**2, np.ones(4), "valid") if len(probe) > 3 else ())
+        if any(np.any(np.abs(values - abs(x)) < 1e-5) for x in (square - 1.0, square**0.5 - 1.0))
+    ]
+
+
+def _reads_any(system: System, names: Sequence[str]) -> bool:
+    """Whether the configuration constraints depend on any of these coordinates, evaluated at a random point."""
+    rng = np.random.default_rng(0)
+    with concretely():
+        system, t, q = at_random_point((system, np.zeros(()), None), rng)
+        along = np.eye(len(q), dtype=q.dtype)[:, [system.coordinates.index(c) for c in names]]
+        return bool(np.any(configuration_residual.numpy_jvp((system, np.asarray(t, q.dtype), q), (None, None, along))))
+
+
+_MAX_STEPS = 64
+
+
+def _iterated(xp: ModuleType, equations: Any, slopes: Any, start: Numbers, solve: Any, loop: Any) -> tuple[Any, Any]:
+    """The root of `equations` and the number of Newton steps. Values and unknowns are scaled to size 1."""
+    eps = float(jnp.finfo(start.dtype).eps)
+
+    def step(carry: Any) -> PyTree:
+        x, last, _, n = carry
+        values = equations(x)
+        dx = solve(slopes(x), values)
+        finite, size = xp.all(xp.isfinite(dx)), xp.max(xp.abs(dx))
+        # Steps that do not become shorter are rounding errors. Near a double root, each step is half the last one.
+        stalls = (size > 0.75 * last) & xp.all(xp.abs(values) <= _met(start.dtype))
+        ends = ~finite | (size <= 8 * eps * (1 + xp.max(xp.abs(x)))) | stalls
+        return xp.where(finite, x - dx, x), size, ends, n + 1
+
+    carry = start, xp.asarray(np.inf, start.dtype), xp.asarray(False), xp.asarray(0)
+    x, _, _, steps = loop(lambda carry: ~carry[2] & (carry[3] < _MAX_STEPS), step, carry)
+    return x, steps
+
+
+def _root_in_numbers(equations: Any, slopes: Any, start: Numbers) -> tuple[Any, Any]:
+    """The root by NumPy, which takes less time than a compilation by XLA."""
+
+    def solve(A: Numbers, b: Numbers) -> Numbers:
+        try:
+            return np.linalg.solve(A, b)
+        except np.linalg.LinAlgError:
+            return np.full_like(b, np.nan)
+
+    def loop(condition: Any, body: Any, carry: Any) -> PyTree:
+        while condition(carry):
+            carry = body(carry)
+        return carry
+
+    return _iterated(np, equations, slopes, start, solve, loop)
+
+
+def _root_under_trace(equations: Any, slopes: Any, start: Numbers) -> tuple[Any, Any]:
+    """The root by JAX, with derivatives of any order by the implicit function theorem."""
+
+    def solve(f: Any, start: Numbers) -> tuple[Any, Any]:
+        x, steps = _iterated(jnp, f, jax.jacfwd(f), start, jnp.linalg.solve, jax.lax.while_loop)
+        return x, steps.astype(x.dtype)  # JAX 0.10 rejects the tangent of an integer
+
+    def solve_linear(f: Any, b: Numbers) -> Numbers:
+        A = jax.jacfwd(f)(jnp.zeros_like(b))
+        # A singular matrix in one member of a batch would give NaN in the derivatives of shared parameters.
+        regular = _singular(jnp, A)[1][-1] > 0
+        return jnp.linalg.solve(jnp.where(regular, A, jnp.eye(len(b), dtype=b.dtype)), b)
+
+    return jax.lax.custom_root(equations, start, solve, solve_linear, has_aux=True)  # type: ignore[return-value]
+
+
+def _singular(xp: ModuleType, A: Numbers) -> tuple[Any, Any]:
+    """U and the singular values of A. NumPy raises an exception for entries that are not finite; replace them by 0."""
+    A = A if xp is np else jax.lax.stop_gradient(A)
+    return tuple(xp.linalg.svd(xp.where(xp.isfinite(A), A, 0.0), full_matrices=True)[:2])  # type: ignore[return-value]
+
+
+def _met(dtype: Any) -> float:
+    """The largest permitted residual after Newton's method, relative to its terms: 4e-10 (float32: 7e-5)."""
+    return float(jnp.finfo(dtype).eps) ** 0.6
+
+
+def _flat(dtype: Any) -> float:
+    """The largest slope that is only a rounding error, for quantities of size 1."""
+    return float(jnp.finfo(dtype).eps) ** 0.9
+
+
+class NewtonResult(NamedTuple):
+    q: Any  # NaN if not converged
+    converged: Any  # the constraints are satisfied and determine the unknown coordinates
+    is_met: Any
+    is_determined: Any
+    remainder: Any  # largest residual
+    implied: Any  # largest residual of the implied constraints
+    steps: Any
+
+
+def newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> NewtonResult:
+    """Newton's method from q0, evaluated by NumPy if no number is traced.
+
+    Residuals are divided by the sizes of their terms. Coordinates are divided by the change that changes a residual by
+    its size. Therefore, no criterion depends on units.
+    """
+    if is_concrete(system, q0, t):
+        system, q0, t = jax.device_get((system, q0, t))
+        with np.errstate(all="ignore"):
+            result = _newton(np, system, q0, t, where, lenient)
+        return result._replace(q=jax.device_put(result.q))
+    return newton_compiled(system, q0, t, where, lenient)
+
+
+@jit
+def newton_compiled(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> NewtonResult:
+    result = _newton(jnp, system, q0, t, where, lenient)
+    return result._replace(q=nan_where(~result.converged, result.q, (system, q0, t)))
+
+
+def _newton(xp: ModuleType, system: System, q0, t, where: tuple[int, ...], lenient: bool) -> NewtonResult:
+    places, dtype = np.array(where, int), q0.dtype
+    # Values that are not finite must not reach the linear solver. It would raise an exception for the whole batch.
+    finite = functools.reduce(operator.and_, [xp.all(xp.isfinite(x)) for x in jax.tree.leaves((system, q0))])
+    system, q0 = jax.tree.map(lambda x: xp.where(finite, x, xp.ones_like(x)), (system, q0))
+    along = np.eye(len(q0), dtype=dtype)[:, places]  # (n_q,moved)
+    root = _root_in_numbers if xp is np else _root_under_trace
+
+    def residuals(q: Numbers) -> Numbers:
+        return configuration_residual.numpy(system, t, q) if xp is np else configuration_residual(system, t, q)
+
+    def slopes(q: Numbers) -> Numbers:
+        if xp is np:
+            return configuration_residual.numpy_jvp((system, t, q), (None, None, along))
+        return jax.jacfwd(lambda dq: residuals(q + along @ dq))(jnp.zeros(len(places), dtype))
+
+    moved, sizes = scales_along(system, t, q0, along.T), residual_sizes(system, t, q0)[0]
+    sizes = xp.where(sizes > 0, sizes, 1.0)
+
+    def scaled_slopes(q: Numbers) -> Numbers:
+        return slopes(q) * moved[None] / sizes[:, None]
+
+    random = q0 + along @ (moved * np.random.default_rng(0).uniform(0.3, 0.7, len(places)).astype(dtype))
+    h, at_guess, at_random = residuals(q0) / sizes, scaled_slopes(q0), scaled_slopes(random)
+    reads = xp.abs(at_random) > _flat(dtype)  # (h,moved)
+    already_met = (xp.abs(h) <= _met(dtype)) & ~xp.any(reads, axis=1) & lenient
+    start = q0 + along @ xp.where(_offset(xp, h, _singular(xp, at_guess), reads), moved, 0.0)
+
+    n_h = len(h)
+    if len(places) == n_h and not lenient:
+        directions = xp.diag(moved)
+    else:  # (h, moved): only along the gradients of the constraints
+        directions = slopes(start) / sizes[:, None] * scales_by_unit(system, t, q0)[places][None] ** 2
+
+    def at(amount: Numbers) -> Numbers:
+        return start + along @ (amount @ directions)
+
+    def equations(amount: Numbers) -> Numbers:
+        return xp.where(already_met, amount, residuals(at(amount)) / sizes)
+
+    def equation_slopes(amount: Numbers) -> Numbers:
+        G = slopes(at(amount)) / sizes[:, None] @ directions.T
+        return xp.where(already_met[:, None], np.eye(n_h, dtype=dtype), G)
+
+    amount, steps = root(equations, equation_slopes, xp.zeros(n_h, dtype))
+    q = at(amount)
+    own, implied = violations(system, t, q)
+    is_met = xp.all(own <= _met(dtype))
+    implied_is_met = xp.all(implied <= configuration_tolerance(dtype))
+    # At a double root, a residual of eps corresponds to a slope of sqrt(eps).
+    smallest = _singular(xp, equation_slopes(amount))[1][-1]
+    is_determined = smallest > 4 * float(jnp.finfo(dtype).eps) ** 0.5
+    converged = finite & is_met & implied_is_met & is_determined
+    remainder, implied = (xp.max(xp.abs(x), initial=0.0) for x in (residuals(q), implied_residual(system, t, q)))
+    return NewtonResult(q, converged, is_met, is_determined, remainder, implied, steps)
+
+
+def _offset(xp: ModuleType, h: Numbers, singular: tuple[Any, Any], reads: Numbers) -> Numbers:
+    """Which coordinates (moved,) are displaced from the initial guess before Newton's method starts.
+
+    If the gradients of the constraints are linearly dependent, no direction may reduce some residuals to first order.
+    Two rods in line are an example. The coordinates on which these residuals depend are then displaced.
+
+    **Arguments:**
+
+    - `h`: relative residuals (h,).
+    - `singular`: U and the singular values of the gradients.
+    - `reads`: on which coordinates each residual depends (h, moved).
+    """
+    U, s = singular
+    unmoved = xp.concatenate([s, xp.zeros(len(h), s.dtype)])[: len(h)] <= _flat(s.dtype)
+    rest = U @ xp.where(unmoved, U.T @ h, 0.0)  # the part of the residuals that no direction reduces to first order
+    return xp.any(reads & (xp.abs(rest) > _met(s.dtype))[:, None], axis=0)
+
+
+class NoConfiguration(ValueError):
+    """The configuration constraints cannot be satisfied, or not from this initial guess."""
+
+
+def assemble(
+    system: System,
+    q: Numbers,
+    u: Numbers = None,
+    x: Numbers = None,
+    *,
+    t: Component = 0.0,
+    free: Sequence[str] | None = None,
+) -> State:
+    """Compute a state that satisfies the constraints.
+
+        h(t, q) = 0
+
+    Newton's method solves for some of the coordinates.
+
+    **Arguments:**
+
+    - `system`: a `System`.
+    - `q`: coordinates (n_q,), or a dict by name. Values in a dict are fixed. Omitted coordinates start at zero, but the
+        last of four Euler parameters starts at one, which is the orientation without rotation. Values of coordinates
+        that are solved for, such as dependent coordinates in an array, are initial guesses.
+    - `u`: independent speeds (n_u,), or a dict by name. Omitted speeds are zero. A dict may also contain dependent
+        speeds, which are compared with the solution of the velocity residuals.
+    - `x`: first-order states (n_x,), or a dict by name. Omitted states are zero.
+    - `t`: time [s], one finite number.
+    - `free`: names of the coordinates that are solved for. The default is `system.dependent_coordinates`. If a dict
+        contains a dependent coordinate, all omitted coordinates are solved for instead. If the dict omits no coordinate
+        that affects the constraints, its dependent coordinates are initial guesses. Without dependent coordinates in
+        the system, the unknowns are the omitted coordinates of a dict, or all coordinates of an array. With more
+        unknowns than constraints, the solution is the nearest to the initial guess along the gradients of the
+        constraints.
+
+    **Returns:** a `State`. It can be differentiated (twice, in both modes) with respect to all numbers, by the implicit
+    function theorem.
+
+    **Raises:** `ValueError` if no such configuration is found, or if given dependent speeds contradict the velocity
+    residuals. If arguments are traced, the coordinates and all their derivatives become NaN instead.
+    """
+    check_is_system(system)
+    name = type(system).__name__
+    check_time(name, t)
+    problem = AssemblyProblem.of(system, q, free)
+    q0 = as_array(problem.guess | dict(q) if isinstance(q, Mapping) else q, system.coordinates, f"{name}: q")
+    u_dep: dict[str, Any] = {}
+    if isinstance(u, Mapping):
+        u_dep = {speed: u[speed] for speed in system.dependent_speeds if speed in u}
+        u = {speed: value for speed, value in u.items() if speed not in u_dep}
+    u0 = as_array({} if u is None else u, system.speeds, f"{name}: u").astype(q0.dtype)
+    if not system.states and x is not None and np.size(x):
+        raise ValueError(f"{name} has no first-order states, got x = {x!r}. Omit x.")
+    x0 = as_array({} if x is None else x, system.states, f"{name}: x").astype(q0.dtype) if system.states else None
+    parts = [y for y in (q0, u0, x0) if y is not None]
+    if is_concrete(parts):
+        names = (*system.coordinates, *system.speeds, *system.states)
+        bad = [n for n, y in zip(names, np.concatenate(parts), strict=True) if not np.isfinite(y)]
+        if bad:
+            raise ValueError(f"{name}: {', '.join(bad)} is not finite.")
+    q0 = _solve_configuration(system, q0, t, problem)
+    if is_concrete(system, q0, u0, t):
+        check_system(system, t, q0)
+        if u_dep:
+            _check_dependent_speeds(system, u_dep, t, q0, u0)
+    return State(q0, u0, x0)
+
+
+def _solve_configuration(system: System, q0, t, problem: AssemblyProblem):
+    t = jnp.asarray(t if isinstance(t, jax.Array) else np.asarray(t, q0.dtype), dtype=q0.dtype)
+    n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
+    if n_h == 0:
+        return q0
+    if len(problem.moved) < n_h:  # e.g. a plane loop that is closed by a Vector, whose third component is always zero
+        problem = problem._replace(lenient=True)
+    places = tuple(system.coordinates.index(c) for c in problem.moved)
+    result = newton(system, q0, t, places, problem.lenient)
+    if is_concrete(system, q0, t) and not bool(result.converged):
+        raise NoConfiguration(_why_not(system, q0, problem, result))
+    return result.q
+
+
+def _why_not(system: System, q0, problem: AssemblyProblem, result: NewtonResult) -> str:
+    name = type(system).__name__
+    moved = ", ".join(problem.moved)
+    fixed = ", ".join(
+        f"{c} = {float(x):.4g}"
+        for c, x in zip(system.coordinates, q0, strict=True)
+        if c not in problem.moved and (x != 0 or (problem.lenient and c in problem.named))
+    )
+    fixed = fixed or "the others zero"
+    hint = " Named values are fixed: omit the unknown coordinates, or pass free=(...)." if problem.lenient else ""
+    if not moved:
+        return (
+            f"{name}: {fixed} does not satisfy the configuration constraints (the largest residual is "
+            f"{float(result.remainder):.3g}), and no coordinate may be changed.{hint}"
+        )
+    if result.is_met and result.is_determined:
+        return (
+            f"{name}: the configuration constraints can be met, but the constraints implied by them are violated "
+            f"by {float(result.implied):.3g}: with these parameters the loop cannot be closed. In a plane loop, "
+            "place both ends in one plane."
+        )
+    if result.is_met:
+        return (
+            f"{name}: the configuration constraints do not determine {moved} with {fixed}: they do not depend on it "
+            f"(a singular configuration, or redundant constraints). Change the fixed values.{hint}"
+        )
+    return (
+        f"{name}: no {moved} satisfies the configuration constraints with {fixed}: after {int(result.steps)} Newton "
+        f"steps the residual is {float(result.remainder):.3g}. Start from another guess, or fix other values.{hint}"
+    )
+
+
+def _check_dependent_speeds(system: System, given: Mapping[str, Any], t: Component, q: Numbers, u: Numbers) -> None:
+    required = np.asarray(dependent_speeds(system, t, q, u))
+    # Relative to the terms of u_dep = J u + drift, so that the result does not depend on units.
+    drift = np.asarray(dependent_speeds(system, t, q, jnp.zeros_like(u)))
+    sizes = np.abs(drift) + np.abs(np.asarray(constraint_jacobian(system, t, q))) @ np.abs(np.asarray(u))
+    for speed, value in given.items():
+        i, value = system.dependent_speeds.index(speed), float(value)
+        if not abs(value - required[i]) <= 1e-6 * max(SMALLEST_SIZE, float(sizes[i])):
+            raise ValueError(
+                f"{type(system).__name__}: {speed} = {value:.6g} contradicts the velocity constraints, which require "
+                f"{required[i]:.6g} (residual {value - required[i]:.3g}). Omit the dependent speeds: they are computed "
+                "from the others."
+            )

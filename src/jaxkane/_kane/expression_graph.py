@@ -1,0 +1,254 @@
+"""The equations of a system as graphs of scalars, with the names of their inputs. Independent of the output language.
+
+Every function is traced in the same way as in a simulation, and JAX computes the derivatives. All functions share one
+graph, so common subexpressions occur once.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._scalarjit.compat import MISSING, ClosedJaxpr, jaxpr_as_fun
+from .._scalarjit.components import ELIMINATE_UP_TO, as_vector, is_written_out
+from .._scalarjit.graph import Graph, NotScalarError, unrolled
+from .._scalarjit.jaxpr import Direction, cse, jacobian
+from .._system.parameters import ANY, ParameterInfo, declared, in_batches, leaf_name
+from .._system.system import System
+from .api import (
+    constraint_jacobian,
+    constraint_jacobian_rate,
+    dependent_accelerations,
+    dependent_speeds,
+    equations_of_motion,
+    kinetic_energy,
+    partial_velocities,
+)
+from .arguments import as_row, check_is_system, is_concrete
+from .checks import check_system
+from .description import DescriptionEvaluator
+from .kanes_method import motion_rates_by_matrix
+from .right_hand_side import rates
+
+
+class Function(NamedTuple):
+    """A function of (system, t, q, u, inputs, u_dep), and the names of its outputs."""
+
+    outputs: tuple[str, ...]
+    evaluate: Callable[..., tuple[Any, ...]]
+    needs_constraints: bool = False
+    needs_states: bool = False
+
+
+def _all_rates(system, t, q, u, w, u_dep):
+    """Rates of the coordinates as a function of all speeds, including the dependent ones."""
+    evaluator = DescriptionEvaluator(system)
+    return (as_vector(evaluator.rates(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
+
+
+def _velocity_residuals(system, t, q, u, w, u_dep):
+    return (as_vector(DescriptionEvaluator(system).residuals(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
+
+
+def _configuration_residuals(system, t, q, u, w, u_dep):
+    return (as_vector(DescriptionEvaluator(system).configuration(t, as_row(q, system.coordinates, "q")), q),)
+
+
+FUNCTIONS: dict[str, Function] = {
+    "rates": Function(("q_dot", "u_dot"), lambda s, t, q, u, w, _: motion_rates_by_matrix(s, t, q, u, w)),
+    "equations": Function(("M", "f"), lambda s, t, q, u, w, _: equations_of_motion(s, t, q, u, w)),
+    "dependent_speeds": Function(("u_dep",), lambda s, t, q, u, w, _: (dependent_speeds(s, t, q, u),), True),
+    "dependent_accelerations": Function(
+        ("u_dep_dot",), lambda s, t, q, u, w, _: (dependent_accelerations(s, t, q, u, w),), True
+    ),
+    "constraint_jacobian": Function(("J",), lambda s, t, q, u, w, _: (constraint_jacobian(s, t, q),), True),
+    "constraint_jacobian_rate": Function(
+        ("J_dot",), lambda s, t, q, u, w, _: (constraint_jacobian_rate(s, t, q, u),), True
+    ),
+    "partial_velocities": Function(("V", "W"), lambda s, t, q, u, w, _: partial_velocities(s, t, q, u, w)),
+    "state_rates": Function(("x_dot",), lambda s, t, q, u, w, _: (rates(s, t, q, u, w).x,), needs_states=True),
+    "kinetic_energy": Function(("energy",), lambda s, t, q, u, w, _: (kinetic_energy(s, t, q, u),)),
+    "coordinate_rates": Function(("q_dot",), _all_rates),
+    "velocity_residuals": Function(("c",), _velocity_residuals, True),
+    "configuration_residuals": Function(("h",), _configuration_residuals),
+}
+# Derivatives of the rates (q_dot, u_dot) with respect to these kinds of arguments.
+JACOBIANS = {
+    "state_jacobian": ("q", "u"),
+    "parameter_jacobian": ("parameters",),
+    "input_jacobian": ("inputs",),
+}
+OFFERED = (*(name for name, f in FUNCTIONS.items() if f.evaluate.__name__ == "<lambda>"), *JACOBIANS)
+
+
+class Argument(NamedTuple):
+    """An array that functions read, with the name of each element. Each parameter is a separate argument."""
+
+    kind: str  # "t", "q", "u", "inputs", "u_dep" or "parameters"
+    name: str
+    shape: tuple[int, ...]
+    elements: tuple[str, ...]
+    info: ParameterInfo = ANY
+
+
+class Formulas:
+    """Functions of a system as arrays of nodes of one graph.
+
+    The attribute `arguments` contains the inputs of the functions. The operands of an input node are the index of its
+    argument, the index of its element in the argument, and the number of elements.
+
+    **Arguments:**
+
+    - `system`: the system.
+    - `dtype`: "float64" or "float32".
+    - `more`: functions by name, in addition to `FUNCTIONS`.
+
+    **Raises:** `TypeError` if `system` is not a `System`, or if it is traced. `ValueError` for a batch, and for a
+    system that contradicts itself. When a function is requested, `ValueError` if the system does not have it, or if its
+    operations cannot be written with scalars.
+    """
+
+    def __init__(self, system: System, dtype: str = "float64", more: Mapping[str, Function] | None = None):
+        check_is_system(system)
+        self.system, self.name, self.dtype = system, type(system).__name__, str(jnp.dtype(dtype))
+        self.functions = {**FUNCTIONS, **(more or {})}
+        if self.dtype not in ("float64", "float32"):
+            raise ValueError(f"{self.name}: `dtype` must be 'float64' or 'float32', got {dtype!r}.")
+        batched = in_batches(system)
+        if batched:
+            raise ValueError(
+                f"{self.name} is a batch: {', '.join(batched)} has additional leading axes. Pass one member of it."
+            )
+        if not is_concrete(system):
+            raise TypeError(f"{self.name} is traced. Call this function outside of jax.jit, vmap and grad.")
+        if MISSING is not None:
+            raise ImportError(f"{self.name} cannot be written as formulas: {MISSING}.")
+        check_system(system, 0.0, None)
+        paths, self.structure = jax.tree_util.tree_flatten_with_path(system)
+        self.leaves = [leaf for _, leaf in paths]
+        self.is_float = [bool(jnp.issubdtype(jnp.result_type(leaf), jnp.floating)) for leaf in self.leaves]
+        parameters = [
+            Argument(
+                "parameters", name := leaf_name(path), np.shape(x), _elements(name, np.shape(x)), declared(system, path)
+            )
+            for (path, x), is_float in zip(paths, self.is_float, strict=True)
+            if is_float
+        ]
+        vectors = {"q": system.coordinates, "u": system.speeds}
+        # At a given time, a first-order state is a number that `loads` reads, like an input.
+        vectors |= {"inputs": (*system.inputs, *system.states)}
+        vectors |= {"u_dep": system.dependent_speeds}
+        self.arguments = (
+            Argument("t", "t", (), ("t",)),
+            *(Argument(kind, kind, (len(names),), tuple(names)) for kind, names in vectors.items()),
+            *parameters,
+        )
+        self.graph = Graph()
+        self.inputs = [
+            np.array(
+                [self.graph.add("input", (i, e, len(a.elements)), self.dtype) for e in range(len(a.elements))], np.int64
+            ).reshape(a.shape)
+            for i, a in enumerate(self.arguments)
+        ]
+        self.program = functools.cache(self._program)
+        self.nodes = functools.cache(self._nodes)
+
+    def values(self) -> dict[str, np.ndarray]:
+        """The parameter values of the system by name."""
+        floats = [x for x, is_float in zip(self.leaves, self.is_float, strict=True) if is_float]
+        return {a.name: np.asarray(x, self.dtype) for a, x in zip(self.of_kind("parameters"), floats, strict=True)}
+
+    def of_kind(self, kind: str) -> list[Argument]:
+        return [a for a in self.arguments if a.kind == kind]
+
+    def names(self, kind: str) -> tuple[str, ...]:
+        """The names of all numbers of a kind, in order."""
+        return tuple(name for a in self.of_kind(kind) for name in a.elements)
+
+    def evaluate(self, function: str, *args: Any) -> tuple[Any, ...]:
+        """Evaluate a function. `args` are arrays in the order of `arguments`."""
+        t, q, u, w, u_dep, *parameters = args
+        values = iter(parameters)
+        leaves = [next(values) if is_float else x for x, is_float in zip(self.leaves, self.is_float, strict=True)]
+        inputs = {name: w[i] for i, name in enumerate((*self.system.inputs, *self.system.states))}
+        return tuple(
+            self.functions[function].evaluate(jax.tree.unflatten(self.structure, leaves), t, q, u, inputs, u_dep)
+        )
+
+    def _program(self, function: str, keeps_solutions: bool = False) -> ClosedJaxpr:
+        """A function as a JAX program without calls of other programs. `keeps_solutions`: see `cse`."""
+        if self.functions[function].needs_constraints and not self.system.dependent_speeds:
+            raise ValueError(f"{self.name} has no dependent speeds, so {function!r} does not exist. Omit it.")
+        if self.functions[function].needs_states and not self.system.states:
+            raise ValueError(f"{self.name} has no first-order states, so {function!r} does not exist. Omit it.")
+        specs = [jax.ShapeDtypeStruct(a.shape, self.dtype) for a in self.arguments]
+        with jax.enable_x64(self.dtype == "float64"):
+            return cse(jax.make_jaxpr(functools.partial(self.evaluate, function))(*specs), keeps_solutions)
+
+    def _nodes(self, function: str) -> dict[str, np.ndarray]:
+        """The outputs of a function by name, as nodes."""
+        if function in JACOBIANS:
+            blocks = self.derivatives("rates", self.directions(*JACOBIANS[function]))
+            return {"jacobian": np.concatenate([*blocks.values()])}
+        program = self.program(function)
+        try:
+            outputs = unrolled(program, self.inputs, self.graph)
+        except NotScalarError as error:
+            raise ValueError(self._refusal(function, error)) from None
+        return dict(zip(self.functions[function].outputs, outputs, strict=True))
+
+    def directions(self, *kinds: str) -> list[Direction]:
+        """All numbers of the given kinds, as pairs: the index of the argument and the index in the argument."""
+        return [(i, e) for i, a in enumerate(self.arguments) if a.kind in kinds for e in range(len(a.elements))]
+
+    def derivatives(self, function: str, directions: Sequence[Direction]) -> dict[str, np.ndarray]:
+        """The derivatives (..., d) of a function's outputs with respect to d numbers, as nodes."""
+        try:
+            with jax.enable_x64(self.dtype == "float64"):
+                outputs = jacobian(self.program(function, keeps_solutions=True), self.inputs, directions, self.graph)
+        except NotScalarError as error:
+            raise ValueError(self._refusal(function, error)) from None
+        return dict(zip(self.functions[function].outputs, outputs, strict=True))
+
+    def by_jax(self, function: str, *args: Any) -> tuple[Any, ...]:
+        """The values of a function or of a Jacobian by JAX. `args` are arrays in the order of `arguments`."""
+        if function not in JACOBIANS:
+            return tuple(jaxpr_as_fun(self.program(function))(*args))
+        places = [i for i, a in enumerate(self.arguments) if a.kind in JACOBIANS[function]]
+
+        def rates_of(values):
+            full = list(args)
+            for i, x in zip(places, values, strict=True):
+                full[i] = x
+            return jnp.concatenate(jaxpr_as_fun(self.program("rates"))(*full))
+
+        n = len(self.system.coordinates) + len(self.system.speeds)
+        if not any(self.arguments[i].elements for i in places):
+            return (jnp.zeros((n, 0), self.dtype),)
+        blocks = jax.jacfwd(rates_of)([jnp.asarray(args[i]) for i in places])
+        return (jnp.concatenate([block.reshape(n, -1) for block in blocks], axis=1),)
+
+    def _refusal(self, function: str, error: NotScalarError) -> str:
+        n, k = len(self.system.speeds), len(self.system.dependent_speeds)
+        if not is_written_out(n) and function not in ("equations", "coordinate_rates"):
+            why = f"because the equations of a system with {n} speeds are solved by LAPACK"
+            remedy = "Export M and f with functions=('equations',), and solve M u_dot = f in the other program"
+        elif k > ELIMINATE_UP_TO:
+            why = f"because {k} dependent speeds are computed by LAPACK"
+            remedy = "Use fewer dependent speeds"
+        else:
+            why = "which its description uses"
+            remedy = "Use functions of single numbers, jnp.where and constant indices"
+        return (
+            f"{self.name}: {function!r} cannot be written as formulas of single numbers: it contains {error}, {why}. "
+            f"{remedy}. Or use jaxkane.export.stablehlo, which supports every operation."
+        )
+
+
+def _elements(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
+    return tuple(name + "".join(f"[{i}]" for i in place) for place in np.ndindex(shape))

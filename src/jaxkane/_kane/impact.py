@@ -1,0 +1,589 @@
+"""Impacts: Kane's impulse equations at one configuration. Independent of events and integrators.
+
+During an impact, forces are infinite and the configuration does not change. Kane's equations, integrated over the
+impact, relate generalized impulses to the change of generalized momenta (Kane and Levinson, "Dynamics: Theory and
+Applications", 1985, sections 3.6 and 4.12):
+
+    M (u+ - u-) = C^T p,   c(u+) = -e c(u-),   C = dc/du
+
+c(u) are the velocity residuals of the impact, p their impulses, e the coefficients of restitution. The dependent speeds
+are eliminated, so all permanent constraints also hold after the impact. The change of the speeds has the smallest
+kinetic energy of all changes that satisfy the second equation (Gauss's principle). With M = X^-T X^-1:
+
+    u+ - u- = X w,   w = the smallest solution of (C X) w = c(u+) - c(u-),   (C X)^T p = w
+
+An orthogonalization of the rows of C X finds w and p. A row that depends linearly on previous rows is omitted. Then w
+remains unique, and p is the smallest of all possible solutions.
+
+A released point or frame has three auxiliary speeds during the impact (see `reactions`). Their generalized impulses
+are zero, because no impulse is transmitted to the bodies that are built from the point.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._common.lookup import not_there
+from .._scalarjit.cache_key import jit
+from .._scalarjit.components import (
+    Component,
+    Rows,
+    add,
+    as_vector,
+    component,
+    dot,
+    is_written_out,
+    matvec,
+    mul,
+    rounding_of_pivots,
+    scale3,
+    solve,
+    stack,
+    sub,
+    total,
+)
+from .._scalarjit.nan import nan_where
+from .._scalarjit.scalar_function import ScalarFunction
+from .._system.kinematics import Frame, Point
+from .._system.motion import flatten_residuals
+from .._system.system import NamedVector, System
+from .api import checked_arrays, finite_or_explained
+from .arguments import Row, as_row, is_concrete, is_one_number
+from .kanes_method import KaneEquations, mass_matrix_columns, unit
+from .reactions import AuxiliarySpeeds
+
+
+class Impact(eqx.Module):
+    """An impact: velocity residuals that an impulse changes.
+
+        lands = jk.Impact(toe.dot(N.x), toe.dot(N.y), release=("foot",))
+
+    Every residual c(u) is a velocity [m/s or rad/s] that is affine in the speeds. After the impact, c(u+) = -e c(u-).
+    The impulses p [N s or N m s] follow from Kane's impulse equations (Kane and Levinson, "Dynamics: Theory and
+    Applications", 1985, section 4.12):
+
+        M (u+ - u-) = C^T p,   C = dc/du
+
+    The permanent constraints of the system also hold after the impact. The relative velocity of a surface that moves
+    belongs to the residual: `(v_point - v_surface).dot(n)`.
+
+    **Arguments:**
+
+    - `velocity_residuals`: numbers or Vectors. A Vector is three residuals. Lists are flattened.
+    - `restitution`: the coefficient e of restitution, from 0 (plastic) to 1 (elastic). One number for all residuals, or
+        one for each residual.
+    - `release`: names of points and frames of the `Motion`. Their constraints transmit no impulse. For example, the
+        stance foot of a walker is fixed by the description, but it leaves the ground when the other foot strikes. The
+        speeds after the impact are those of the description, so the next stage must exchange the legs. A direction in
+        which a released part moves no mass remains fixed.
+
+    **Raises:** `ValueError` without residuals, and for a coefficient of restitution outside [0, 1]. `TypeError` for
+    arguments of a wrong type.
+    """
+
+    residuals: tuple[Component, ...]
+    restitution: tuple[Component, ...]
+    release: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(self, *velocity_residuals: Any, restitution: Any = 0.0, release: Any = ()):
+        label = "Impact(*velocity_residuals): the velocity residuals"
+        counts = [len(flatten_residuals(each, label)) for each in velocity_residuals]
+        self.residuals = flatten_residuals(velocity_residuals, label)
+        if not self.residuals:
+            raise ValueError("Impact(*velocity_residuals): pass at least one velocity residual.")
+        self.restitution = _for_each(checked_restitution(restitution), counts)
+        self.release = checked_release(release)
+
+
+def checked_restitution(value: Any) -> Any:
+    """One coefficient of restitution, or a tuple of these."""
+    if not is_one_number(value) and not isinstance(value, (tuple, list)) and getattr(value, "ndim", 0) != 1:
+        raise TypeError(f"Impact: the restitution is one number, or one for each residual, got {value!r}.")
+    coefficients: tuple[Any, ...] = (value,) if is_one_number(value) else tuple(value)
+    for e in coefficients:
+        if not is_one_number(e):
+            raise TypeError(f"Impact: a coefficient of restitution is one number, got {e!r}.")
+        if is_concrete(e) and not 0 <= float(e) <= 1:
+            raise ValueError(f"Impact: the coefficient of restitution is {float(e)}. It must be between 0 and 1.")
+    return value if is_one_number(value) else coefficients
+
+
+def _for_each(restitution: Any, counts: Sequence[int]) -> tuple[Component, ...]:
+    """One coefficient for each residual. `counts`: the number of residuals in each argument."""
+    values = restitution if isinstance(restitution, tuple) else (restitution,) * sum(counts)
+    if len(values) == len(counts) != sum(counts):  # one for each Vector
+        values = [e for e, count in zip(values, counts, strict=True) for _ in range(count)]
+    if len(values) != sum(counts):
+        raise ValueError(
+            f"Impact: there are {sum(counts)} residuals, but {len(values)} coefficients of restitution. Pass a "
+            "single number, or one number for each residual."
+        )
+    return tuple(component(e) for e in values)
+
+
+def checked_release(release: Any) -> tuple[str, ...]:
+    """Names of released parts, each once."""
+    names = (release,) if isinstance(release, str) else release
+    if not isinstance(names, (tuple, list)) or not all(isinstance(name, str) for name in names):
+        raise TypeError(
+            f"Impact: release is a tuple of names of points and frames, such as ('foot',), got {release!r}."
+        )
+    return tuple(dict.fromkeys(names))
+
+
+ReadImpact: TypeAlias = Callable[[Component, Row, Row], Impact]
+"""(t, q, u_all) -> the impact, with its residuals at the speeds u_all (n + k,)."""
+
+ReadImpactOf: TypeAlias = Callable[[System, Component, Row, Row], Impact]
+"""(system, t, q, u_all) -> the impact. A Module: its static fields and the code that it calls belong to the key."""
+
+
+class ImpactResult(eqx.Module):
+    """The result of an impact.
+
+    Attributes:
+
+    - `u`: independent speeds (n,) after the impact.
+    - `impulses`: impulses (m,) of the velocity residuals [N s or N m s]. An impulse is positive if it increases its
+        residual.
+    - `energy_lost`: kinetic energy before the impact minus that after it [J].
+    - `unique`: whether the impulses are unique. False if a residual depends linearly on the others. Then the speeds are
+        unique, and the impulses have the smallest sum of squares.
+    """
+
+    u: Float[Array, " n"]
+    impulses: Float[Array, " m"]
+    energy_lost: Float[Array, ""]
+    unique: Bool[Array, ""]
+
+
+class ImpactSolution(NamedTuple):
+    """An `ImpactResult` and the reasons for which it may be NaN.
+
+    - `C` (m, N): derivatives of the residuals by the independent speeds and the speeds of released parts.
+    - `is_affine` (m,): whether each residual is affine in the speeds.
+    - `is_consistent` (): whether the residuals can be satisfied together.
+    """
+
+    result: ImpactResult
+    C: Array
+    is_affine: Array
+    is_consistent: Array
+
+
+def after_impact(kane: KaneEquations, read: ReadImpact) -> ImpactSolution:
+    """The impact at a state, as a program of scalars. For few speeds (`is_written_out`).
+
+    **Arguments:**
+
+    - `kane`: Kane's equations at the state before the impact.
+    - `read`: the impact as a function of time, coordinates and all speeds.
+
+    **Returns:** the result. It is NaN if the residuals contradict each other or are not affine in the speeds, and if
+    the mass matrix is singular.
+    """
+    return _solved(*_equations_of(kane, read))
+
+
+def impact_at(
+    system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array], read: ReadImpactOf
+) -> ImpactSolution:
+    """`after_impact` from checked arrays, for any number of speeds.
+
+    `read` is part of the key under which the program is stored. Its arrays are arguments of the program.
+    """
+    if is_written_out(len(system.speeds)):
+        return _impact_written_out(system, t, q, u, inputs, read)
+    return _solved(*impulse_equations(system, t, q, u, inputs, read))
+
+
+def impulse_equations(
+    system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array], read: ReadImpactOf
+) -> tuple[Array, Array, Quantities]:
+    """The mass matrix M (n, n), the derivatives C (m, n) of the residuals, and the other quantities of an impact."""
+    if is_written_out(len(system.speeds)):
+        return _equations_written_out(system, t, q, u, inputs, read)
+
+    def column(direction: Any) -> Array:
+        return _residuals_along(system, t, q, u, inputs, read, direction)
+
+    C = jax.vmap(column, out_axes=-1)(np.eye(len(system.speeds), dtype=q.dtype))
+    return mass_matrix_columns(system, t, q, u, inputs), C, _quantities(system, t, q, u, inputs, read)
+
+
+def _equations_of(kane: KaneEquations, read: ReadImpact) -> tuple[Array, Array, Quantities]:
+    before = BeforeImpact(kane, read)
+    M = stack(kane.mass_matrix(kane.partial_velocities())).astype(kane.dtype)
+    columns = [before.along(kane.with_dependent(unit(kane.n, r))) for r in range(kane.n)]
+    return M, stack(columns).astype(kane.dtype).T, before.quantities()
+
+
+@ScalarFunction
+def _impact_written_out(system, t, q, u, inputs, read):
+    return after_impact(KaneEquations(system, t, q, u, inputs), functools.partial(read, system))
+
+
+@ScalarFunction
+def _equations_written_out(system, t, q, u, inputs, read):
+    return _equations_of(KaneEquations(system, t, q, u, inputs), functools.partial(read, system))
+
+
+@ScalarFunction
+def _residuals_along(system, t, q, u, inputs, read, direction):
+    kane = KaneEquations(system, t, q, u, inputs)
+    direction = kane.with_dependent(as_row(direction, system.speeds, "direction"))
+    return as_vector(BeforeImpact(kane, functools.partial(read, system)).along(direction), q)
+
+
+@ScalarFunction
+def _quantities(system, t, q, u, inputs, read):
+    return BeforeImpact(KaneEquations(system, t, q, u, inputs), functools.partial(read, system)).quantities()
+
+
+class Released(NamedTuple):
+    """The a = 3 p auxiliary speeds of p released parts.
+
+    - `M_own` (n, a), `M` (a, a): blocks of the mass matrix.
+    - `C` (m, a): derivatives of the residuals of the impact.
+    - `h` (a,): generalized momenta before the impact.
+    """
+
+    M_own: Array
+    M: Array
+    C: Array
+    h: Array
+
+
+class Quantities(NamedTuple):
+    """The impact before it is solved.
+
+    - `u` (n,): independent speeds before the impact.
+    - `h` (n,): their generalized momenta.
+    - `residuals`, `restitution` (m,): at these speeds.
+    - `deviation` (m,): the part of each residual that is not affine in the speeds.
+    - `size` (m,): the size of the terms of each residual.
+    - `released`: None if nothing is released.
+    """
+
+    u: Array
+    h: Array
+    residuals: Array
+    restitution: Array
+    deviation: Array
+    size: Array
+    released: Released | None
+
+
+class BeforeImpact:
+    """The state before an impact: the residuals, their derivatives and the momenta."""
+
+    def __init__(self, kane: KaneEquations, read: ReadImpact):
+        self.kane, self.read = kane, read
+        self.rest = (0.0,) * (kane.n + kane.k)
+        self.impact = self._impact(kane.u_all)
+
+    def _impact(self, u: Row) -> Impact:
+        impact = self.read(self.kane.t, self.kane.q, u)
+        if not isinstance(impact, Impact):
+            raise TypeError(f"{self.kane.name}: an impact must be a jaxkane.Impact, got {impact!r}.")
+        return impact
+
+    def residuals(self, u: Row) -> Row:
+        return self._impact(u).residuals
+
+    def along(self, direction: Row) -> Row:
+        """Derivatives (m,) of the residuals along a direction (n + k,) of all speeds."""
+        return self.kane.along_speeds(self.residuals, direction)
+
+    def quantities(self) -> Quantities:
+        kane, impact = self.kane, self.impact
+        momenta = kane.momenta(kane.u_all)
+        h = kane.projected_onto_speeds(lambda u: kane.velocities(u)[0], momenta)
+        r, r0, slope = impact.residuals, self.residuals(self.rest), self.along(kane.u_all)
+        deviation = [sub(sub(x, y), z) for x, y, z in zip(r, r0, slope, strict=True)]
+        size = [total(map(abs, terms)) for terms in zip(r, r0, slope, strict=True)]
+        released = self._released(momenta) if impact.release else None
+        rows: Any = (kane.u, h, r, impact.restitution, deviation, size)
+        return Quantities(*map(self._array, rows), released=released)
+
+    def _array(self, row: Sequence[Component]) -> Array:
+        return stack([row])[0].astype(self.kane.dtype)
+
+    def _matrix(self, rows: Rows) -> Array:
+        return stack(rows).astype(self.kane.dtype)
+
+    def _released(self, momenta: list[tuple[Row, Row]]) -> Released:
+        kane = self.kane
+        auxiliary = AuxiliarySpeeds(kane.system, kane.t, kane.q, kane.u, dict(kane.inputs))
+        parts = [_part(auxiliary, name) for name in self.impact.release]
+        partials = [self._partial(auxiliary, part, axis) for part in parts for axis in range(3)]
+        bodies, along = kane.read("bodies", kane.t, kane.q, kane.u_all), lambda u: kane.velocities(u)[0]
+        M_own = []
+        for partial, _ in partials:
+            # M_rs = sum_i V_ir . m_i V_is + W_ir . I_i W_is
+            changes = [(scale3(m, V), matvec(I, W)) for (m, I), (V, W) in zip(bodies, partial[0], strict=True)]
+            M_own.append(kane.projected_onto_speeds(along, changes))
+        h = [
+            total(add(dot(V, p), dot(W, H)) for (V, W), (p, H) in zip(partial[0], momenta, strict=True))
+            for partial, _ in partials
+        ]
+        M = self._matrix(kane.mass_matrix([partial for partial, _ in partials]))
+        C = self._matrix([column for _, column in partials])
+        return Released(self._matrix(M_own).T, M, C.T, self._array(h))
+
+    def _partial(self, kane: AuxiliarySpeeds, part: Point | Frame, axis: int) -> tuple[Any, Row]:
+        """Partial velocities and derivatives (m,) of the residuals for one auxiliary speed of a released part."""
+        along = []
+        if kane.k:
+            # The permanent constraints hold:  C_dep u_dep + C_aux u_aux = 0
+            u_dep = [mul(-1.0, x) for x in solve(kane.C_dep, kane.auxiliary_residuals(part, axis))[0]]
+            direction = (*(0.0,) * kane.n, *u_dep)
+            along.append((kane.along_speeds(kane.velocities, direction), self.along(direction)))
+        if kane.is_cut(part):
+            # Otherwise, no body is built from the part, and its auxiliary speed changes only the constraints.
+            along.append(
+                kane.along_auxiliary(part, axis, lambda: (kane.velocities(self.rest), self.residuals(self.rest)))
+            )
+        return functools.reduce(lambda a, b: jax.tree.map(add, a, b), along)
+
+
+def _part(kane: AuxiliarySpeeds, name: str) -> Point | Frame:
+    motion = kane.description
+    parts: dict[str, Point | Frame] = {**motion.points, **motion.frames}
+    if name not in parts:
+        raise not_there(name, parts, f"the points and frames of {kane.name} that an impact can release")
+    part = parts[name]
+    if isinstance(part, Frame) and part.parent is None:
+        raise ValueError(f"{kane.name}: the impact releases {name!r}, which is the inertial frame. Omit it.")
+    if not kane.is_cut(part) and not kane.k:
+        raise ValueError(
+            f"{kane.name}: the impact releases {name!r}, but the position of no body is defined from this point. The "
+            "release has no effect. Release the point from which the positions of the bodies are defined."
+        )
+    return part
+
+
+class ImpulseCoordinates(NamedTuple):
+    """The impact in coordinates w in which the mass matrix is the unit matrix. N = n + a with a auxiliary speeds.
+
+    - `X` (N, N): the change of the speeds is X w.
+    - `C` (m, N): derivatives of the residuals by all speeds.
+    - `h` (N,): generalized momenta before the impact.
+    """
+
+    X: Array
+    C: Array
+    h: Array
+
+    @classmethod
+    def of(cls, M: Array, C: Array, before: Quantities) -> ImpulseCoordinates:
+        X, released = _own_root(M), before.released
+        if released is None:
+            return cls(X, C, before.h)
+        # M = [[M_oo, M_oa], [M_ao, M_aa]],   X^T M X = 1,   S = M_aa - M_ao M_oo^-1 M_oa
+        B = X.T @ released.M_own
+        S = released.M - B.T @ B
+        sizes = [released.M[i, i] for i in range(len(S))]
+        X_a = stack(_inverse_root(_rows(S), sizes)).astype(M.dtype)
+        lower = jnp.concatenate([jnp.zeros_like(released.M_own.T), X_a], axis=1)
+        X = jnp.concatenate([jnp.concatenate([X, -X @ B @ X_a], axis=1), lower], axis=0)
+        return cls(X, jnp.concatenate([C, released.C], axis=1), jnp.concatenate([before.h, released.h]))
+
+    def energy_lost(self, w: Array) -> Array:
+        """Kinetic energy before the impact minus that after it [J]."""
+        # T(u+) - T(u-) = (change . M change) / 2 + h . change,   change = X w
+        return -(0.5 * w @ w + self.h @ (self.X @ w))
+
+
+def _solved(M: Array, C: Array, before: Quantities) -> ImpactSolution:
+    """The impact with the mass matrix `M` (n, n) and the derivatives `C` (m, n) of the residuals."""
+    coordinates = ImpulseCoordinates.of(M, C, before)
+    X, C, n = coordinates.X, coordinates.C, len(M)
+    # C (u+ - u-) = c(u+) - c(u-) = -(1 + e) c(u-)
+    b = -(1.0 + before.restitution) * before.residuals
+    w, y, T, is_new, missing = least_norm(C @ X, b)
+    p = least_norm(T.T[::-1], y[::-1])[0]  # T^T p = y
+    size = before.size + jnp.abs(b) + jnp.abs(T) @ jnp.abs(y)
+    tolerance = float(jnp.finfo(M.dtype).eps) ** 0.5
+    is_consistent = jnp.all(jnp.abs(missing) <= tolerance * size)
+    is_consistent &= jnp.all((before.restitution >= 0) & (before.restitution <= 1))
+    is_affine = jnp.abs(before.deviation) <= tolerance * before.size
+    values = before.u + (X @ w)[:n], p, coordinates.energy_lost(w)
+    u, p, energy_lost = (jnp.where(is_consistent & jnp.all(is_affine), x, jnp.nan) for x in values)
+    return ImpactSolution(ImpactResult(u, p, energy_lost, jnp.all(is_new)), C, is_affine, is_consistent)
+
+
+def _rows(A: Array) -> list[list[Component]]:
+    return [[A[i, j] for j in range(A.shape[1])] for i in range(A.shape[0])]
+
+
+def _own_root(M: Array) -> Array:
+    """X (n, n) with X^T M X = 1, upper triangular. NaN if M is singular within rounding."""
+    if is_written_out(len(M)):
+        return stack(_inverse_root(_rows(M))).astype(M.dtype)
+    K = jnp.linalg.cholesky(M)
+    K = jnp.where(jnp.all(jnp.diag(K) ** 2 > rounding_of_pivots(M.dtype) * jnp.diag(M)), K, jnp.nan)
+    return jsl.solve_triangular(K, jnp.eye(len(M), dtype=M.dtype), lower=True).T
+
+
+def _inverse_root(M: Rows, sizes: Sequence[Component] | None = None) -> Rows:
+    """X (n, n) with X^T M X = 1, upper triangular, by the Cholesky factors M = K K^T, X = K^-T.
+
+    A pivot that is zero within rounding gives NaN. If the `sizes` (n,) of the diagonal before cancellation are passed,
+    it gives a column of zeros. These directions move no mass, or move it as the directions before them.
+    """
+    n = len(M)
+    K: list[list[Component]] = [[0.0] * n for _ in range(n)]
+    reciprocals: list[Component] = []
+    for j in range(n):
+        pivot = sub(M[j][j], dot(K[j][:j], K[j][:j]))
+        size = M[j][j] if sizes is None else sizes[j]
+        eps = float(jnp.finfo(jnp.result_type(pivot, size)).eps)
+        # With cancelled digits, the rounding error of a pivot is that of the whole Schur complement.
+        is_regular = pivot > (100 * eps if sizes is None else eps**0.75) * size
+        root = jnp.sqrt(jnp.where(is_regular, pivot, 1.0))
+        reciprocals.append(jnp.where(is_regular, 1.0 / root, math.nan if sizes is None else 0.0))
+        for i in range(j + 1, n):
+            K[i][j] = mul(sub(M[i][j], dot(K[i][:j], K[j][:j])), reciprocals[j])
+    X: list[list[Component]] = [[0.0] * n for _ in range(n)]
+    for i in range(n):
+        X[i][i] = reciprocals[i]
+        for j in range(i):
+            # K K^-1 = 1
+            X[j][i] = mul(mul(-1.0, reciprocals[i]), total(mul(K[i][k], X[j][k]) for k in range(j, i)))
+    return X
+
+
+def least_norm(A: Array, b: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """The smallest solution w (n,) of A w = b, for A (m, n) and b (m,).
+
+        A = T Q with orthonormal rows of Q,   T y = b,   w = Q^T y
+
+    A row is omitted if it is zero or linearly dependent on the previous ones. Its row of Q and its column of T are
+    zero. As `constraints.least_change`, but with products of scalars only.
+
+    **Returns:** w (n,), y (m,), T (m, m), whether each row is used (m,), and the part of b (m,) that the omitted rows
+    do not satisfy.
+    """
+    m, threshold = len(A), float(jnp.finfo(A.dtype).eps) ** 0.75
+    Q, T, y = jnp.zeros((0, A.shape[1]), A.dtype), [], jnp.zeros(0, A.dtype)
+    is_new, missing = [], []
+    for i in range(m):
+        rest, row = A[i], jnp.zeros(i, A.dtype)
+        for _ in range(2 if i else 0):  # Gram-Schmidt twice: after one pass, it is not orthogonal within rounding
+            along = Q @ rest
+            rest, row = rest - along @ Q, row + along
+        is_used = jax.lax.stop_gradient(jnp.max(jnp.abs(rest)) > threshold * jnp.max(jnp.abs(A[i])))
+        norm = jnp.sqrt(jnp.sum(jnp.where(is_used, rest, 1.0) ** 2))  # the derivative of a norm of zero is NaN
+        remainder = b[i] - row @ y if i else b[i]
+        Q = jnp.concatenate([Q, jnp.where(is_used, rest / norm, 0.0)[None]])
+        y = jnp.concatenate([y, jnp.where(is_used, remainder / norm, 0.0)[None]])
+        T.append(jnp.concatenate([row, jnp.where(is_used, norm, 0.0)[None], jnp.zeros(m - i - 1, A.dtype)]))
+        missing.append(jnp.where(is_used, 0.0, remainder))
+        is_new.append(is_used)
+    return y @ Q, y, jnp.stack(T), jnp.stack(is_new), jnp.stack(missing)
+
+
+class _OfFunction(eqx.Module):
+    """An impact from a function of the motion."""
+
+    function: Callable[..., Any]
+    restitution: Any
+    release: tuple[str, ...] = eqx.field(static=True)
+
+    def __call__(self, system: System, t: Component, q: Row, u: Row) -> Impact:
+        motion = system.motion(t, q, u)
+        q_named = NamedVector(q, system.coordinates)
+        u_named = NamedVector(u, (*system.speeds, *system.dependent_speeds))
+        residuals = self.function(t, q_named, u_named, motion)
+        residuals = residuals if isinstance(residuals, (tuple, list)) else (residuals,)
+        return Impact(*residuals, restitution=self.restitution, release=self.release)
+
+
+_compiled = jit(impact_at)
+
+
+def impact(
+    system: System,
+    t: Component,
+    q: Any,
+    u: Any,
+    residuals: Callable[..., Any],
+    restitution: Any = 0.0,
+    release: Any = (),
+) -> ImpactResult:
+    """The speeds after an impact, by Kane's impulse equations. See `Impact` for the equations.
+
+        def toe(t, q, u, motion):
+            v = motion["toe"].velocity
+            return v.dot(motion.N.x), v.dot(motion.N.y)
+
+        after = jk.impact(walker, 0.0, q, u, toe, release=("foot",))
+
+    **Arguments:**
+
+    - `system`: a `System`.
+    - `t`: time [s].
+    - `q`: coordinates (n_q,), or a dict by name.
+    - `u`: independent speeds (n,) before the impact, or a dict by name.
+    - `residuals`: a function (t, q, u, motion) -> the velocity residuals [m/s or rad/s]: a number, a Vector, or a tuple
+        of these. They are affine in the speeds. `u` also contains the dependent speeds.
+    - `restitution`: one coefficient for all residuals, or one for each residual.
+    - `release`: names of points and frames whose constraints transmit no impulse.
+
+    **Returns:** an `ImpactResult`. If arguments are traced, it is NaN where an exception would be raised.
+
+    **Raises:** `ValueError` if the residuals contradict each other, if a residual does not depend on the speeds or is
+    not affine in them, and if the mass matrix is singular.
+    """
+    if not callable(residuals):
+        raise TypeError(
+            f"impact(system, t, q, u, residuals): pass a function (t, q, u, motion) -> velocity residuals, got "
+            f"{residuals!r}."
+        )
+    arrays = checked_arrays(system, t, q, u)
+    coefficients = jax.tree.map(lambda e: jnp.asarray(e, arrays[2].dtype), checked_restitution(restitution))
+    if jax.tree_util.all_leaves([residuals]):  # a method of a Module is a tree, and its arrays are arguments
+        residuals = jax.tree_util.Partial(residuals)
+    read = _OfFunction(residuals, coefficients, checked_release(release))
+    solution = (impact_at if is_written_out(len(system.speeds)) else _compiled)(*arrays, read)
+    result = solution.result
+    values = result.u, result.impulses, result.energy_lost
+    if not is_concrete(values):
+        is_solved = jnp.isfinite(result.energy_lost)
+        u, impulses, energy_lost = nan_where(~is_solved, values, (arrays, coefficients))
+        return ImpactResult(u, impulses, energy_lost, result.unique)
+    _explain(solution, arrays)
+    return result
+
+
+def _explain(solution: ImpactSolution, arrays: Any) -> None:
+    """Raise an exception if the result is not finite."""
+    if np.isfinite(solution.result.energy_lost):
+        return
+    name, C, is_affine = type(arrays[0]).__name__, np.asarray(solution.C), np.asarray(solution.is_affine)
+    for i in range(len(C)):
+        if not is_affine[i]:
+            raise ValueError(f"{name}: the velocity residual {i} of the impact is not affine in the speeds.")
+        if not C[i].any():
+            raise ValueError(
+                f"{name}: the velocity residual {i} of the impact is not zero and does not depend on the speeds, so no "
+                "impulse can change it. Pass a velocity, such as motion['P'].velocity.dot(motion.N.y)."
+            )
+    finite_or_explained(solution.result, arrays)
+    if not solution.is_consistent:
+        raise ValueError(
+            f"{name}: the velocity residuals of the impact contradict each other. There are {len(C)} residuals, and no "
+            "speeds after the impact satisfy all of them. Omit the dependent residuals, or give them the same "
+            "coefficient of restitution."
+        )

@@ -1,0 +1,1 @@
+"""Extensions of an incomplete model: candidates and their selection."""

@@ -1,0 +1,305 @@
+"""Candidate extensions of a model: they are checked, grouped, and combined in one augmented problem."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from ..._common.lookup import as_names, refuse_unknown
+from ..._scalarjit.compat import on_device
+from ..._system.system import System
+from ..problem.bijections import Interval
+from ..problem.declarations import CalibrationTerm, Delay, Free, Item, Items
+from ..problem.from_declarations import as_items, is_eliminated, parameters_of
+from ..problem.model import Simulation, Unknowns
+from ..problem.parameters import with_entries
+from ..problem.problem import Problem
+from ..problem.specification import Names, ProblemSpec, deviations_by_name
+from ..result.fit_result import Fit
+
+Bounds = tuple[float | None, float | None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """An extension of a model, to be tested by `forward_selection`.
+
+        Candidate("motor lag", system=Lagging.from_parameters(values), free="lag", unknown="motor_torque")
+        Candidate("the roll sensor", free=[Offset("roll"), Gain("roll_rate")])
+
+    **Arguments:**
+
+    - `name`: name in tables.
+    - `free`: parameters, as in `fit`: names, `Free`, `Gain`, `Offset`, `Delay`, `LowPass`, `Inertia`. They start at the
+        system's values, which do not change the model.
+    - `system`: another system, with the free parameters of the fit under the same names. By default the system of the
+        fit. If its trajectories differ before a parameter is freed, the candidate is tested by a fit only. Otherwise it
+        is linearized first.
+    - `unknown`: additional unknown initial states, such as those of additional states of `system`.
+    - `plausible`: by name of a parameter, its plausible range (lower, upper). None for an open end.
+    """
+
+    name: str
+    free: Items = ()
+    system: System | None = None
+    unknown: Names = ()
+    plausible: Mapping[str, Bounds] = dataclasses.field(default_factory=dict, hash=False)
+
+    @property
+    def items(self) -> tuple[Item, ...]:
+        return tuple(as_items(self.free))
+
+    @property
+    def has_parameters_only(self) -> bool:
+        return self.system is None and not self.unknown
+
+    def names(self, system: System) -> tuple[str, ...]:
+        """Names of its parameters."""
+        return _names_of(self.system or system, *self.items)
+
+
+Candidates = Item | Candidate | Sequence[Item | Candidate]
+
+
+@dataclasses.dataclass(frozen=True)
+class Terms:
+    """The terms that a search may add and remove.
+
+    - `base`: the specification of the fit without the removable terms.
+    - `removable`: terms that may be removed, as candidates.
+    - `candidates`: terms that may be added.
+    """
+
+    base: ProblemSpec
+    removable: tuple[Candidate, ...]
+    candidates: tuple[Candidate, ...]
+
+    @property
+    def all(self) -> tuple[Candidate, ...]:
+        return (*self.removable, *self.candidates)
+
+
+def checked_terms(fit: Fit, candidates: Candidates, remove: str | Sequence[str] = ()) -> Terms:
+    """The terms of a search.
+
+    **Raises:** `ValueError` without a candidate, for a candidate that frees nothing or a parameter that is already
+    free, for repeated names, for two candidates that free the same parameter differently, and for names in `remove`
+    that are not free.
+    """
+    items, system = (candidates,) if isinstance(candidates, Candidate) else as_items(candidates), fit.problem.system
+    candidates = tuple(_candidate(fit, item) for item in items)
+    remove = as_names(remove)
+    refuse_unknown(remove, fit.names, "`remove` contains unknown names:", "the fit has")
+    base, removable = [], []
+    for item in fit.problem.specification.free:
+        names = () if getattr(item, "each", None) else _names_of(system, item)
+        if not set(names) & set(remove):
+            base.append(item)
+            continue
+        # As a candidate it starts at the value of the system, and the search covers both sides of it.
+        if isinstance(item, (Free, CalibrationTerm)):
+            item = dataclasses.replace(item, start=type(item).start if isinstance(item, CalibrationTerm) else None)
+        free, bounds = _unbounded(system, item, always=True)
+        removable.append(Candidate(", ".join(names), free=(free,), plausible=bounds))
+    if not (candidates or removable):
+        raise ValueError(
+            "forward_selection: `candidates` is empty. Pass names of parameters, `Gain`, `Offset`, `Delay` or "
+            "`Candidate`."
+        )
+    names = [candidate.name for candidate in (*removable, *candidates)]
+    twice = sorted({name for name in names if names.count(name) > 1} - {c.name for c in removable})
+    if twice:
+        raise ValueError(
+            f"Two candidates have the name {', '.join(twice)}. Give each candidate its own name: Candidate(name, ...)."
+        )
+    for candidate in candidates:
+        _refuse_nothing_new(fit, candidate)
+    specification = dataclasses.replace(fit.problem.specification, free=tuple(base) or ())
+    for group in compatible_groups(fit, candidates):
+        extended_specification(specification, group)  # rejects inconsistent candidates
+    return Terms(specification, tuple(removable), candidates)
+
+
+def _candidate(fit: Fit, item: Item | Candidate) -> Candidate:
+    """The checked candidate. The bounds of a parameter that starts on one of them become its plausible range, as for
+    friction at zero.
+    """
+    if not isinstance(item, Candidate):
+        item = Candidate(str(item), free=(item,))
+        if not any(getattr(one, "each", None) for one in item.items):
+            names = _names_of(fit.problem.system, _unbounded(fit.problem.system, item.items[0])[0])
+            item = dataclasses.replace(item, name=", ".join(names))
+    system = item.system or fit.problem.system
+    if not isinstance(system, System):
+        raise TypeError(f"{item.name}: `system` must be a jaxkane.System, got {type(system).__name__}.")
+    for one in item.items:
+        if getattr(one, "each", None):
+            raise ValueError(
+                f"{item.name}: a candidate with `each` is not supported. Free it in a second fit, and compare the "
+                "`bic` of both."
+            )
+    unbounded = [_unbounded(system, one) for one in item.items]
+    free = tuple(one for one, _ in unbounded)
+    bounds = {name: pair for _, of_one in unbounded for name, pair in of_one.items()}
+    known = [name for one in free for name in _names_of(system, one)]
+    refuse_unknown(
+        item.plausible, (*known, *fit.names), f"{item.name}: `plausible` contains unknown names:", "the names are"
+    )
+    return dataclasses.replace(item, free=free, plausible={**bounds, **item.plausible})
+
+
+def _unbounded(system: System, item: Item, always: bool = False) -> tuple[Item, Mapping[str, Bounds]]:
+    """The item without bounds, and the bounds, if it starts on one of them (or `always`). Otherwise the same item."""
+    named = Free(item) if isinstance(item, str) or callable(item) else item
+    if not isinstance(named, (Free, CalibrationTerm)):
+        return item, {}
+    free = parameters_of(system, named)
+    ends = [(float(one.lower), float(one.upper)) for one in free.bijections if isinstance(one, Interval)]
+    if not always and not any(start in pair for start, pair in zip(np.asarray(free.start), ends, strict=True)):
+        return item, {}
+    finite = {name: pair for name, pair in zip(free.names, ends, strict=True) if np.isfinite(pair).any()}
+    return dataclasses.replace(named, bounds=(None, None)), finite
+
+
+def _names_of(system: System, *items: Item) -> tuple[str, ...]:
+    """Names of the parameters that the items free."""
+    return parameters_of(system, [item for item in items if not is_eliminated(item)]).names
+
+
+def _refuse_nothing_new(fit: Fit, candidate: Candidate) -> None:
+    names = candidate.names(fit.problem.system)
+    free = [name for name in names if name in fit.names]
+    if free:
+        raise ValueError(f"{candidate.name}: the fit already estimates {', '.join(free)}. Leave this candidate out.")
+    known = deviations_by_name(fit.problem.specification.unknown)
+    starts = [name for name in deviations_by_name(candidate.unknown) if name in known]
+    if starts:
+        raise ValueError(
+            f"{candidate.name}: the initial values of {', '.join(starts)} are already `unknown` in the fit. Leave them "
+            "out of the candidate."
+        )
+    if not names and candidate.has_parameters_only:
+        raise ValueError(
+            f"{candidate.name}: the candidate adds no parameter and no unknown initial value. Pass `free` or `unknown`."
+        )
+
+
+def compatible_groups(fit: Fit, candidates: Sequence[Candidate]) -> list[list[Candidate]]:
+    """Groups of candidates that can be combined in one problem: the same system and the same unknown initial states.
+
+    A delay of an input under a zero-order hold has a group of its own. The delay replaces discontinuities of the input
+    by ramps of two steps, so the trajectories differ slightly even for a zero delay.
+    """
+    groups: list[list[Candidate]] = []
+    for candidate in candidates:
+        group = next((group for group in groups if _are_compatible(fit, group[0], candidate)), None)
+        if group is None:
+            groups.append([candidate])
+        else:
+            group.append(candidate)
+    return groups
+
+
+def _are_compatible(fit: Fit, a: Candidate, b: Candidate) -> bool:
+    same = deviations_by_name(a.unknown) == deviations_by_name(b.unknown) and _delayed(fit, a) == _delayed(fit, b)
+    return same and bool(eqx.tree_equal(*(c.system or fit.problem.system for c in (a, b))))
+
+
+def _delayed(fit: Fit, candidate: Candidate) -> set[str]:
+    """Inputs under a zero-order hold that a candidate delays."""
+    delayed = {name for item in candidate.items if isinstance(item, Delay) for name in item.channels}
+    return delayed & {*fit.problem.model.zero_order_hold}
+
+
+def extended_specification(base: ProblemSpec, candidates: Sequence[Candidate]) -> ProblemSpec:
+    """The specification with these candidates added.
+
+    **Raises:** `ValueError` if two of them free the same parameter differently, or have incompatible systems.
+    """
+    system = base.system
+    for candidate in candidates:
+        other = candidate.system
+        if other is None or bool(eqx.tree_equal(other, system)):
+            continue
+        if system is not base.system and not isinstance(other, type(system)):  # system of a previous candidate
+            if isinstance(system, type(other)):
+                continue  # the previous system extends this one
+            raise ValueError(
+                f"{candidate.name}: its `system`, {type(other).__name__}, is not a subclass of "
+                f"{type(system).__name__}, the `system` of another candidate. Derive one class from the other."
+            )
+        system = other
+    items: list[tuple[Any, tuple[str, ...]]] = []
+    for item in (item for candidate in candidates for item in candidate.items):
+        names = _names_of(system, item)
+        same = [other for other, other_names in items if set(other_names) & set(names)]
+        if any(other is not item and not bool(other == item) for other in same):
+            raise ValueError(
+                f"Two candidates free {', '.join(names)} with different options. Use the same declaration in both."
+            )
+        if not same:
+            items.append((item, names))
+    unknown = deviations_by_name(base.unknown)
+    for candidate in candidates:
+        unknown |= deviations_by_name(candidate.unknown)
+    return dataclasses.replace(base, system=system, free=[*base.free, *(item for item, _ in items)], unknown=unknown)
+
+
+def augmented_problem(
+    base: ProblemSpec, at: tuple[Problem, Unknowns, Sequence[str]], candidates: Sequence[Candidate]
+) -> tuple[Problem, Unknowns]:
+    """The problem in which all these candidates are free, and a point of another problem as a point of it.
+
+    **Arguments:**
+
+    - `at`: the other problem, its point, and the names of the parameters whose values are used.
+
+    **Raises:** `ValueError` if a system lacks a parameter that is free in the fit, or if two candidates free the same
+    parameter differently.
+    """
+    source, point, names = at
+    specification = extended_specification(base, candidates)
+    if source.chooses_steps:  # use the steps that the fit has chosen
+        step = float(np.median(np.asarray(source.windows.step)))
+        simulation = dataclasses.replace(specification.simulation or Simulation(), step=step)
+        specification = dataclasses.replace(specification, simulation=simulation)
+    problem = source.with_specification(specification)
+    return problem, mapped_point(source, point, problem, names)
+
+
+def with_scales(candidate: Candidate, problem: Problem, norms: np.ndarray, size: float) -> Candidate:
+    """The candidate with a scale for each parameter that starts at zero and has no scale.
+
+    The scale is the value that changes the residuals by `size`, if the columns of the linearized problem have these
+    `norms` (p,). The default scale of 1 depends on the units: with masses of 1e-12 kg, the data seem to be insensitive
+    to all other parameters.
+    """
+    names, starts = problem.parameters.names, np.asarray(problem.parameters.start)
+
+    def scaled(item: Item) -> Item:
+        item = Free(item) if isinstance(item, str) or callable(item) else item
+        places = [names.index(name) for name in _names_of(problem.system, item)]
+        norm = np.linalg.norm(norms[places])
+        if not isinstance(item, (Free, CalibrationTerm)) or item.scale is not None or starts[places].any() or not norm:
+            return item
+        return dataclasses.replace(item, scale=float(size / norm))
+
+    return dataclasses.replace(candidate, free=tuple(map(scaled, candidate.items)))
+
+
+def mapped_point(source: Problem, at: Unknowns, problem: Problem, names: Sequence[str]) -> Unknowns:
+    """A point of one problem as a point of another with more unknowns. The additional unknowns have their initial
+    guess.
+    """
+    values = dict(zip(source.parameters.names, np.asarray(source.parameters.values(at.parameters)), strict=True))
+    point = problem.at({name: float(values[name]) for name in names}, problem.start)
+    new, old = problem.model.nuisance, source.model.nuisance
+    z = point.window_starts
+    if old.window_names:
+        places = np.array([new.window_names.index(name) for name in old.window_names])
+        z = on_device(with_entries(np.asarray(z).T, places, np.asarray(at.window_starts).T).T)
+    return Unknowns(point.parameters, at.trial_unknowns, z)

@@ -1,0 +1,1 @@
+"""The problem of a fit: trials, windows, parameters, the model of the measurements, and the specification."""

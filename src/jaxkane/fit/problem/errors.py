@@ -1,0 +1,394 @@
+"""Models of measurement errors: autoregressive, Student's t and Huber's. They do not depend on a system."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import gammaln
+from jax.scipy.stats import norm
+from jaxtyping import Array, Bool, Float
+
+from ..._common.lookup import real_number, refuse_unknown
+from ..._scalarjit.cache_key import jit
+from ..._scalarjit.compat import on_device
+from .trial import Trial
+
+LOG_2PI = 1.8378770664093453
+LARGEST_PARTIAL_AUTOCORRELATION, MOST_DEGREES_OF_FREEDOM = 1 - 1e-5, 1e4
+LOG_MOST = float(np.log(MOST_DEGREES_OF_FREEDOM))
+"""Upper bounds in the search for the parameters of an error model. A t distribution with 1e4 degrees of freedom is
+practically normal."""
+NORMAL = 1e12
+"""Degrees of freedom, or a threshold, with which residuals of any size are treated as normal. With 1e4 degrees of
+freedom, the first fit took 50 or more steps if residuals were 1e4 times `sigma`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AutoRegressive:
+    """Measurement errors that are correlated in time.
+
+        e_t = phi_1 e_{t-1} + phi_2 e_{t-2} + innovation
+
+    The likelihood is exact: the process is stationary, and missing samples (NaN) are integrated out by a Kalman filter
+    (Jones, Technometrics 22, 1980). Each window starts with the stationary variance, independently of the one before.
+
+    **Arguments:**
+
+    - `order`: 1 or 2. Order 0 is white noise.
+
+    **Raises:** `ValueError` for another order.
+    """
+
+    order: int = 1
+
+    def __post_init__(self) -> None:
+        if self.order not in (0, 1, 2):
+            raise ValueError(f"AutoRegressive: `order` is {self.order!r}. Pass order=1 or order=2.")
+
+    def __str__(self) -> str:
+        return f"AR({self.order})" if self.order else "white noise"
+
+
+@dataclasses.dataclass(frozen=True)
+class StudentT:
+    """Measurement errors with heavy tails: Student's t distribution (Lange, Little and Taylor, JASA 84, 1989).
+
+    **Arguments:**
+
+    - `degrees_of_freedom`: a number of at least 1; by default (None) it is estimated.
+
+    **Raises:** `ValueError` if the number is below 1 or not finite.
+    """
+
+    degrees_of_freedom: float | None = None
+
+    def __post_init__(self) -> None:
+        nu = self.degrees_of_freedom
+        # Below 1, a few residuals of exactly zero make the likelihood infinite at scale zero.
+        if nu is not None and not 1 <= real_number(nu, "StudentT: `degrees_of_freedom`") < np.inf:
+            raise ValueError(f"StudentT: `degrees_of_freedom` is {nu!r}. Pass a finite number of at least 1.")
+
+    def __str__(self) -> str:
+        return "Student's t"
+
+
+@dataclasses.dataclass(frozen=True)
+class Huber:
+    """Measurement errors with a few outliers: Huber's loss (Annals of Mathematical Statistics 35, 1964).
+
+        loss = u^2 / 2 for |u| <= threshold, else threshold |u| - threshold^2 / 2,   u = residual / (scale sigma)
+
+    The scale is the median of |residual / sigma|, divided by 0.6745. The covariance of the estimates is Huber's
+    sandwich estimator.
+
+    **Arguments:**
+
+    - `threshold`: the threshold in units of the scale. With 1.345, the efficiency for normal errors is 95 %.
+
+    **Raises:** `ValueError` if the threshold is not positive and finite.
+    """
+
+    threshold: float = 1.345
+
+    def __post_init__(self) -> None:
+        if not 0 < real_number(self.threshold, "Huber: `threshold`") < np.inf:
+            raise ValueError(f"Huber: `threshold` is {self.threshold!r}. Pass a positive number, such as 1.345.")
+
+    def __str__(self) -> str:
+        return f"Huber({self.threshold:g})"
+
+
+Distribution = AutoRegressive | StudentT | Huber
+WHITE = AutoRegressive(0)
+
+
+class Numbers(eqx.Module):
+    """The parameters of an error model, or, with a leading axis (n_c,), those of all channels.
+
+    - `phi`: coefficients (2,) of the autoregression.
+    - `scale`: the standard deviation or scale of the innovations, in units of `Trial.sigma`.
+    - `shape`: degrees of freedom, or Huber's threshold in units of `scale`.
+    - `slope`: square root of the Fisher information about u = residual / scale in one residual; 1 for normal errors.
+    """
+
+    phi: Float[Array, "*n_c 2"]
+    scale: Float[Array, "*n_c"]
+    shape: Float[Array, "*n_c"]
+    slope: Float[Array, "*n_c"]
+
+
+class Whitened(NamedTuple):
+    """The whitened residuals of one window.
+
+    - `u`: standardized innovations (n_c, n_t).
+    - `r`: least-squares residuals (n_c, n_t). Their gradient J^T r is that of minus the log likelihood, and J^T J is
+        the expected information.
+    - `cost`: minus twice the log likelihood.
+    """
+
+    u: Array
+    r: Array
+    cost: Array
+
+
+class Errors(eqx.Module):
+    """The error model of every channel. `numbers` is separate from `distributions`, so new values do not cause a
+    recompilation."""
+
+    distributions: tuple[Distribution, ...] = eqx.field(static=True)
+    numbers: Numbers
+
+    @classmethod
+    def initial(cls, distributions: Sequence[Distribution]) -> Errors:
+        """Independent normal errors with the given `sigma`, so that the first fit is ordinary least squares."""
+        one = np.ones(len(distributions))
+        numbers = Numbers(np.zeros((len(one), 2)), one, NORMAL * one, one)  # type: ignore[arg-type]
+        return cls(tuple(distributions), jax.tree.map(lambda x: on_device(x, jnp.result_type(float)), numbers))
+
+    def whitened(self, difference: Array, weight: Array) -> Whitened:
+        """Whiten the residuals of one window.
+
+        **Arguments:**
+
+        - `difference`: (simulated - measured) / sigma (n_c, n_t), zero where `weight` is zero.
+        - `weight`: 1 / sigma (n_c, n_t), zero where a sample is missing.
+        """
+
+        def of_channel(i):
+            return jax.tree.map(lambda x: x[i], self.numbers)
+
+        seen, places = weight > 0, range(len(self.distributions))
+        parts = [_channel(self.distributions[i], of_channel(i), difference[i], seen[i]) for i in places]
+        u, r, cost = (jnp.stack(rows) for rows in zip(*parts, strict=True))
+        of_sigma = -2.0 * jnp.sum(jnp.log(jnp.where(seen, weight, 1.0)))
+        return Whitened(u, r, jnp.sum(cost) + of_sigma)
+
+    def estimated(self, difference: np.ndarray, weight: np.ndarray, smallest: np.ndarray) -> Errors:
+        """Estimate the parameters of the error models: by maximum likelihood, or Huber's scale from the median.
+
+        **Arguments:**
+
+        - `difference`: (simulated - measured) / sigma (W, n_c, n_t).
+        - `weight`: 1 / sigma (W, n_c, n_t), zero where a sample is missing.
+        - `smallest`: the smallest allowed scale of each channel (n_c,).
+        """
+        before = jax.device_get(self.numbers)
+        columns = [
+            _estimate(
+                d, difference[:, i], weight[:, i] > 0, float(smallest[i]), jax.tree.map(lambda x, i=i: x[i], before)
+            )
+            for i, d in enumerate(self.distributions)
+        ]
+        dtype = self.numbers.scale.dtype
+        return Errors(self.distributions, jax.tree.map(lambda *xs: on_device(np.stack(xs), dtype), *columns))
+
+    @property
+    def n_estimated(self) -> int:
+        """The number of estimated parameters: the scale of every channel, and coefficients or degrees of freedom."""
+        more = (d.order if isinstance(d, AutoRegressive) else d == StudentT() for d in self.distributions)
+        return len(self.distributions) + sum(map(int, more))
+
+    @property
+    def values(self) -> list[dict[str, float]]:
+        """The parameters of every channel by name, with scales in units of `Trial.sigma`."""
+        rows = []
+        for i, d in enumerate(self.distributions):
+            scale, shape = float(self.numbers.scale[i]), float(self.numbers.shape[i])
+            if isinstance(d, AutoRegressive):
+                phi = np.asarray(self.numbers.phi[i]).tolist()
+                rows.append({"scale": scale, **{f"phi_{j + 1}": phi[j] for j in range(d.order)}})
+            elif isinstance(d, StudentT):
+                rows.append({"scale": scale, "degrees of freedom": shape})
+            else:
+                # A fit that was interrupted before the first estimate still has the normal limit `NORMAL` as its shape.
+                rows.append({"scale": scale * (shape / d.threshold if shape < 0.1 * NORMAL else 1.0)})
+        return rows
+
+    def described(self, channels: Sequence[str]) -> str:
+        """The parameters of all channels as text."""
+        parts = []
+        for channel, d, values in zip(channels, self.distributions, self.values, strict=True):
+            numbers = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+            parts.append(f"{channel} {d} ({numbers})")
+        return f"Errors, with scales in units of sigma: {'; '.join(parts)}"
+
+
+@jit
+def whitened(errors: Errors, windows: Any, simulated: Array) -> Array:
+    """Standardized innovations (W, n_c, n_t); NaN where a sample is missing."""
+
+    def of_window(window):
+        measured, weight, y = window
+        seen = weight > 0
+        u = errors.whitened(jnp.where(seen, (y - measured) * weight, 0.0), weight).u
+        return jnp.where(seen, u, jnp.nan)
+
+    return jax.vmap(of_window)((windows.measured, windows.weight, simulated))
+
+
+def errors_of(errors: Any, trials: Sequence[Trial], channels: Sequence[str]) -> Errors | None:
+    """The error models from the argument `errors` of a fit.
+
+    **Raises:** `TypeError` if a value is not an error model; `ValueError` for an unknown channel, or for an
+    autoregression of samples that are not equally spaced.
+    """
+    if errors is None:
+        return None
+    named: dict[str, Any] = dict(errors) if isinstance(errors, Mapping) else dict.fromkeys(channels, errors)
+    refuse_unknown(named, channels, "`errors` contains unknown channels:", "the channels are")
+    for name, d in named.items():
+        if not isinstance(d, (AutoRegressive, StudentT, Huber)):
+            raise TypeError(
+                f"`errors` of {name} is {d!r}. Pass AutoRegressive(order=1), StudentT() or Huber(), for all channels "
+                "or in a dict by channel."
+            )
+        if isinstance(d, AutoRegressive) and d.order:
+            _check_spacing(name, [trial for trial in trials if name in trial.measured])
+    return Errors.initial([named.get(channel, WHITE) for channel in channels])
+
+
+def _check_spacing(channel: str, trials: Sequence[Trial]) -> None:
+    interval = float(np.median(np.diff(trials[0].t)))
+    for trial in trials:
+        wrong = np.abs(np.diff(trial.t) - interval) > 0.01 * interval
+        if np.any(wrong):
+            i = int(np.argmax(wrong))
+            raise ValueError(
+                f"{trial.name}: the samples at t = {trial.t[i]:.6g} s and {trial.t[i + 1]:.6g} s are not "
+                f"{interval:.6g} s apart. An autoregression of {channel} needs equal intervals. Add rows of NaN where "
+                "samples are missing, or interpolate the channel."
+            )
+
+
+def _channel(d: Distribution, n: Numbers, e: Array, seen: Array) -> tuple[Array, Array, Array]:
+    """u, r and minus twice the log likelihood of one channel (n_t,), for residuals in units of `sigma`."""
+    u, counted = e / n.scale, lambda x: jnp.sum(jnp.where(seen, x, 0.0))
+    if isinstance(d, AutoRegressive):
+        log_variance = jnp.zeros_like(u)
+        if d.order:
+            u, log_variance = innovations(n.phi, u, seen)
+        return u, u, counted(u**2 + log_variance + LOG_2PI + 2.0 * jnp.log(n.scale))
+    if isinstance(d, StudentT):
+        nu = n.shape
+        psi, loss = (nu + 1.0) * u / (nu + u**2), (nu + 1.0) * jnp.log1p(u**2 / nu)
+        log_norm = gammaln(0.5 * nu) - gammaln(0.5 * (nu + 1.0)) + 0.5 * jnp.log(jnp.pi * nu)
+        # With 1e12 degrees of freedom, the difference of the two gammaln is lost in rounding, so use the normal limit.
+        log_norm = jnp.where(nu < 10.0 * MOST_DEGREES_OF_FREEDOM, log_norm, 0.5 * LOG_2PI)
+    else:
+        c = n.shape
+        psi = jnp.clip(u, -c, c)
+        loss = psi * (2.0 * u - psi)
+        log_norm = 0.5 * LOG_2PI + jnp.log(2.0 * norm.cdf(c) - 1.0 + 2.0 * norm.pdf(c) / c)
+    # The value of r is psi / slope and its derivative is slope. J^T r is then the gradient of the loss, and J^T J is
+    # the expected information. Do not use the derivative psi' instead: it is zero or negative for outliers.
+    r = n.slope * u + jax.lax.stop_gradient(psi / n.slope - n.slope * u)
+    return u, r, counted(loss + 2.0 * (log_norm + jnp.log(n.scale)))
+
+
+def innovations(
+    phi: Float[Array, " 2"], e: Float[Array, " n_t"], seen: Bool[Array, " n_t"]
+) -> tuple[Float[Array, " n_t"], Float[Array, " n_t"]]:
+    """Standardized innovations of a stationary autoregression, and the logarithm of their variance.
+
+    The driving noise has variance one. The results are zero where a sample is not `seen`. Innovations are linear in e.
+    """
+    variance = (1.0 - phi[1]) / ((1.0 + phi[1]) * ((1.0 - phi[1]) ** 2 - phi[0] ** 2))
+    covariance = phi[0] * variance / (1.0 - phi[1])
+    one = jnp.ones((), e.dtype)
+
+    def step(known: Any, now: Any) -> Any:
+        (x, before), (p, q, s) = known  # predicted means of e_t and e_{t-1}; var e_t, covariance, var e_{t-1}
+        y, there = now
+        gain = jnp.where(there, q / p, 0.0)
+        innovation = jnp.where(there, y - x, 0.0)
+        out = innovation / jnp.sqrt(p), jnp.where(there, jnp.log(p), 0.0)
+        # A measured e_t has exactly zero variance. Computing p - p^2 / p instead would leave a rounding error.
+        x, before, s = jnp.where(there, y, x), before + gain * innovation, s - gain * q
+        p, q = jnp.where(there, 0.0, p), jnp.where(there, 0.0, q)
+        predicted = phi[0] ** 2 * p + 2.0 * phi[0] * phi[1] * q + phi[1] ** 2 * s + one
+        return ((phi[0] * x + phi[1] * before, x), (predicted, phi[0] * p + phi[1] * q, p)), out
+
+    zero = jnp.zeros_like(one)
+    _, out = jax.lax.scan(step, ((zero, zero), (variance, covariance, variance)), (e, seen))
+    return out
+
+
+def _numbers(d: Distribution, theta: Array, smallest: Array) -> Numbers:
+    """Parameters of an error model from unconstrained variables: one for the scale, others for partial
+    autocorrelations or the degrees of freedom."""
+    one, scale = jnp.ones((), theta.dtype), jnp.sqrt(jnp.exp(2.0 * theta[0]) + smallest**2)
+    if isinstance(d, AutoRegressive):
+        # Durbin and Levinson: partial autocorrelations with magnitudes below one always give a stationary process.
+        pacf = LARGEST_PARTIAL_AUTOCORRELATION * jnp.tanh(theta[1:])
+        pacf = jnp.concatenate([pacf, jnp.zeros(2 - d.order, theta.dtype)])
+        return Numbers(jnp.stack([pacf[0] * (1.0 - pacf[1]), pacf[1]]), scale, one, one)
+    nu = d.degrees_of_freedom * one if theta.shape[0] == 1 else jnp.exp(LOG_MOST * jax.nn.sigmoid(theta[1]))  # type: ignore[union-attr]
+    return Numbers(jnp.zeros(2, theta.dtype), scale, nu, jnp.sqrt((nu + 1.0) / (nu + 3.0)))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _mean_cost(d: Distribution, theta: Array, smallest: Array, e: Array, seen: Array) -> Any:
+    """Minus twice the log likelihood per sample of all windows (W, n_t), its gradient and Hessian, and the
+    `Numbers`."""
+
+    def cost(theta):
+        numbers = _numbers(d, theta, smallest)
+        of_windows = jax.vmap(lambda e, seen: _channel(d, numbers, e, seen)[2])(e, seen)
+        return jnp.sum(of_windows) / jnp.sum(seen, dtype=e.dtype)
+
+    gradient = jax.jacfwd(cost)
+    return cost(theta), gradient(theta), jax.jacfwd(gradient)(theta), _numbers(d, theta, smallest)
+
+
+def _estimate(d: Distribution, e: np.ndarray, seen: np.ndarray, smallest: float, before: Numbers) -> Numbers:
+    """Estimate the parameters of one channel from its residuals (W, n_t). Without measurements, return `before`."""
+    flat = np.asarray(e, float)[seen]
+    if not flat.size:
+        return before
+    median = max(float(np.median(np.abs(flat))) / 0.6744897501960817, smallest)
+    rms = max(float(np.sqrt(np.mean(flat**2))), smallest)
+    if d == WHITE:
+        return Numbers(np.zeros(2), rms, 1.0, 1.0)  # type: ignore[arg-type]
+    if isinstance(d, Huber):
+        psi = np.clip(flat / median, -d.threshold, d.threshold)
+        inside, square = np.mean(np.abs(flat) <= d.threshold * median), np.mean(psi**2)
+        # The loss is rescaled so that the mean square of its gradient equals the information. Channels are then
+        # weighted by their information, and the covariance of the estimates is Huber's sandwich without a factor.
+        root = np.sqrt(inside / square)
+        return Numbers(np.zeros(2), median / root, d.threshold * root, np.sqrt(inside))  # type: ignore[arg-type]
+    if isinstance(d, AutoRegressive):
+        both = seen[:, 1:] & seen[:, :-1]
+        r = np.clip(np.sum(e[:, 1:] * e[:, :-1], where=both) / max(both.sum(), 1) / rms**2, -0.99, 0.99)
+        theta = [np.log(rms * np.sqrt(1 - r**2)), np.arctanh(r), 0.0][: 1 + d.order]
+    else:
+        theta = [np.log(median), -1.7][: 1 + (d.degrees_of_freedom is None)]  # four degrees of freedom
+    arrays = on_device(smallest, e.dtype), on_device(e), on_device(seen)
+    return _minimum(lambda theta: jax.device_get(_mean_cost(d, on_device(theta, e.dtype), *arrays)), np.array(theta))
+
+
+def _minimum(evaluate: Callable[[np.ndarray], Any], theta: np.ndarray) -> Numbers:
+    """Newton's method with steps of length 1 or less.
+
+    SciPy's minimizers are not used: they compare values, so rounding hides the last steps, and they need several times
+    as many evaluations.
+    """
+    value, gradient, hessian, numbers = evaluate(theta)
+    for _ in range(100):
+        curvatures, V = np.linalg.eigh(hessian.astype(float))
+        step = -V @ (V.T @ gradient / np.maximum(np.abs(curvatures), 1e-5))
+        step /= max(1.0, float(np.linalg.norm(step)))
+        tried = evaluate(theta + step)
+        while not tried[0] <= value + 1e-12 * (1 + abs(value)) and np.abs(step).max() > 1e-6:
+            step /= 4
+            tried = evaluate(theta + step)
+        theta, (value, gradient, hessian, numbers) = theta + step, tried
+        if np.abs(step).max() <= 1e-9:
+            break
+    return numbers

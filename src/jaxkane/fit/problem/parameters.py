@@ -1,0 +1,453 @@
+"""The free parameters of a fit: maps between unconstrained variables and values, priors, and subsets."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+import numpy as np
+import scipy.linalg
+from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
+
+from ..._common.lookup import real_number
+from ..._scalarjit.cache_key import jit
+from ..._scalarjit.compat import Tracer, on_device
+from ..._scalarjit.scalar_function import ScalarFunction
+from ..._system.system import System
+from .bijections import Interval, PossibleBody
+from .declarations import (
+    Prior,
+)
+from .trial import Trial, groups_of
+
+LOW_PASSES = ("time constant", "time constant (twice)")
+"""Kinds of `LowPass`, by their order."""
+
+
+class Entry(NamedTuple):
+    """One estimated value: a parameter of the system, of an input, of a channel or of the noise.
+
+    - `name`: the name of the value.
+    - `unit`: its unit.
+    - `targets`: the entries of the system that are set: triples (index of the leaf, index of the entry, factor).
+    - `roles`: pairs such as ("gain of input", name), ("spectral density", name), ("noise scale", channel).
+    - `part`: the name of the learned function to which the value belongs, or "".
+    - `group`: the label and its value for the trials to which the value applies; None for all trials.
+    """
+
+    # A tuple, because JAX compares these entries when it looks up a compiled program. With an __eq__ in Python, Ctrl-C
+    # raised KeyboardInterrupt there. JAX converted it to a ValueError, and the fit was lost.
+    name: str
+    unit: str
+    targets: tuple[tuple[int, int, float], ...] = ()
+    roles: tuple[tuple[str, str], ...] = ()
+    part: str = ""
+    group: tuple[str, str | float] | None = None
+
+    @property
+    def start_means_something(self) -> bool:
+        """Whether the initial guess indicates the size of the value. This is not so for learned parameters, noise,
+        offsets, delays and time constants."""
+        kind = self.roles[0][0].partition(" of ")[0] if self.roles else ""
+        return not self.part and kind not in ("spectral density", "noise scale", "offset", "delay", *LOW_PASSES)
+
+
+class Parameters(eqx.Module):
+    """The free parameters of a fit: maps from unconstrained variables x (p,) to values (p,).
+
+    The search starts at x = 0. A change of x by one is a typical change of the parameter. `start` contains the initial
+    guesses. If one is at its bound, the search starts inside (see `Free`).
+
+    Each map is a bijection from its own part of x to the same number of values: see `Interval` and `PossibleBody`. In a
+    `subset`, only the entries at `places` (p,) are free, and `rest` contains the x of all entries. The places are data,
+    so all subsets of the same size use the same compiled program.
+
+    Joint priors of several values, and priors of logarithms, are rows (joint_matrix [values, log values] -
+    joint_target) / joint_deviation. `distributions` contains (name, first row, end of the rows) of each distribution.
+    Its standard deviation is estimated, in standard deviations of a residual.
+
+    With exact sums and inequalities, the bijections give `mixing`^-1 values: each sum replaces one of its parameters.
+    This parameter must remain within `limits` (all, 2). `inequalities` contains each sum as text and its index. The
+    indices of exact sums are not free.
+    """
+
+    all_entries: tuple[Entry, ...] = eqx.field(static=True)
+    bijections: tuple[Interval | PossibleBody, ...]
+    start: Float[Array, " p"]
+    scale: Float[Array, " p"]
+    prior_mean: Float[Array, " p"]
+    prior_deviation: Float[Array, " p"]
+    places: Int[Array, " p"]
+    rest: Float[Array, " all"]
+    joint_matrix: Float[Array, "k 2*all"]
+    joint_target: Float[Array, " k"]
+    joint_deviation: Float[Array, " k"]
+    distributions: tuple[tuple[str, int, int], ...] = eqx.field(static=True, default=())
+    mixing: Float[Array, "all all"] | None = None
+    limits: Float[Array, "all 2"] | None = None
+    inequalities: tuple[tuple[str, int], ...] = eqx.field(static=True, default=())
+
+    @property
+    def has_prior(self) -> np.ndarray:
+        """Whether each parameter (p,) has a prior, separate or joint."""
+        n, joint = self.rest.size, np.any(np.asarray(self.joint_matrix) != 0, axis=0)
+        return np.isfinite(np.asarray(self.prior_deviation)) | (joint[:n] | joint[n:])[np.asarray(self.places)]
+
+    @property
+    def has_groups(self) -> bool:
+        """Whether some parameters differ between trials."""
+        return any(entry.group is not None for entry in self.all_entries)
+
+    @property
+    def shared_directions(self) -> Array:
+        """Directions (p, n) of differentiation: one per parameter, shared by all groups of the parameter."""
+        kinds = [tuple(places_of(e)) if e.group is not None else i for i, e in enumerate(self.all_entries)]
+        of = np.array([[kind == other for other in dict.fromkeys(kinds)] for kind in kinds], float)
+        return jnp.asarray(of)[self.places] if self.has_groups else jnp.eye(self.size)
+
+    def applies(self, trials: Sequence[Trial]) -> np.ndarray:
+        """Whether each parameter applies to each trial (T, all).
+
+        **Raises:** `ValueError` that names a trial whose group has no value of a parameter.
+        """
+        groups = {each: groups_of(trials, each) for each, _ in filter(None, (e.group for e in self.all_entries))}
+        own = np.ones((len(trials), len(self.all_entries)), bool)
+        values: dict[Any, list[int]] = {}  # by the entries that they set, the parameters of one group or of all trials
+        for i, entry in enumerate(self.all_entries):
+            if entry.group is not None:
+                each, value = entry.group
+                own[:, i] = [group == value for group in groups[each]]
+            values.setdefault(tuple(places_of(entry)), []).append(i)
+        for same in values.values():
+            has_value = own[:, same].any(axis=1)
+            if not has_value.all():
+                raise ValueError(
+                    f"{trials[int(np.argmin(has_value))].name} belongs to none of the groups of "
+                    f"{', '.join(self.all_entries[i].name for i in same)}. Leave the trial out, or give the parameter "
+                    "a distribution (prior='normal'), whose mean applies to other groups."
+                )
+        return own
+
+    def subset(self, places: Sequence[int], x: Float[Array, " p"]) -> Parameters:
+        """The parameters at `places`. All others keep their values at x."""
+        names = ("start", "scale", "prior_mean", "prior_deviation", "places")
+        new = {name: on_device(np.asarray(getattr(self, name))[list(places)]) for name in names}
+        return dataclasses.replace(self, **new, rest=self.all(x))
+
+    @property
+    def size(self) -> int:
+        """The number of free parameters."""
+        return self.places.size
+
+    @property
+    def whole(self) -> Parameters:
+        """All parameters as free ones, with the priors of this subset."""
+        n, zeros = self.rest.size, jnp.zeros_like(self.rest)
+        mean, deviation = map(on_device, self._all_priors)
+        new = {"start": zeros, "scale": zeros, "prior_mean": mean, "prior_deviation": deviation}
+        return dataclasses.replace(self, **new, places=jnp.arange(n, dtype=self.places.dtype), rest=zeros)
+
+    @property
+    def _all_priors(self) -> tuple[Any, Any]:
+        """Means and standard deviations (all,) of the priors; infinite standard deviations for fixed parameters."""
+        none, dtype = np.zeros(self.rest.size), self.start.dtype
+        pairs = ((none, self.prior_mean), (none + math.inf, self.prior_deviation))
+        mean, deviation = (with_entries(every.astype(dtype), self.places, np.asarray(x)) for every, x in pairs)
+        return mean, deviation
+
+    def all(self, x: Float[Array, " p"]) -> Float[Array, " all"]:
+        """The unconstrained variables of all parameters, free or fixed."""
+        every = with_entries(self.rest, self.places, x)
+        return every if _are_traced(every) else on_device(every)
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The number of values of each bijection."""
+        return tuple(f.size for f in self.bijections)
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        return tuple(self.all_entries[i] for i in np.asarray(self.places).tolist())
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.entries)
+
+    @property
+    def owners(self) -> list[int]:
+        """For every value, the index of its bijection."""
+        return np.repeat(np.arange(len(self.sizes)), self.sizes)[np.asarray(self.places)].tolist()
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return tuple(e.unit for e in self.entries)
+
+    @property
+    def learned(self) -> tuple[str, ...]:
+        """For every value, the name of its learned function, or "". A learned value is not meaningful by itself."""
+        return tuple(e.part for e in self.entries)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """The lower and upper bound of each value (p, 2), infinite without a bound. Values of bodies are not
+        bounded."""
+        none = [(-math.inf, math.inf)]
+        pairs = [[(f.lower, f.upper)] if isinstance(f, Interval) else none * f.size for f in self.bijections]
+        bounds = np.array([pair for of_one in pairs for pair in of_one], float)
+        if self.mixing is not None:
+            own = np.any(np.asarray(self.mixing) != np.eye(len(bounds)), axis=1)
+            bounds = np.where(own[:, None], np.asarray(self.limits), bounds)
+        return bounds[np.asarray(self.places)]
+
+    @property
+    def longest_steps(self) -> np.ndarray:
+        """The longest allowed step (p,) of every x: see `Interval.longest_step`."""
+        every = [[f.longest_step] if isinstance(f, Interval) else [math.inf] * f.size for f in self.bijections]
+        return np.concatenate(every)[np.asarray(self.places)]
+
+    def values(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
+        """Parameters in their own units."""
+        return self._of_free(self.all_values(x))
+
+    def inverse(self, values: Float[Array, " p"]) -> Float[Array, " p"]:
+        """The x (p,) of parameters in their own units; NaN outside their bounds."""
+        every = self._each(_value, self.rest)  # contains sums instead of some parameters
+        if self.mixing is not None:
+            sums, free = np.linalg.inv(np.asarray(self.mixing)), np.isin(np.arange(every.size), np.asarray(self.places))
+            new = np.array(with_entries(every, self.places, values))
+            rest = sums[np.ix_(~free, free)] @ new[free]
+            new[~free] = np.linalg.solve(sums[np.ix_(~free, ~free)], every[~free] - rest)
+            every = sums @ new
+        else:
+            every = with_entries(every, self.places, values)
+        return self._of_free(self._each(_inverse, every))
+
+    def slopes(self, x: Float[Array, " p"]) -> Float[Array, "p p"]:
+        """d values / d x."""
+        return self._of_free(self.all_slopes(x))
+
+    def all_slopes(self, x: Float[Array, " p"]) -> Any:
+        """d all_values / d all x (all, all)."""
+        slopes = self._each(_slope, with_entries(self.rest, self.places, x))
+        return (
+            slopes
+            if self.mixing is None
+            else (self.mixing if _are_traced(slopes) else np.asarray(self.mixing)) @ slopes
+        )
+
+    def _each(self, evaluate: Any, numbers: Any) -> Any:
+        """The results of all bijections: concatenated vectors, or a block-diagonal matrix.
+
+        Concrete numbers are evaluated by one compiled program per kind of bijection, which all fits share. This also
+        applies while another function is traced.
+        """
+        if _are_traced(self, numbers):
+            parts = [evaluate.__wrapped__(*pair) for pair in zip(self.bijections, self._parts(numbers), strict=True)]
+            return jnp.concatenate(parts) if parts[0].ndim == 1 else jsl.block_diag(*parts)
+        with jax.ensure_compile_time_eval():
+            pairs = zip(self.bijections, self._parts(np.asarray(numbers)), strict=True)
+            parts = [np.asarray(evaluate(*pair)) for pair in pairs]
+        return np.concatenate(parts) if parts[0].ndim == 1 else scipy.linalg.block_diag(*parts)
+
+    def _of_free(self, of_all: Any) -> Array:
+        if _are_traced(self.places, of_all):
+            return of_all[jnp.ix_(*[self.places] * of_all.ndim)]
+        return on_device(of_all[np.ix_(*[np.asarray(self.places)] * of_all.ndim)])
+
+    def log_determinant(self, x: Float[Array, " p"]) -> Array:
+        """log |det d values / d x|. Added to a log density of the values, this gives a log density of x."""
+        if self.mixing is not None:
+            return jnp.linalg.slogdet(jnp.asarray(self.slopes(x)))[1]
+        pairs = zip(self.bijections, self._parts(self.all(x)), strict=True)
+        return sum((jnp.linalg.slogdet(jax.jacfwd(f)(part))[1] for f, part in pairs), jnp.zeros((), x.dtype))
+
+    def all_values(self, x: Float[Array, " p"]) -> Any:
+        """The values of all parameters, free or fixed (all,)."""
+        every = with_entries(self.rest, self.places, x)
+        traced = _are_traced(self, every)
+        values = jnp.stack(_values(self.bijections, every)) if traced else self._each(_value, every)
+        if self.mixing is None:
+            return values
+        xp: Any = jnp if traced else np
+        values, limits = xp.asarray(self.mixing) @ values, xp.asarray(self.limits)
+        # A bijection does not keep a parameter that follows from a sum within its bounds. NaN makes the optimizer
+        # reject such a step.
+        return xp.where((values >= limits[:, 0]) & (values <= limits[:, 1]), values, xp.nan)
+
+    def _parts(self, x: Any) -> list[Any]:
+        split = np.split if isinstance(x, np.ndarray) else jnp.split
+        return split(x, np.cumsum(self.sizes)[:-1])
+
+    @jit
+    def apply(
+        self, system: System, x: Float[Array, " p"], applies: Array | None = None
+    ) -> tuple[System, dict[tuple[str, str], Array]]:
+        """Set the parameters.
+
+        **Arguments:**
+
+        - `system`: the `System` to change.
+        - `x`: the unconstrained variables (p,).
+        - `applies`: whether each parameter applies to the trial (all,). By default, parameters of groups do not.
+
+        **Returns:** the system, and a dict of gains, offsets, delays and noise parameters by ("gain of input", name).
+        """
+        leaves, structure = jax.tree.flatten(system)
+        calibration = {}
+        values = _values(self.bijections, self.all(x)) if self.mixing is None else [*self.all_values(x)]
+        for i, (entry, value) in enumerate(zip(self.all_entries, values, strict=True)):
+            if entry.group is not None and applies is None:
+                continue
+            own = functools.partial(_where, None if entry.group is None or applies is None else applies[i])
+            calibration |= {role: own(value, calibration.get(role, value)) for role in entry.roles}
+            for number, place, factor in entry.targets:
+                leaf, new = leaves[number], factor * value
+                new = own(new.astype(leaf.dtype), jnp.ravel(leaf)[place])
+                leaves[number] = new if leaf.ndim == 0 else jnp.ravel(leaf).at[place].set(new).reshape(leaf.shape)
+        return jax.tree.unflatten(structure, leaves), calibration
+
+    def prior_residuals(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
+        """(value - mean) / deviation; zero without a prior."""
+        numbers = self.values(x), self.prior_mean, self.prior_deviation
+        if _are_traced(numbers):
+            return (numbers[0] - numbers[1]) / numbers[2]
+        value, mean, deviation = map(np.asarray, numbers)
+        return on_device((value - mean) / deviation)
+
+    def joint_residuals(self, x: Float[Array, " p"]) -> Array:
+        """The residuals (k,) of joint priors and of priors of logarithms."""
+        if not self.joint_target.size:
+            return jnp.zeros(0, self.start.dtype)
+        values = jnp.asarray(self.all_values(x))
+        both = jnp.concatenate([values, jnp.log(jnp.where(self._logarithmic, values, 1.0))])
+        return (self.joint_matrix @ both - self.joint_target) / self.joint_deviation
+
+    def joint_slopes(self, x: Float[Array, " p"]) -> np.ndarray:
+        """d joint_residuals / d x (k, p)."""
+        matrix, n = np.asarray(self.joint_matrix, float), self.rest.size
+        values, slopes = np.asarray(self.all_values(x), float), np.asarray(self.all_slopes(x), float)
+        by_values = matrix[:, :n] + matrix[:, n:] / np.where(np.asarray(self._logarithmic), values, 1.0)
+        return by_values @ slopes[:, np.asarray(self.places)] / np.asarray(self.joint_deviation, float)[:, None]
+
+    @property
+    def _logarithmic(self) -> Array:
+        return jnp.any(self.joint_matrix[:, self.rest.size :] != 0, axis=0)
+
+    def sums(self, x: Float[Array, " p"]) -> np.ndarray:
+        """All values (all,), in which each exact sum or inequality replaces one parameter."""
+        return self._each(_value, self.all(x))
+
+    def is_near_bound(self, place: int, x: Float[Array, " p"]) -> bool:
+        """Whether the sum at this index is near its bound: its slope is below a tenth of the slope at the initial
+        guess. The sum has then covered nine tenths of the distance to the bound."""
+        slopes = [np.diagonal(self._each(_slope, at))[place] for at in (self.all(x), np.zeros(self.rest.size))]
+        return bool(abs(slopes[0]) < 0.1 * abs(slopes[1]))
+
+    def resting(self, place: int, x: Float[Array, " p"]) -> tuple[Parameters, np.ndarray]:
+        """The parameters with the sum at this index fixed at its nearer bound, and the x that remain free."""
+        free = np.asarray(self.places)
+        bijection = self.bijections[self.owners[int(np.flatnonzero(free == place)[0])]]
+        assert isinstance(bijection, Interval)
+        lower, upper = bijection.bounded
+        value = float(self.sums(x)[place])
+        at_lower = lower and (not upper or value - float(bijection.lower) < float(bijection.upper) - value)
+        kept = np.flatnonzero(free != place)
+        fixed = self.subset(kept.tolist(), x)
+        rest = np.array(fixed.rest)
+        rest[place] = (-1.0 if at_lower else 1.0) * bijection.far
+        return dataclasses.replace(fixed, rest=on_device(rest)), np.asarray(x)[kept]
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """The standard deviations (n,) of the distributions, in standard deviations of a residual."""
+        return np.asarray(self.joint_deviation, float)[[first for _, first, _ in self.distributions]]
+
+    def with_deviations(self, deviations: np.ndarray) -> Parameters:
+        """The same parameters with these standard deviations (n,) of the distributions."""
+        new = np.array(self.joint_deviation)
+        for (_, first, last), deviation in zip(self.distributions, deviations, strict=True):
+            new[first:last] = deviation
+        return dataclasses.replace(self, joint_deviation=on_device(new))
+
+    @property
+    def log_prior_constants(self) -> np.ndarray:
+        """log p(value) + prior_residual^2 / 2 of every entry (p,), with p the prior density in the entry's unit.
+
+        The density is Gaussian and truncated at the bounds, or uniform between the bounds. The result is NaN for
+        entries without such a density and for entries with a joint prior.
+        """
+        parts = [self._parts(np.asarray(x, float)) for x in self._all_priors]
+        constants = [f.log_prior_constants(*pair) for f, *pair in zip(self.bijections, *parts, strict=True)]
+        n, joint = self.rest.size, np.any(np.asarray(self.joint_matrix) != 0, axis=0)
+        alone = ~(joint[:n] | joint[n:]) & (self.mixing is None)
+        return np.where(alone, np.concatenate(constants), np.nan)[np.asarray(self.places)]
+
+    def with_priors(self, priors: Mapping[str, Prior]) -> Parameters:
+        """The same parameters with priors (mean, standard deviation) by name. Names that are not free are ignored."""
+        mean, deviation = np.array(self.prior_mean), np.array(self.prior_deviation)
+        for i, name in enumerate(self.names):
+            if name in priors:
+                mean[i], deviation[i] = checked_prior(name, priors[name])
+        new = (on_device(mean, self.start.dtype), on_device(deviation, self.start.dtype))
+        return eqx.tree_at(lambda p: (p.prior_mean, p.prior_deviation), self, new)
+
+
+@ScalarFunction.compile_cheaply
+def _values(bijections: tuple[Interval | PossibleBody, ...], x: Array) -> list[Array]:
+    """The value of each bijection, as one scalar function. XLA would compile this to a dozen kernels."""
+    places = np.cumsum([f.size for f in bijections])[:-1]
+    return [y for f, part in zip(bijections, jnp.split(x, places), strict=True) for y in f(part)]
+
+
+_value = jax.jit(lambda bijection, x: bijection(x))
+_inverse = jax.jit(lambda bijection, values: bijection.inverse(values))
+_slope = jax.jit(lambda bijection, x: jax.jacfwd(bijection)(x))
+
+
+def _are_traced(*numbers: Any) -> bool:
+    return any(isinstance(x, Tracer) for x in jax.tree.leaves(numbers))
+
+
+def with_entries(every: Any, places: Any, some: Any) -> Any:
+    """A copy of `every` with `some` at the unique indices `places` of the first axis. The result is a NumPy array if
+    no argument is traced."""
+    if _are_traced(every, places, some):
+        # With `unique_indices`, JAX differentiates this as one assignment. Without it, the derivative is ten kernels.
+        return jnp.asarray(every).at[places].set(some, unique_indices=True, mode="promise_in_bounds")
+    every = np.array(every)
+    every[np.asarray(places)] = some
+    return every
+
+
+def floats(numbers: ArrayLike) -> Array:
+    """Numbers as an array of JAX, with its default type."""
+    return on_device(numbers, jnp.result_type(float))
+
+
+def _where(applies: Array | None, new: Any, old: Any) -> Any:
+    return new if applies is None else jnp.where(applies, new, old)
+
+
+def places_of(entry: Entry) -> list[Any]:
+    """The entries of the system and the roles that an entry sets."""
+    return [*[target[:2] for target in entry.targets], *entry.roles]
+
+
+def checked_prior(name: str, prior: Any) -> tuple[float, float]:
+    try:
+        mean, deviation = (real_number(x, f"{name}: in a prior, what is given") for x in prior)
+    except (TypeError, ValueError):
+        mean = deviation = math.nan
+    if not (math.isfinite(mean) and deviation > 0):
+        raise ValueError(
+            f"{name}: `prior` must be (mean, standard deviation) with a positive standard deviation, got {prior!r}."
+        )
+    return mean, deviation

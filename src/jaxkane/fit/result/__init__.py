@@ -1,0 +1,1 @@
+"""Results of a fit: estimates and errors, tests, diagnostics, validation, comparison, reports."""

@@ -1,0 +1,463 @@
+"""Validation of parameters on trials that they were not estimated from: validation, cross-validation, prediction."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..._common.lookup import positive_number
+from ..._scalarjit.compat import on_device
+from ..._system.system import System
+from ..problem.declarations import Free
+from ..problem.from_declarations import leaf_names, parameters_of
+from ..problem.model import Unknowns
+from ..problem.problem import Problem
+from ..problem.specification import ProblemSpec, refuse_other, with_options
+from ..problem.trial import Trial, as_trials
+from ..solve.blocks import Blocks
+from ..solve.fit import minimize, uninterrupted
+from ..solve.linearization import Linearization
+from ..solve.local_unknowns import Unsimulated, solve_nuisance
+from ..solve.optimizers import LeastSquares
+from ..solve.step_refinement import finer
+from .diagnostics import AT_A_MINIMUM, STATUS
+from .fit_result import Fit
+from .linearized import folds_of
+from .statistics import LARGEST_LEVERAGE, intervals, t_quantile, trial_names
+from .tables import Rows, text_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_ADDED_SAMPLES = 100_000
+"""Largest number of samples of padding windows, which have zero weight. Simulating this many samples a few times takes
+as long as compiling a program without padding."""
+
+
+@with_options
+def validate(fit: Fit | System, trials: Sequence[Trial] | Trial, **options: Any) -> Fit:
+    """Predict trials with fixed parameters. Only initial states and trial unknowns (offsets, gains, delays) are
+    estimated.
+
+        jk.fit.validate(result, validation_trials).variance_accounted_for
+        jk.fit.validate(system, trials, unknown=("roll",))   # the parameter values of the system
+
+    **Arguments:**
+
+    - `fit`: a `Fit`, whose estimates and options are used, or a `System`, whose parameter values are used.
+    - `trials`: trials that were not used for the fit. The compiled program of the fit is reused if no trial has more or
+        longer windows than the fit.
+    - `**options`: options of `jaxkane.fit.fit` such as `unknown` and `window`. Pass them only with a `System`.
+
+    **Returns:** a `Fit` of these trials with the status "validated". Its `cost`, `variance_accounted_for`, `tests` and
+    report refer to these trials. The standard errors of its parameters are NaN, because the parameters were not fitted
+    to these trials. Trials that cannot be simulated with these parameters are left out; `failed` and `notes` state the
+    reason.
+
+    **Raises:** `ValueError` in the cases of `fit`, for trials that do not match the system, and if no trial can be
+    simulated; `TypeError` for another type of first argument, and for options passed with a `Fit`.
+    """
+    if isinstance(fit, System):
+        # A problem needs at least one free parameter. It is fixed below, like the others.
+        spec, x, room, method = ProblemSpec(fit, _first_number(fit), **options), None, None, "given values"
+    else:
+        refuse_other(fit, Fit, "validate", "validate(fit(...), trials) or validate(system, trials, unknown=...)")
+        if options:
+            raise TypeError(f"validate: the options {', '.join(options)} are already part of the Fit. Omit them.")
+        spec, x, room = fit.problem.specification, fit.point.parameters, fit.problem.windows.shape
+        method = fit.method
+    problem, failed = _posed(fit, spec, trials), {}
+    names = trial_names(problem)
+    while True:
+        if x is None:
+            none = problem.parameters.subset((), problem.start.parameters)
+            problem = dataclasses.replace(problem, model=eqx.tree_at(lambda m: m.parameters, problem.model, none))
+        parameters = problem.start.parameters if x is None else x
+        lost, fits = {}, []
+        for part, numbers in problem.parts(room, MOST_ADDED_SAMPLES):
+            try:
+                fits.append(_validated(part, dataclasses.replace(part.start, parameters=parameters), method))
+            except Unsimulated as error:
+                lost |= {numbers[k]: why for k, why in error.reasons.items()}
+        failed |= {names[k]: why for k, why in lost.items()}
+        if not lost:
+            return dataclasses.replace(_joined(problem, fits), failed=failed)
+        kept = [k for k in range(len(names)) if k not in lost]
+        if not kept:
+            name, why = next(iter(failed.items()))
+            raise ValueError(
+                f"validate: none of these trials can be simulated with these parameters: {name}, {why}. Check the "
+                "initial values of the trials."
+            )
+        problem = _posed(fit, spec, [problem.trials[k] for k in kept])
+        names = tuple(names[k] for k in kept)
+
+
+def _posed(fit: Fit | System, spec: ProblemSpec, trials: Sequence[Trial] | Trial) -> Problem:
+    """The problem of these trials, with the tolerances and the error models of the fit. Fixed steps are chosen for
+    these trials.
+    """
+    if not isinstance(fit, Fit):
+        return Problem.with_first_steps(spec, trials)
+    problem = Problem.with_first_steps(spec, trials, fit.parameters)
+    return problem.as_fine_as(fit.problem).with_errors_of(fit.problem)
+
+
+def _first_number(system: System) -> Any:
+    """A `Free` for the first parameter of a system.
+
+    **Raises:** `ValueError` for a system without parameters.
+    """
+    for name in leaf_names(system):
+        with contextlib.suppress(ValueError):
+            if parameters_of(system, Free(name, bounds=(None, None))).size:
+                return Free(name, bounds=(None, None))
+    raise ValueError(f"{type(system).__name__} has no parameter. Declare one with jk.parameter().")
+
+
+def _validated(problem: Problem, first: Unknowns, method: str) -> Fit:
+    """Estimate only the nuisance parameters.
+
+    **Raises:** `Unsimulated` if windows cannot be simulated with these parameters.
+    """
+    if problem.chooses_steps:
+        problem = finer(problem, first)
+    # Gauss-Newton steps converge quadratically. After a relative decrease below 1e-4, the next one is a rounding error.
+    point, at = solve_nuisance(problem, first, steps=20, rtol=1e-4)
+    return uninterrupted(Fit.of(problem, point, at, (at.cost,), "validated", method))
+
+
+def _joined(problem: Problem, fits: Sequence[Fit]) -> Fit:
+    """One fit of all trials from the fits of the parts."""
+    if len(fits) == 1:
+        return fits[0]
+
+    def joined(of: Callable[[Fit], Any]) -> Any:
+        """Arrays by window (W, ...) or by trial (T, ...) of all parts."""
+        return jax.tree.map(lambda *xs: on_device(np.concatenate([*map(np.asarray, xs)])), *map(of, fits))
+
+    problem = problem.with_steps(joined(lambda one: one.problem.windows.step))
+    b, z = joined(lambda one: (one.point.trial_unknowns, one.point.window_starts))
+    prediction = joined(lambda one: one.linearization.prediction)
+    # The number of triangular factors per window depends on the number of windows. QR reduces all to one factor.
+    R = joined(lambda one: np.linalg.qr(np.asarray(one.linearization.blocks.R), mode="r"))
+    at = Linearization(Blocks.of(problem.model.nuisance, R, problem.by_trial), prediction)
+    point = Unknowns(fits[0].point.parameters, b, z)
+    return Fit(problem, point, at, joined(lambda one: one.step_errors), (at.cost,), "validated", fits[0].method)
+
+
+@dataclasses.dataclass(frozen=True)
+class CrossValidation:
+    """The result of `cross_validate`: sums of squares of trials that are left out in turn. Print it for a table.
+
+    The initial states and unknowns of each trial are estimated with fixed parameters. For fits with process noise or
+    `errors`, the costs are minus twice the log likelihoods.
+
+    - `fit`: the fit of all trials.
+    - `trials`: names of the trials.
+    - `n` (T,): number of residuals.
+    - `at_start` (T,): cost with the initial guess of the parameters.
+    - `fitted` (T,): cost with the parameters of the fit of all trials.
+    - `held_out` (T,): cost with the parameters of the fit without the trial's fold. Infinite if the trial cannot be
+        simulated with them. NaN if the fit of the other trials has not converged or does not determine a parameter.
+    - `spread` (T,): sum of squares of the measurements about the mean of each channel, divided by `sigma`.
+    - `estimates`: by parameter, the estimate of each fold (n_folds,). NaN for a fold whose fit has not converged, and
+        for a parameter that the trials of the fold alone determine.
+    - `cost_name`: name of the cost, used in the text.
+    - `failures`: one sentence for each such fold, with the reason.
+    - `held_out_kind`: which trials were left out together, as text.
+    """
+
+    fit: Fit
+    trials: tuple[str, ...]
+    n: np.ndarray
+    at_start: np.ndarray
+    fitted: np.ndarray
+    held_out: np.ndarray
+    spread: np.ndarray
+    estimates: dict[str, np.ndarray]
+    cost_name: str = "sum of squares"
+    failures: tuple[str, ...] = ()
+    held_out_kind: str = ""
+
+    @property
+    def score(self) -> float:
+        """1 - held out / spread, over all trials: the predictive R^2.
+
+        It is the share of the variance of the measurements that is accounted for by parameters from other trials. One
+        is perfect, below zero is worse than a constant. It does not depend on the cost at the initial guess. NaN for
+        likelihoods, which have no natural zero.
+        """
+        if self.cost_name != "sum of squares":
+            return float("nan")
+        return float(1 - self.held_out.sum() / self.spread.sum())
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Prediction intervals by name, for the estimate from a new data set of the size of one fold.
+
+            estimate +- t s (1 + 1/K)^1/2,   s: of K estimates,   K estimate - (K - 1) (without the fold)   of each
+
+        K is the number of folds and s the standard deviation of the K pseudo-values (Tukey 1958). t is the quantile of
+        Student's distribution with K - 1 degrees of freedom. The intervals are truncated at the parameter's bounds.
+
+        If the model is incomplete, each trial has a different best estimate. A confidence interval describes the mean
+        of these estimates and need not contain the estimate from the next trial. All folds use the same priors. NaN if
+        `failures` names a fold of the parameter. Infinite or NaN if the formal errors of the fit are.
+
+        **Arguments:**
+
+        - `level`: level of the interval, between 0 and 1.
+
+        **Returns:** a dictionary of (lower, upper), in the parameter's unit.
+
+        **Raises:** `ValueError` if `level` is not between 0 and 1.
+        """
+        without = np.array([self.estimates[name] for name in self.fit.names])
+        K = without.shape[1]
+        own = K * np.array([*self.fit.estimates.values()])[:, None] - (K - 1) * without
+        half = t_quantile(level, K - 1) * np.std(own, axis=1, ddof=1) * (1 + 1 / K) ** 0.5
+        errors = np.array([*self.fit.standard_errors.values()])
+        half = np.where(np.isfinite(errors), half, errors)
+        return dict(zip(self.fit.names, intervals(self.fit.parameters, self.fit.point.parameters, half), strict=True))
+
+    @property
+    def conclusion(self) -> str:
+        """How well trials that were not used in a fit are predicted, as a sentence."""
+        lost = [name for name, cost in zip(self.trials, self.held_out, strict=True) if np.isinf(cost)]
+        reasons = [*self.failures]
+        if lost:
+            reasons.append(f"{', '.join(lost)} cannot be simulated with the parameters of the others.")
+        if reasons:
+            return " ".join(reasons)
+        if self.cost_name != "sum of squares":
+            drop = self.at_start.sum() - self.held_out.sum()
+            return f"The held-out {self.cost_name} of all trials is {drop:.4g} below that of the initial guess."
+        kind = f" (left out: {self.held_out_kind})" * bool(self.held_out_kind)
+        return f"held-out score: {100 * self.score:.1f} % of the measurements' variance is accounted for{kind}."
+
+    @property
+    def rows(self) -> Rows:
+        """Rows of the table: the header, each trial, and the sum over all trials."""
+        columns = (self.spread, self.at_start, self.fitted, self.held_out)
+        rows = [*zip(self.trials, self.n, *columns, strict=True), ("all", *(c.sum() for c in (self.n, *columns)))]
+        cells = [[name, str(n), *(f"{cost:.5g}" for cost in costs)] for name, n, *costs in rows]
+        return [("trial left out", "residuals", "spread", "start", "fitted", "held out"), *cells]
+
+    def __str__(self) -> str:
+        return f"{text_table(self.rows)}\n{self.conclusion}"
+
+    __repr__ = __str__
+
+
+def trial_folds(
+    folds: int | str | Sequence[Sequence[int]] | None, trials: Sequence[Trial]
+) -> tuple[list[list[int]], str]:
+    """Groups of trials that are left out together, and their description as text.
+
+    **Raises:** `ValueError` for folds that do not leave out each trial exactly once, and for a label that a trial does
+    not have.
+    """
+    if not isinstance(folds, str):
+        groups = folds_of(folds, len(trials))
+        alone = all(len(group) == 1 for group in groups)
+        return groups, "each trial alone" if alone else f"{len(groups)} folds of the trials"
+    missing = [trial.name for trial in trials if folds not in trial.labels]
+    if missing:
+        known = ", ".join(sorted({label for trial in trials for label in trial.labels})) or "none"
+        raise ValueError(
+            f"`folds`: {missing[0]} has no label {folds!r}; the labels of these trials are: {known}. Pass Trial(..., "
+            f"labels={{{folds!r}: ...}})."
+        )
+    by_label: dict[str | float, list[int]] = {}
+    for k, trial in enumerate(trials):
+        by_label.setdefault(trial.labels[folds], []).append(k)
+    if len(by_label) < 2:
+        raise ValueError(
+            f"`folds`: all trials have the same {folds}, {trials[0].labels[folds]!r}, so none can be left out. Use "
+            "another label."
+        )
+    return list(by_label.values()), f"each {folds}: {', '.join(str(label) for label in by_label)}"
+
+
+def cross_validate(fit: Fit, folds: int | str | Sequence[Sequence[int]] | None = None) -> CrossValidation:
+    """Cross-validation: fit some of the trials, and predict the others with these parameters.
+
+    Each fold is a new fit that starts at the estimates of `fit`.
+
+    **Arguments:**
+
+    - `fit`: the `Fit` of all trials.
+    - `folds`: number of folds, or a list of lists of the indices of trials that are left out together. By default each
+        trial is left out alone; with eleven or more trials there are five folds. With the name of a label, as in
+        `folds="speed"`, trials with the same value of the label are left out together. The cost of a kind of trial that
+        the fit has not seen is often several times larger.
+
+    **Returns:** a `CrossValidation`.
+
+    **Raises:** `ValueError` with fewer than two trials.
+    """
+    refuse_other(fit, Fit, "cross_validate", "cross_validate(fit(...))")
+    T = len(fit.problem.trials)
+    if T < 2:
+        raise ValueError(
+            "cross_validate: at least two trials are needed, got one. Cut a long trial with `Trial.between`."
+        )
+    groups, kind = trial_folds(folds, fit.problem.trials)
+    held_out, estimates, failures = np.full(T, np.nan), [], []
+    with_all = fit.identifiability.given_sigma_errors
+    for group in groups:
+        training = fit.problem.only(set(range(T)) - set(group))
+        trained = uninterrupted(minimize(training, LeastSquares(), start=fit.point))
+        values, without = np.array([*trained.estimates.values()]), ", ".join(fit.trial_names[k] for k in group)
+        # A parameter that the other trials do not determine stays at the estimate from all trials. The fold predicts
+        # nothing about it and would look precise.
+        with np.errstate(invalid="ignore"):
+            alone = 1 - (with_all / trained.identifiability.given_sigma_errors) ** 2 > LARGEST_LEVERAGE
+        if trained.status not in AT_A_MINIMUM:
+            failures.append(f"Without {without} the fit has not converged ({STATUS[trained.status]}).")
+            values[:] = np.nan
+        elif alone.any():
+            names = ", ".join(np.array(fit.names)[alone])
+            failures.append(f"Without {without} the other trials do not determine {names}.")
+            values[alone] = np.nan
+        else:
+            held_out[group] = costs_by_trial(fit.problem.with_errors_of(trained.problem), trained.point)[group]
+        estimates.append(dict(zip(fit.names, values.tolist(), strict=True)))
+    owner = np.asarray(fit.problem.windows.trial)
+    counts = np.sum(np.asarray(fit.problem.windows.weight) > 0, axis=(1, 2))
+    return CrossValidation(
+        fit=fit,
+        trials=fit.trial_names,
+        n=np.array([counts[owner == k].sum() for k in range(T)]),
+        at_start=costs_by_trial(fit.problem, fit.problem.start),
+        fitted=costs_by_trial(fit.problem, fit.point),
+        held_out=held_out,
+        spread=spread_by_trial(fit.problem),
+        estimates={name: np.array([of_fold[name] for of_fold in estimates]) for name in fit.names},
+        cost_name=fit.problem.cost_name,
+        held_out_kind=kind,
+        failures=tuple(failures),
+    )
+
+
+def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
+    """Sums of squares (T,) with these parameters. The initial states and unknowns of each trial are estimated for them.
+
+    Priors of the initial states and unknowns of a trial are included. Priors of parameters are not, because they belong
+    to no single trial. Infinite for trials that cannot be simulated.
+    """
+    windows = eqx.tree_at(lambda w: w.very_first, problem.windows, jnp.zeros_like(problem.windows.very_first))
+    problem = dataclasses.replace(problem, windows=windows)
+    try:
+        _, at = solve_nuisance(problem, point, rtol=1e-5)
+    except Unsimulated as error:
+        costs, left = np.full(len(problem.trials), np.inf), np.delete(np.arange(len(problem.trials)), [*error.reasons])
+        if left.size:
+            left_out = problem.with_trials([problem.trials[k] for k in left])
+            costs[left] = costs_by_trial(left_out, dataclasses.replace(left_out.start, parameters=point.parameters))
+        return costs
+    value = at.prediction.cost
+    costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1) if value is None else np.asarray(value)
+    return np.bincount(np.asarray(problem.windows.trial), costs, minlength=len(problem.trials))
+
+
+def spread_by_trial(problem: Problem) -> np.ndarray:
+    """Sums of squares (T,) of the measurements about the mean of each channel, divided by their standard deviations.
+
+    This is the cost of a model that predicts a constant.
+    """
+    windows, owner = problem.windows, np.asarray(problem.windows.trial)
+    y, weight = np.asarray(windows.measured), np.asarray(windows.weight) ** 2  # (W, n_c, n_t)
+    spread = []
+    for k in range(len(problem.trials)):
+        y_k, w_k = y[owner == k], weight[owner == k]
+        total = w_k.sum(axis=(0, 2), keepdims=True)
+        mean = np.sum(w_k * y_k, axis=(0, 2), keepdims=True) / np.where(total > 0, total, 1.0)
+        spread.append(np.sum(w_k * (y_k - mean) ** 2))
+    return np.array(spread)
+
+
+def predict(
+    fit: Fit,
+    trials: Sequence[Trial] | Trial,
+    ahead: Sequence[float] | float,
+    *,
+    past: float | None = None,
+) -> pd.DataFrame:
+    """Prediction errors a given time ahead, restarted along each trial.
+
+    A prediction starts at a time t. The initial state and the unknowns of the trial are estimated from the measurements
+    in the `past` seconds before t. The simulation then continues from t with the measured inputs. With process noise
+    the filter does both. A state that is not `unknown` starts `past` seconds before t, as in `fit`. Predictions do not
+    overlap: t advances by the longest of `ahead`.
+
+        errors = predict(fit, trials, ahead=(0.01, 0.1, 0.5))
+        errors.groupby(["channel", "ahead"]).error.std()
+
+    **Arguments:**
+
+    - `fit`: a `Fit`, whose parameters are used.
+    - `trials`: trials, preferably not those of the fit.
+    - `ahead`: prediction times [s], rounded to the nearest sample.
+    - `past`: duration [s] of the measurements before t that are used. By default the window length of the fit, or
+        without windows the longest of `ahead`. If offsets or delays of each trial are unknown, choose it long enough to
+        estimate them.
+
+    **Returns:** a `pandas.DataFrame` with a row for each trial, time, channel and `ahead`. The columns are `trial`,
+    `channel`, `ahead` [s], `t` [s], `measured`, `predicted`, `error` (predicted - measured, in the channel's unit) and
+    `residual` (error / sigma). Gaps are left out. A prediction is NaN if the trial cannot be simulated.
+
+    **Raises:** `ValueError` for times that are not positive or shorter than half a sample, for trials that are all
+    shorter than `past` plus the longest of `ahead`, and in the cases of `validate`.
+    """
+    import pandas as pd
+
+    refuse_other(fit, Fit, "predict", "predict(fit(...), trials, ahead=(0.1, 0.5))")
+    times = np.atleast_1d(np.asarray(ahead, float))
+    if not (times.ndim == 1 and times.size and np.all(np.isfinite(times)) and np.all(times > 0)):
+        raise ValueError(f"predict: `ahead` must be positive times [s], got {ahead}.")
+    spec = fit.problem.specification
+    past = (spec.window or float(times.max())) if past is None else positive_number(past, "predict: `past`")
+    pieces, origins = [], []
+    for trial in as_trials(trials):
+        t, dt = trial.t, float(np.median(np.diff(trial.t)))
+        if times.min() < 0.5 * dt:
+            raise ValueError(
+                f"predict: `ahead` = {times.min():g} s is shorter than half of the sample interval of {trial.name}, "
+                f"{dt:.3g} s. Pass a longer time."
+            )
+        for now in np.arange(t[0] + past, t[-1] - times.max() + 0.5 * dt, times.max()):
+            piece = trial.between(max(now - past, t[0]) - 0.25 * dt, now + times.max() + 0.5 * dt)
+            unseen = piece.t > now + 0.25 * dt
+            hidden = {name: np.where(unseen, np.nan, y) for name, y in piece.measured.items()}
+            if unseen.sum() < 1 or not any(np.isfinite(y).any() for y in hidden.values()):
+                continue
+            options = {"sigma": piece.sigma, "initial": piece.initial, "labels": piece.labels}
+            pieces.append(Trial(piece.t, hidden, piece.inputs, name=str(len(pieces)), **options))
+            origins.append((trial.name, piece, int(np.argmax(unseen)) - 1))
+    if not pieces:
+        raise ValueError(
+            f"predict: no trial is longer than {past:g} s for the initial state plus {times.max():g} s to predict. "
+            "Choose a shorter `past` or `ahead`."
+        )
+    whole = dataclasses.replace(spec, window=None, defect_std=None)
+    unwindowed = dataclasses.replace(fit, problem=dataclasses.replace(fit.problem, specification=whole))
+    fitted, rows = validate(unwindowed, pieces).fitted, []
+    for number, (name, piece, last) in enumerate(origins):
+        for channel, y in piece.measured.items():
+            simulated = fitted[str(number)][channel] if str(number) in fitted else np.full_like(y, np.nan)
+            for h in times:
+                i = int(np.argmin(np.abs(piece.t - (piece.t[last] + h))))
+                if i > last and np.isfinite(y[i]):
+                    error = simulated[i] - y[i]
+                    residual = error / piece.sigma[channel][i]
+                    rows.append((name, channel, h, piece.t[i], y[i], simulated[i], error, residual))
+    columns = ["trial", "channel", "ahead", "t", "measured", "predicted", "error", "residual"]
+    return pd.DataFrame(rows, columns=columns)

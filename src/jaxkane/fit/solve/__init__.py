@@ -1,0 +1,1 @@
+"""The solution of a problem: linearization, elimination of nuisance values, optimizers, checkpoints."""

@@ -1,0 +1,122 @@
+"""Standard deviations of distributions over groups, by restricted maximum likelihood of the linearized problem."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+from scipy import optimize
+
+from ..problem.model import Unknowns
+from ..problem.problem import Problem
+from .blocks import eliminate, triangle
+from .linearization import Linearization
+
+
+def estimated_deviations(problem: Problem, point: Unknowns) -> np.ndarray:
+    """The standard deviations (n,) of all distributions, in standard deviations of a residual.
+
+    The restricted likelihood of the model, linearized at the point, is maximized (Lindstrom and Bates, Nonlinear mixed
+    effects models for repeated measures data, Biometrics 46, 1990). Up to a constant, minus twice its logarithm is
+
+        nu log C + log det H + 2 sum_j q_j log d_j
+
+    C is the minimum sum of squares for given standard deviations d_j. H is the information about all unknowns. q_j is
+    the number of groups. nu is the number of measurements minus the number of unknowns without a distribution. The
+    variance of a residual is estimated together with them, as C / nu.
+    """
+    parameters = problem.parameters
+    first = problem.with_deviations(np.full(len(parameters.distributions), np.inf)).linearize(point)
+    assert first is not None
+    data = triangle(np.column_stack(eliminate(first.blocks, 0.0).rows).astype(float))
+    one = parameters.with_deviations(np.ones(len(parameters.distributions)))
+    rows = np.column_stack([one.joint_slopes(point.parameters), np.asarray(one.joint_residuals(point.parameters))])
+    places = [slice(begin, end) for _, begin, end in parameters.distributions]
+    q, p = np.array([s.stop - s.start for s in places]), data.shape[1] - 1
+    scale = np.linalg.norm(np.concatenate([data, rows]), axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    nu = problem.size[0] - problem.size[1]
+
+    def criterion(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        weighed = [np.exp(-log) * rows[s] for log, s in zip(logs, places, strict=True)]
+        R = triangle(np.concatenate([data, *weighed]) / scale)
+        cost = float((R[p, p] * scale[p]) ** 2)
+        to_x = scipy.linalg.solve_triangular(R[:p, :p], np.eye(p), check_finite=False)
+        x = -to_x @ R[:p, p]
+        value = nu * np.log(cost) + 2 * np.sum(np.log(np.abs(R.diagonal()[:p]))) + 2 * q @ logs
+        slopes = []
+        for one, number in zip(weighed, q, strict=True):
+            A, r = one[:, :p] / scale[:p], one[:, p] / scale[p]
+            explained = np.sum((A @ to_x) ** 2)  # tr H^-1 A^T A
+            slopes.append(2 * (number - explained - nu * np.sum((A @ x + r) ** 2) * scale[p] ** 2 / cost))
+        return float(value), np.array(slopes)
+
+    lower, upper = _limits(data[:p, :p], rows, places)
+    along = np.linspace(lower, upper, 41)  # start from a grid: the criterion may be flat far from the minimum
+    start = min(along, key=lambda logs: criterion(logs)[0])
+    found = optimize.minimize(
+        criterion, start, jac=True, method="L-BFGS-B", bounds=[*zip(lower, upper, strict=True)],
+        options={"ftol": 1e-15, "gtol": 1e-10, "maxiter": 200},
+    )  # fmt: skip
+    return np.exp(found.x)
+
+
+def _limits(R: np.ndarray, rows: np.ndarray, places: list[slice]) -> tuple[np.ndarray, np.ndarray]:
+    """The bounds of the logarithms of the standard deviations.
+
+    The lower bound is a thousandth of the smallest standard error of a group: the groups do not differ. At the upper
+    bound, the groups do not shrink towards the mean.
+    """
+    covariance = np.linalg.pinv(R.T @ R)
+    ends = []
+    for s in places:
+        A, r = rows[s, :-1], rows[s, -1]
+        error = np.sqrt(np.einsum("ki,ij,kj->k", A, covariance, A))
+        error = error[error > 0] if np.any(error > 0) else np.ones(1)
+        ends.append((np.log(1e-3 * error.min()), np.log(1e3 * (error.max() + np.abs(r).max()))))
+    return np.array(ends).T[0], np.array(ends).T[1]
+
+
+def degrees_of_freedom(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
+    """The degrees of freedom (p,) of Student's t distribution of each estimate. They are few for a mean of few groups.
+
+        2 V^2 / var(V),   var(V) = (dV/da)^T cov(a) dV/da
+
+    V is the variance of an estimate. a contains the logarithms of the distributions' standard deviations and of the
+    residual variance (Satterthwaite; Giesbrecht and Burns, Two-stage analysis based on a mixed model, Biometrics 41,
+    1985).
+    """
+    parameters, M = problem.parameters, np.column_stack(eliminate(at.blocks, 0.0).rows).astype(float)
+    rows = np.column_stack([parameters.joint_slopes(point.parameters), parameters.joint_residuals(point.parameters)])
+    scale = np.linalg.norm(M, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    parts = [(rows[begin:end] / scale).T @ (rows[begin:end] / scale) for _, begin, end in parameters.distributions]
+    data, nu = (M / scale).T @ (M / scale) - sum(parts), problem.size[0] - problem.size[1]
+    q = np.array([end - begin for _, begin, end in parameters.distributions])
+    to_values = np.asarray(parameters.slopes(point.parameters), float) / scale[:-1]
+    s = len(parts)
+
+    def inverse(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+        """H^-1, the optimal x, and the information from each distribution."""
+        weighed = [np.exp(-2 * log) * part for log, part in zip(a[:s], parts, strict=True)]
+        N = data + sum(weighed)
+        H = np.linalg.pinv(N[:-1, :-1], rcond=1e-14, hermitian=True)
+        return H, np.append(-H @ N[:-1, -1], 1.0), weighed
+
+    def gradient(a: np.ndarray) -> np.ndarray:
+        """The gradient of minus twice the restricted log likelihood."""
+        H, x, weighed = inverse(a)
+        cost = x @ (data + sum(weighed)) @ x
+        own = [2 * (n - np.sum(H * P[:-1, :-1]) - np.exp(-a[s]) * (x @ P @ x)) for n, P in zip(q, weighed, strict=True)]
+        return np.array([*own, nu - np.exp(-a[s]) * cost])
+
+    H, x, weighed = inverse(np.zeros(s + 1))
+    best = np.append(np.zeros(s), np.log(x @ (data + sum(weighed)) @ x / nu))
+    steps = 1e-4 * np.eye(s + 1)
+    hessian = np.array([(gradient(best + h) - gradient(best - h)) / 2e-4 for h in steps])
+    # The pseudo-inverse excludes a distribution whose standard deviation is zero: its groups do not differ.
+    covariance = 2 * np.linalg.pinv((hessian + hessian.T) / 2, rcond=1e-4, hermitian=True)
+    variance = np.einsum("ki,ij,kj->k", to_values, H, to_values)
+    slopes = [2 * np.einsum("ki,ij,kj->k", to_values, H @ P[:-1, :-1] @ H, to_values) for P in weighed]
+    slopes = np.array([*slopes, variance])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.minimum(2 * variance**2 / np.einsum("ap,ab,bp->p", slopes, covariance, slopes), nu)

@@ -1,0 +1,487 @@
+"""Families of periodic orbits by pseudo-arclength continuation, their bifurcations, and their start at Hopf points."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+from jaxtyping import Array, Bool, Complex, Float
+
+from .._common.lookup import hint, not_there
+from .._scalarjit.cache_key import jit
+from .._system.parameters import parameters_in, with_parameters
+from .._system.system import System, packed
+from ._continuation import Family, SolutionCurve, steady_family
+from ._orbit_equations import OrbitArguments, OrbitEquations, packed_rates
+from ._periodic import Orbit, as_orbit, normal_at, orbit_equations, scales_at
+from ._steady import SteadyMotion
+
+
+class Bifurcation(eqx.Module):
+    """A special orbit of a family.
+
+    Attributes:
+
+    - `kind`: "fold" (the parameter turns back), "branch point" (a multiplier is 1), "period doubling" (a multiplier is
+        -1) or "Neimark-Sacker" (a conjugate pair is on the unit circle).
+    - `value`: of the parameter.
+    - `orbit`: the `Orbit` there.
+    """
+
+    kind: str = eqx.field(static=True)
+    value: float
+    orbit: Orbit
+
+    def __repr__(self) -> str:
+        return f"{self.kind} at {float(self.value):.10g} (period {float(self.orbit.period):.6g} s)"
+
+
+class OrbitFamily(eqx.Module):
+    """Periodic orbits along a curve, by name: `cycles["mu"]` (m,) is the parameter, `cycles["x"]` (m,) are values at
+    the start. `cycles.orbit(i)` is the i-th `Orbit`.
+
+    Attributes:
+
+    - `values` (m,): of the parameter; the periods if no parameter changes.
+    - `period` (m,) [s].
+    - `states` (m, n_y): the packed states at the start.
+    - `multipliers` (m, k): the Floquet multipliers without the trivial one, the largest magnitude first.
+    - `arclength` (m,): in the scaled unknowns.
+    - `bifurcations`: the special orbits between the members, in their order.
+    - `reason`: why the family ends.
+    """
+
+    values: Float[Array, " m"]
+    period: Float[Array, " m"]
+    states: Float[Array, "m n_y"]
+    multipliers: Complex[Array, "m k"]
+    arclength: Float[Array, " m"]
+    unknowns: Float[Array, "m n"]
+    start: Orbit
+    bifurcations: tuple[Bifurcation, ...]
+    parameter: str = eqx.field(static=True)
+    reason: str = eqx.field(static=True)
+
+    @property
+    def stable(self) -> Bool[Array, " m"]:
+        """Where all multipliers are inside the unit circle."""
+        return jnp.all(jnp.abs(self.multipliers) < 1.0, axis=1)
+
+    def orbit(self, i: int) -> Orbit:
+        """The i-th orbit. It is differentiable if it is passed to `periodic` as a guess."""
+        start = self.start
+        return _orbit_at(start.equations, self.parameter, self.unknowns[i], start.arguments)
+
+    def __getitem__(self, name: str) -> Float[Array, " m"]:
+        system = self.start.system
+        entries = (*system.coordinates, *system.speeds, *system.states)
+        named = {"period": self.period, **dict(zip(entries, self.states.T, strict=True))}
+        if self.parameter:
+            named[self.parameter] = self.values
+        if name not in named:
+            raise not_there(name, named, "this family of orbits")
+        return named[name]
+
+    def __len__(self) -> int:
+        return len(self.arclength)
+
+    def __repr__(self) -> str:
+        label = self.parameter or "period"
+        found = "; ".join(map(repr, self.bifurcations)) or "no bifurcations"
+        return (
+            f"OrbitFamily({len(self)} orbits, {label} {float(self.values[0]):.6g} to {float(self.values[-1]):.6g}: "
+            f"{found}; ended by {self.reason})"
+        )
+
+
+def family(
+    system: System,
+    start: SteadyMotion | Orbit,
+    *,
+    towards: Mapping[str, float],
+    until: Mapping[str, float] | None = None,
+    hold: tuple[str, ...] = (),
+    find: tuple[str, ...] = (),
+    step: float = 0.05,
+    max_step: float | None = None,
+    steps: int = 500,
+) -> Family | OrbitFamily:
+    """The family of steady motions or periodic orbits through one of them, by pseudo-arclength continuation.
+
+        F(z) = 0,   tangent . (z - z_predicted) = 0
+
+    z are the unknowns of `steady_turn` or `periodic`, and F are its equations. The arclength is measured in scaled
+    unknowns and has no unit. The step is halved if Newton's method fails, and increased if it converges quickly. The
+    curve can be followed through folds.
+
+    **Arguments:**
+
+    - `start`: a steady motion from `steady_turn`, or an orbit from `periodic`.
+    - `towards`: {name: +1 or -1}, the initial direction. For steady motions, a coordinate or a speed. For orbits, a
+        parameter of the system or a constant input, which then changes along the family; or, for the family of a
+        conservative system, "period" or a quantity at the start.
+    - `until`: {name: value}. The family ends exactly at the first of these values that it reaches. Names are those of
+        coordinates and speeds, also dependent ones; for orbits those of `towards`.
+    - `hold`: for steady motions, as in `steady_turn`, but one quantity less, because the family is a curve. Orbits keep
+        the quantities that `periodic` holds, except for the one in `towards`.
+    - `find`: for steady motions, as in `steady_turn`.
+    - `step`: the first step of arclength.
+    - `max_step`: the largest step of arclength; four times `step` by default. Two bifurcations of the same kind within
+        one step are not detected.
+    - `steps`: the largest number of steps.
+
+    Steady motions: angles are in rad; speeds and inputs are relative to their values at the start. Lengths and unknowns
+    that are zero at the start are scaled by the change that balances the terms of an equation. Orbits: all unknowns are
+    relative to their amplitudes, and the parameter is relative to its value at the start.
+
+    **Returns:** a `Family` or an `OrbitFamily`, whose first member is `start`. Its members are not differentiable; pass
+    one to `steady_turn` or `periodic` for that. An `OrbitFamily` contains folds, branch points, period doublings and
+    Neimark-Sacker points.
+
+    **Raises:** `ValueError` if no curve, or more than one, passes through the start.
+    """
+    if not isinstance(start, Orbit):
+        options = {"hold": hold, "find": find, "step": step, "max_step": max_step, "steps": steps}
+        return steady_family(system, start, towards=towards, until=until, **options)
+    label = f"family({type(system).__name__})"
+    if hold or find:
+        raise ValueError(
+            f"{label}: `hold` and `find` apply to steady motions only. Omit them: a family of orbits uses the `hold` "
+            "of `periodic`."
+        )
+    if len(towards) != 1:
+        raise ValueError(f"{label}: `towards` must be one name with +1 or -1, got {dict(towards)}.")
+    ((name, sign),) = towards.items()
+    parameter, equations = _parameter(label, system, start, name)
+    args = start.arguments._replace(system=system, center=packed(start.state))
+    kept = [start.equations.hold.index(i) for i in equations.hold]
+    args = args._replace(targets=args.targets[np.array(kept, int)])
+    curve = _OrbitCurve(equations, parameter, args, start.unknowns, dict(until or {}), label)
+    y = curve.first
+    if np.max(np.abs(curve.evaluate(y)[0])) > 1e-6:
+        raise ValueError(f"{label}: `start` is not an orbit of this system. Pass its own system, `start.system`.")
+    curve.move_phase(y)
+    tangent = curve.tangent(y, None)
+    ahead = tangent[curve.place(name)]
+    tangent = tangent * float(np.sign(sign * ahead) or 1.0)
+    max_step = 4 * step if max_step is None else max_step
+    points, arc, met = curve.follow(y, tangent, step, max_step, steps)
+    reason = f"{steps} steps" if len(points) > steps else "Newton's method, which found no further orbit"
+    if met is not None:
+        reached, value = list(curve.until.items())[met]
+        reason = f"{reached} = {value:g}"
+    zs = jnp.asarray(np.array(points) * curve.scale)
+    rows = [curve.member(y) for y in points]
+    values, period, states, multipliers = map(jnp.asarray, map(np.array, zip(*rows, strict=True)))
+    first = dataclasses.replace(start, equations=equations, arguments=args, system=system)
+    special = tuple(
+        Bifurcation(kind, curve.member(y)[0], _orbit_at(equations, parameter, jnp.asarray(y * curve.scale), args))
+        for kind, y in curve.found
+    )
+    return OrbitFamily(values, period, states, multipliers, jnp.asarray(arc), zs, first, special, parameter, reason)
+
+
+def _parameter(label: str, system: System, start: Orbit, name: str) -> tuple[str, OrbitEquations]:
+    """The name of the parameter that changes, or "" if none does, and the equations without the released entry."""
+    equations = start.equations
+    parameters = [key for key, value, _ in parameters_in(system) if np.ndim(value) == 0]
+    inputs = [] if callable(start.inputs) else [key for key, x in start.inputs.items() if not callable(x)]
+    if name in parameters or name in inputs:
+        return name, equations
+    entries = (*system.coordinates, *system.speeds, *system.states)
+    if name != "period" and name not in entries:
+        known = (*parameters, *inputs, *entries, "period")
+        raise ValueError(f"{label}: `towards` has no quantity {name!r}; {hint(name, known, 'it has')}")
+    if not equations.hold:
+        raise ValueError(
+            f"{label}: the orbit is isolated if no parameter changes, because `periodic` was called without `hold`. "
+            f"Name a parameter in `towards`: {', '.join((*parameters, *inputs))}."
+        )
+    released = entries.index(name) if name in entries else equations.hold[0]
+    if released not in equations.hold:
+        raise ValueError(
+            f"{label}: `towards` contains {name}, which is not in the `hold` of `periodic`. Name a quantity of this "
+            "`hold`, or a parameter."
+        )
+    return "", dataclasses.replace(equations, hold=tuple(i for i in equations.hold if i != released))
+
+
+class _OrbitCurve(SolutionCurve):
+    """The curve of the orbits, in scaled unknowns y = (z, p) / scale."""
+
+    def __init__(
+        self, equations: OrbitEquations, parameter: str, args: OrbitArguments, z: Array, until: Any, label: str
+    ):
+        self.equations, self.parameter = equations, parameter
+        system = args.system
+        entries = (*system.coordinates, *system.speeds, *system.states)
+        self.args = args
+        self.places = {entries[k]: i for i, k in enumerate(equations.closed)}
+        if equations.autonomous:
+            self.places["period"] = z.size - 1
+        sizes = np.asarray(equations.sizes(z, args))
+        if parameter:
+            self.places[parameter] = z.size
+            p = float(_value(args, parameter))
+            z, sizes = jnp.append(z, p), np.append(sizes, abs(p) or 1.0)
+        self.scale, self.first = sizes, np.asarray(z) / sizes
+        unknown = [key for key in until if key not in self.places]
+        if unknown:
+            raise ValueError(
+                f"{label}: `until` contains the unknown name {unknown[0]!r}; "
+                f"{hint(unknown[0], self.places, 'there are')}"
+            )
+        self.until, self._memory = until, {}
+        self.found: list[tuple[str, Any]] = []  # kinds and places of the bifurcations so far
+        super().__init__(self._evaluated, max(float(jnp.finfo(z.dtype).eps), equations.rtol))
+
+    def place(self, name: str) -> int:
+        return self.places[name]
+
+    def _all(self, y) -> Any:
+        key = y.tobytes()
+        if key not in self._memory:
+            if len(self._memory) > 8:
+                self._memory.pop(next(iter(self._memory)))
+            found = _extended(self.equations, self.parameter, jnp.asarray(y * self.scale), self.args)
+            self._memory[key] = tuple(map(np.asarray, found))
+        return self._memory[key]
+
+    def _evaluated(self, y):
+        F, J, rows, _, _ = self._all(y)
+        where = np.array([self.places[key] for key in self.until], int)
+        limits = np.array(list(self.until.values()), float) / self.scale[where]
+        size = np.maximum(np.abs(limits), 1.0)
+        G = np.eye(len(y))[where]
+        return F / rows, J * self.scale / rows[:, None], (y[where] - limits) / size, G / size[:, None]
+
+    def move_phase(self, y) -> None:
+        """Let the phase condition contain the orbit's own start, so that it stays transversal along the family."""
+        if self.equations.autonomous and not self.equations.section:
+            z_p = jnp.asarray(y * self.scale)
+            center, normal = _phase(self.equations, self.parameter, z_p, self.args)
+            self.args = self.args._replace(center=center, normal=normal)
+            self._memory.clear()
+        if self.equations.jumps:
+            self.args = self.args._replace(period=jnp.asarray(self._summary(y)[0]))
+
+    def member(self, y) -> tuple[Any, ...]:
+        """The value of the parameter, the period, the packed state and the multipliers."""
+        T, state, M = self._summary(y)
+        values = np.linalg.eigvals(M) if np.all(np.isfinite(M)) else np.full(len(M), np.nan)
+        values = values[np.argsort(-np.abs(values), kind="stable")].astype(complex)
+        p = y[-1] * self.scale[-1] if self.parameter else T
+        return float(p), float(T), state, values
+
+    def _summary(self, y):
+        matrix = self._all(y)[3]
+        T, state = self._all(y)[4][0], self._all(y)[4][1:]
+        return T, state, matrix
+
+    def tests(self, y, tangent) -> dict[str, float]:
+        """Functions that change their sign at a bifurcation.
+
+        Products of multipliers are used, because a single multiplier cannot be followed where two of them meet.
+        """
+        if not self.parameter:
+            return {}
+        M = self._summary(y)[2]
+        values = np.linalg.eigvals(M)
+        found = {"fold": tangent[-1], "period doubling": np.linalg.det(M + np.eye(len(M)))}
+        if not self.equations.hold:
+            pairs = [1.0 - a * b for i, a in enumerate(values) for b in values[i + 1 :]]
+            found["Neimark-Sacker"] = float(np.real(np.prod(pairs))) if pairs else 1.0
+            found["branch point"] = np.linalg.det(M - np.eye(len(M)))
+        return found
+
+    def accepts(self, y, tangent, z, new, met: int | None) -> bool:
+        new = new if met is None else self.tangent(z, tangent)
+        special = None if new is None else self._between(y, tangent, z, new)
+        self.found += special or []
+        return special is not None
+
+    def tangent_ahead(self, y, new) -> Any:
+        self.move_phase(y)
+        return self.tangent(y, new)
+
+    def _between(self, y, tangent, z, new) -> list[tuple[str, Any]] | None:
+        """Kinds and places of the bifurcations between y and z, in their order. None if the search for one fails."""
+        before, after = self.tests(y, tangent), self.tests(z, new)
+        kinds = [kind for kind in before if before[kind] * after[kind] < 0]
+        length, found = float(tangent @ (z - y)), []
+        for kind in kinds:
+
+            def test(s, kind=kind):
+                if s in (0.0, length):
+                    return before[kind] if s == 0.0 else after[kind]
+                attempt = self.correct(y + s * tangent, tangent)
+                if attempt is None:
+                    return np.nan
+                ahead = self.tangent(attempt[0], tangent)
+                return np.nan if ahead is None else self.tests(attempt[0], ahead)[kind]
+
+            accuracy = {"xtol": 1e-13 * length, "rtol": np.float64(1e-13), "maxiter": 60}
+            try:
+                s: Any = scipy.optimize.toms748(test, 0.0, length, **accuracy)
+            except (ValueError, RuntimeError):  # an orbit between y and z was not found
+                return None
+            attempt = self.correct(y + s * tangent, tangent)
+            if attempt is None:
+                return None
+            if self._is_real(kind, attempt[0]):
+                found.append((s, kind, attempt[0]))
+        folds = [s for s, kind, _ in found if kind == "fold"]
+        if folds:  # a multiplier is 1 at a fold too
+            found = [entry for entry in found if entry[1] != "branch point"]
+        return [(kind, at) for _, kind, at in sorted(found, key=lambda entry: entry[0])]
+
+    def _is_real(self, kind: str, y) -> bool:
+        """Whether a Neimark-Sacker point has a conjugate pair. Two real multipliers whose product is 1 do not count."""
+        if kind != "Neimark-Sacker":
+            return True
+        values: Any = np.linalg.eigvals(self._summary(y)[2])
+        pairs = values[np.abs(values.imag) > 1e-7]
+        return bool(len(pairs) and np.min(np.abs(np.abs(pairs) - 1.0)) < 1e-6)
+
+
+def _value(args: OrbitArguments, name: str) -> Any:
+    for key, value, _ in parameters_in(args.system):
+        if key == name:
+            return value
+    return args.inputs[name]
+
+
+def _with_value(args: OrbitArguments, name: str, value: Any) -> OrbitArguments:
+    if not name:
+        return args
+    if any(key == name for key, _, _ in parameters_in(args.system)):
+        return args._replace(system=with_parameters(args.system, {name: value}))
+    return args._replace(inputs={**args.inputs, name: value})
+
+
+def _split(parameter: str, z_p: Array, args: OrbitArguments) -> tuple[Array, OrbitArguments]:
+    return (z_p[:-1], _with_value(args, parameter, z_p[-1])) if parameter else (z_p, args)
+
+
+@jit
+def _extended(equations: OrbitEquations, parameter: str, z_p: Array, args: OrbitArguments):
+    """F, J, the sizes of the rows, the derivative of the return map, and the period with the packed state."""
+    z, there = _split(parameter, z_p, args)
+    if parameter:
+        at = equations.evaluate(z, args, z_p[-1:], lambda p: _with_value(args, parameter, p[0]))
+    else:
+        at = equations.evaluate(z, args)
+    rows = scales_at(equations, z, there, at)[1]
+    matrix = equations.return_matrix(at.segments, z, there)
+    return at.F, at.J, rows, matrix, jnp.append(equations.period(z, there), equations.states(z, there)[0])
+
+
+@jit
+def _phase(equations: OrbitEquations, parameter: str, z_p: Array, args: OrbitArguments):
+    z, args = _split(parameter, z_p, args)
+    return equations.states(z, args)[0], normal_at(equations, z, args)
+
+
+@jit
+def _orbit_at(equations: OrbitEquations, parameter: str, z_p: Array, args: OrbitArguments) -> Orbit:
+    z, args = _split(parameter, z_p, args)
+    center = equations.states(z, args)[0]
+    args = args._replace(
+        center=center, normal=normal_at(equations, z, args), targets=center[np.array(equations.hold, int)]
+    )
+    if equations.jumps:
+        args = args._replace(period=equations.period(z, args))
+    at = equations.evaluate(z, args)
+    return as_orbit(equations, z, args, at.segments, scales_at(equations, z, args, at)[2])
+
+
+def limit_cycle(
+    system: System,
+    motion: SteadyMotion,
+    amplitude: Mapping[str, float],
+    *,
+    parameter: str,
+    segments: int = 1,
+    rtol: float | None = None,
+    atol: float | None = None,
+) -> Orbit:
+    """A small periodic orbit about a steady motion near a Hopf point, from the eigenvector of the linear model.
+
+    The parameter is changed such that an orbit with this amplitude exists. Follow the orbits to larger amplitudes with
+    `family`: they exist on one side of the Hopf point.
+
+    **Arguments:**
+
+    - `motion`: a steady motion of `system`, with a pair of eigenvalues near the imaginary axis.
+    - `amplitude`: {name: value}, the deviation of one coordinate, speed or first-order state from the steady motion at
+        the start.
+    - `parameter`: the name of a parameter of the system, or of an input of `motion`.
+    - `segments`, `rtol`, `atol`: as for `periodic`.
+
+    **Returns:** an `Orbit`, whose `system` has the new value of the parameter.
+
+    **Raises:** `ValueError` if no pair of eigenvalues oscillates, or if no orbit is found.
+    """
+    label = f"limit_cycle({type(system).__name__})"
+    if not isinstance(motion, SteadyMotion):
+        raise TypeError(f"{label}: `motion` must be a SteadyMotion, e.g. from equilibrium; got {motion!r}.")
+    entries = (*system.coordinates, *system.speeds, *system.states)
+    if len(amplitude) != 1 or next(iter(amplitude)) not in entries:
+        raise ValueError(
+            f"{label}: `amplitude` must be one of {', '.join(entries)} with a number; got {dict(amplitude)}."
+        )
+    known = [*(key for key, value, _ in parameters_in(system) if np.ndim(value) == 0), *system.inputs]
+    if parameter not in known:
+        raise ValueError(f"{label}: there is no parameter {parameter!r}; {hint(parameter, known)}")
+    ((name, deviation),) = amplitude.items()
+    center = packed(motion.state)
+    inputs = {key: motion.inputs[key] for key in system.inputs}
+    equations, args = orbit_equations(
+        system,
+        center,
+        inputs,
+        hold={name: center[entries.index(name)] + deviation},
+        segments=segments,
+        rtol=rtol,
+        atol=atol,
+    )
+    eigen: Any = np.linalg.eig(np.asarray(_slopes_at(equations, args, center)))
+    values, vectors = eigen
+    rising = values.imag > 1e-6 * np.max(np.abs(values))
+    moves = np.abs(vectors[equations.closed.index(entries.index(name))]) > 1e-9
+    pairs = np.nonzero(rising & moves)[0]
+    if not len(pairs):
+        raise ValueError(
+            f"{label}: no pair of eigenvalues oscillates in {name}. Pass a steady motion near a Hopf point."
+        )
+    k = pairs[np.argmin(np.abs(values[pairs].real))]
+    vector, omega = vectors[:, k], values[k].imag
+    vector = vector * deviation / vector[equations.closed.index(entries.index(name))]
+    phases = np.exp(2j * np.pi * np.arange(segments) / segments)
+    rows = np.asarray(center)[equations.places] + np.real(phases[:, None] * vector[None, :])
+    z = equations.unknowns(
+        jnp.tile(center, (segments, 1)).at[:, equations.places].set(rows), jnp.asarray(2 * np.pi / omega)
+    )
+    normal = jnp.zeros_like(center).at[equations.places].set(vector.imag / np.linalg.norm(vector.imag) ** 2)
+    args = args._replace(center=center, normal=normal)
+    curve = _OrbitCurve(equations, parameter, args, z, {}, label)
+    attempt = curve.correct(curve.first, np.zeros_like(curve.first))
+    if attempt is None:
+        raise ValueError(
+            f"{label}: no orbit was found. Pass a smaller amplitude, or a motion nearer to the Hopf point."
+        )
+    free = dataclasses.replace(equations, hold=())
+    return _orbit_at(free, parameter, jnp.asarray(attempt[0] * curve.scale), args)
+
+
+@jit
+def _slopes_at(equations: OrbitEquations, args: OrbitArguments, y: Array) -> Array:
+    """The derivative (n, n) of the rates of the closed entries."""
+    places = equations.places
+    return jax.jacfwd(lambda x: packed_rates(args, args.t, y.at[places].set(x))[places])(y[places])

@@ -1,0 +1,358 @@
+"""The equations of a periodic orbit by multiple shooting, and their derivatives."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._integrate.events import event_values, events_of
+from .._integrate.inputs import as_signals, inputs_at
+from .._integrate.jumps import stages_of, state_after
+from .._integrate.simulate import simulate
+from .._integrate.status import Status
+from .._integrate.trajectory import Trajectory
+from .._kane.constraint_residuals import configuration_residual, coordinate_units, projected
+from .._kane.right_hand_side import vector_field
+from .._system.system import System, packed, unpacked
+
+
+class OrbitArguments(NamedTuple):
+    """The data of a periodic orbit.
+
+    Fields:
+
+    - `system`: the system. `inputs`: as for `simulate`. `t`: the time of the start [s].
+    - `period` [s]: of a force, unless it is a function of the system. With a jump at the section: an estimate of the
+      period.
+    - `start` (n_y,): a packed state, from which the drifting coordinates are taken.
+    - `advance` (n_y,): the change of each entry of the state in one period.
+    - `targets` (n_hold,): values of the held entries.
+    - `center`, `normal` (n_y,): of the hyperplane that contains the start.
+    """
+
+    system: System
+    inputs: Any
+    t: Array
+    period: Array
+    start: Array
+    advance: Array
+    targets: Array
+    center: Array
+    normal: Array
+
+
+class Evaluation(NamedTuple):
+    """Residuals of an orbit and their derivatives.
+
+    - `F` (m,): residuals. `J` (m, n_z): their derivatives with respect to the unknowns.
+    - `segments` (K, n, n): derivatives of the end of each segment with respect to its start, of the closed entries.
+    """
+
+    F: Array
+    J: Array
+    segments: Array
+
+
+class OrbitEquations(eqx.Module):
+    """The unknowns z of a periodic orbit, and its equations F(z) = 0.
+
+    z contains the closed entries of the packed state at the start of each segment, and the period if it is unknown.
+    F contains for each segment the difference between its end and the next start, then the phase condition, the held
+    entries and the configuration constraints.
+
+    Attributes:
+
+    - `closed`: indices of the n entries of the packed state that are periodic. The other coordinates drift.
+    - `segments`: the number K of segments.
+    - `hold`: indices of the entries that keep their value at the start.
+    - `section`: the name of the event at which the orbit starts, or "".
+    - `jumps`: whether the event of the section changes the state. The orbit then starts after this jump.
+    - `autonomous`: whether the phase is free, so that the equations contain a phase condition.
+    - `period_of`: the period of the force as a function of the system, or None.
+    - `constrained`: whether the system has configuration constraints.
+    - `rtol`, `atol`, `max_steps`, `solver`: as for `simulate`.
+    """
+
+    closed: tuple[int, ...] = eqx.field(static=True)
+    segments: int = eqx.field(static=True)
+    hold: tuple[int, ...] = eqx.field(static=True)
+    section: str = eqx.field(static=True)
+    jumps: bool = eqx.field(static=True)
+    autonomous: bool = eqx.field(static=True)
+    period_of: Callable[[System], Any] | None = eqx.field(static=True)
+    constrained: bool = eqx.field(static=True)
+    rtol: float = eqx.field(static=True)
+    atol: float = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+    solver: diffrax.AbstractSolver
+
+    @property
+    def places(self) -> np.ndarray:
+        return np.array(self.closed, int)
+
+    def period(self, z: Array, args: OrbitArguments) -> Array:
+        """The period [s], which is the last unknown of an autonomous system."""
+        if self.autonomous:
+            return z[-1]
+        return args.period if self.period_of is None else jnp.asarray(self.period_of(args.system), z.dtype)
+
+    def rows(self, z: Array) -> Float[Array, "K n"]:
+        """The closed entries at the start of each segment."""
+        n = len(self.closed)
+        return z[: self.segments * n].reshape(self.segments, n)
+
+    def states(self, z: Array, args: OrbitArguments) -> Float[Array, "K n_y"]:
+        """The packed state at the start of each segment."""
+        return jnp.tile(args.start, (self.segments, 1)).at[:, self.places].set(self.rows(z))
+
+    def unknowns(self, states: Array, period: Array) -> Array:
+        """The inverse of `states` and `period`."""
+        z = jnp.ravel(states[:, self.places])
+        return jnp.append(z, period) if self.autonomous else z
+
+    def _segment_starts(self, z: Array, args: OrbitArguments) -> Float[Array, "K n+2"]:
+        """For each segment: the closed entries at its start, its start time and its duration."""
+        duration = self.period(z, args) / self.segments
+        times = args.t + jnp.arange(self.segments, dtype=z.dtype) * duration
+        durations = jnp.broadcast_to(duration, times.shape)
+        return jnp.concatenate([self.rows(z), times[:, None], durations[:, None]], axis=1)
+
+    def _segment_end(self, segment: Array, args: OrbitArguments, last: bool) -> Array:
+        """The closed entries at the end of a segment, and how much later it ends than its duration (n+1,).
+
+        NaN if the simulation does not reach the end. If the section has a jump, the last segment ends after this jump.
+        """
+        n = len(self.closed)
+        y, t, duration = args.start.at[self.places].set(segment[:n]), segment[n], segment[n + 1]
+        if last and self.jumps:
+            end, elapsed = self.until_jump(args, y, t, 2.0 * args.period)
+            return jnp.append(end[self.places], elapsed - duration)
+        return jnp.append(self.flow(args, y, t, duration)[self.places], 0.0 * duration)
+
+    def until_jump(self, args: OrbitArguments, y: Array, t: Array, longest: Array) -> tuple[Array, Array]:
+        """The packed state after the next jump at the section, and the time until then. NaN if it takes longer."""
+        ride = self.simulate(args, y, jnp.stack([t, t + longest]))
+        assert ride.end is not None
+        events = events_of(args.system, t, unpacked(args.system, y))
+        place = events.names.index(self.section)
+        # A simulation that ends elsewhere must not be passed to the jump: its derivatives could be NaN.
+        ok = ride.status == Status.EVENT + place
+        before, t_end = jnp.where(ok, packed(ride.end), y), jnp.where(ok, ride.t_end, t)
+        after = state_after(args.system, t_end, before, jnp.asarray(place, y.dtype), stages_of(events))
+        return jnp.where(ok, after, jnp.nan), jnp.where(ok, t_end - t, jnp.nan)
+
+    def flow(self, args: OrbitArguments, y: Array, t: Array, duration: Array) -> Array:
+        """The packed state after a duration, from a packed state at time t."""
+        ride = self.simulate(args, y, jnp.stack([t, t + duration]))
+        assert ride.end is not None
+        return jnp.where(ride.ok, packed(ride.end), jnp.nan)
+
+    def simulate(self, args: OrbitArguments, y: Array, ts: Array, adjoint: Any = "forward") -> Trajectory:
+        """A simulation that does not end at the section, or ends there before its jump."""
+        system = with_section(args.system, self.section, self.jumps)
+        if self.constrained:  # `simulate` refuses a state that violates the constraints
+            n_q = len(system.coordinates)
+            y = jnp.concatenate([projected(system, ts[0], y[:n_q]), y[n_q:]])
+        options = {"rtol": self.rtol, "atol": self.atol, "solver": self.solver, "max_steps": self.max_steps}
+        return simulate(system, unpacked(system, y), ts, args.inputs, adjoint=adjoint, **options)
+
+    def _ends(self, f: Any, segments: Array) -> Any:
+        """f(segment, last) of all segments. They share one program, but the last one has its own if it ends by a
+        jump."""
+        if not self.jumps:
+            return jax.lax.map(lambda segment: f(segment, False), segments)
+        end = jax.tree.map(lambda x: x[None], f(segments[-1], True))
+        if self.segments == 1:
+            return end
+        others = jax.lax.map(lambda segment: f(segment, False), segments[:-1])
+        return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), others, end)
+
+    def _targets(self, z: Array, args: OrbitArguments) -> Array:
+        """The closed entries (K, n) at which the segments must end."""
+        return jnp.roll(self.rows(z), -1, axis=0).at[-1].add(args.advance[self.places])
+
+    def _conditions(self, z: Array, args: OrbitArguments) -> Array:
+        """Phase condition, held entries and configuration constraints at the start."""
+        y = self.states(z, args)[0]
+        conditions = [y[np.array(self.hold, int)] - args.targets]
+        if self.section and not self.jumps:
+            conditions.append(section_value(args.system, self.section, args.t, y)[None])
+        elif self.autonomous and not self.jumps:
+            conditions.append(jnp.sum(args.normal * (y - args.center))[None])
+        if self.constrained:
+            conditions.append(configuration_residual(args.system, args.t, y[: len(args.system.coordinates)]))
+        return jnp.concatenate(conditions)
+
+    def residual(self, z: Array, args: OrbitArguments) -> Array:
+        ends = self._ends(lambda segment, last: self._segment_end(segment, args, last), self._segment_starts(z, args))
+        return self._residual(ends, self._targets(z, args), self._conditions(z, args))
+
+    def _residual(self, ends: Array, targets: Array, conditions: Array) -> Array:
+        late = ends[-1:, -1] if self.jumps else ends[:0, -1]
+        return jnp.concatenate([jnp.ravel(ends[:, :-1] - targets), late, conditions])
+
+    def evaluate(
+        self,
+        z: Array,
+        args: OrbitArguments,
+        p: Array | None = None,
+        args_at: Callable[[Array], OrbitArguments] | None = None,
+    ) -> Evaluation:
+        """F and J. A segment is differentiated with respect to its own start only, so the cost is linear in K.
+
+        `p` (n_p,) are further unknowns on which the arguments depend, as `args_at(p)`. J then has n_p more columns.
+        """
+        extra = jnp.zeros(0, z.dtype) if p is None else p
+        n_p = extra.size
+
+        def at(z_p: Array) -> tuple[Array, OrbitArguments]:
+            return z_p[: z.size], args if args_at is None else args_at(z_p[z.size :])
+
+        def with_slope(segment, last):
+            def twice(segment):
+                end = self._segment_end(segment, at(jnp.append(z, segment[segment.size - n_p :]))[1], last)
+                return end, end
+
+            return jax.jacfwd(twice, has_aux=True)(segment)
+
+        def starts(z_p):
+            return jnp.concatenate(
+                [self._segment_starts(*at(z_p)), jnp.tile(z_p[z.size :], (self.segments, 1))], axis=1
+            )
+
+        def targets(z_p):
+            return self._targets(*at(z_p))
+
+        def conditions(z_p):
+            return self._conditions(*at(z_p))
+
+        z_p = jnp.append(z, extra)
+        slopes, ends = self._ends(with_slope, starts(z_p))  # (K, n+1, n+2+n_p), (K, n+1)
+        J_ends, J_targets = jnp.einsum("kij,kjz->kiz", slopes, jax.jacfwd(starts)(z_p)), jax.jacfwd(targets)(z_p)
+        J_others = jax.jacfwd(conditions)(z_p)
+        columns = jax.vmap(self._residual, in_axes=-1, out_axes=-1)
+        J = columns(J_ends, J_targets, J_others)
+        F = self._residual(ends, targets(z_p), conditions(z_p))
+        n = len(self.closed)
+        return Evaluation(F, J, slopes[:, :n, :n])
+
+    def rates(self, z: Array, args: OrbitArguments) -> Float[Array, "K n"]:
+        """The rates of the closed entries at the start of each segment."""
+        times = self._segment_starts(z, args)[:, -2]
+        return jax.vmap(lambda t, y: packed_rates(args, t, y)[self.places])(times, self.states(z, args))
+
+    def sizes(self, z: Array, args: OrbitArguments) -> Float[Array, " n_z"]:
+        """The size of each unknown, in its unit: 1 for an angle, otherwise the amplitude of a harmonic motion with
+        these values and rates."""
+        T, system = self.period(z, args), args.system
+        amplitudes = jnp.sqrt(self.rows(z) ** 2 + (self.rates(z, args) * T / (2 * np.pi)) ** 2)
+        amplitude, largest = jnp.max(amplitudes, axis=0), []
+        n_q, n_u = len(system.coordinates), len(system.speeds)
+        units = coordinate_units(system)
+        for i in self.closed:
+            like = [
+                j for j, k in enumerate(self.closed) if (k < n_q) == (i < n_q) and (k < n_q + n_u) == (i < n_q + n_u)
+            ]
+            size = jnp.max(amplitude[np.array(like)])
+            least = jnp.where(
+                size > 0, 1e-3 * size, 1.0
+            )  # an entry that is zero along the orbit is compared with others
+            own = amplitude[self.closed.index(i)]
+            largest.append(jnp.ones_like(own) if i < n_q and units[i] == "rad" else jnp.maximum(own, least))
+        sizes = jnp.tile(jnp.stack(largest), self.segments)
+        return jax.lax.stop_gradient(jnp.append(sizes, T) if self.autonomous else sizes)
+
+    def return_matrix(self, segments: Array, z: Array, args: OrbitArguments) -> Float[Array, "m m"]:
+        """The derivative of the return map: the product of the segments, each between the planes that are orthogonal to
+        the flow (if the system is autonomous) and tangent to the configuration constraints.
+
+        The flow maps its own direction onto itself, so these planes have all multipliers but the trivial one. A product
+        of such small matrices keeps the relative accuracy of multipliers that are as small as 1e-38.
+        """
+        size = self.sizes(z, args)[: len(self.closed)]
+        bases = jax.vmap(lambda y, t, f: self._basis(args, y, t, f, size))(
+            self.states(z, args), self._segment_starts(z, args)[:, -2], self.rates(z, args)
+        )
+        scaled = segments * size[None, None, :] / size[None, :, None]
+        product = jnp.eye(bases.shape[2], dtype=z.dtype)
+        for i in range(self.segments):
+            product = bases[(i + 1) % self.segments].T @ scaled[i] @ bases[i] @ product
+        return product
+
+    def trivial_multiplier(self, segments: Array, z: Array, args: OrbitArguments) -> Array:
+        """The multiplier of the direction of the flow, which is 1 without numerical errors."""
+        size = self.sizes(z, args)[: len(self.closed)]
+        f = self.rates(z, args)
+        after = jnp.roll(f, -1, axis=0) / size[None]
+        along = jnp.einsum("kij,kj->ki", segments, f)
+        if self.jumps:  # the last segment ends at the section, so that it has the same end for all starts along f
+            along = along.at[-1].add(f[0])
+        along = along / size[None]
+        return jnp.prod(jnp.sum(after * along, axis=1) / jnp.sum(after**2, axis=1))
+
+    def _basis(self, args: OrbitArguments, y: Array, t: Array, f: Array, size: Array) -> Array:
+        """An orthonormal basis (n, m) of the scaled changes of a state that remain, in its columns.
+
+        Householder's reflections depend smoothly on the state. The factor of `jnp.linalg.qr` has no derivative here.
+        """
+        vectors = []
+        if self.constrained:
+            n_q = len(args.system.coordinates)
+            G = jax.jacfwd(lambda q: configuration_residual(args.system, t, q))(y[:n_q])
+            G = jnp.concatenate([G, jnp.zeros((len(G), len(y) - n_q), G.dtype)], axis=1)[:, self.places]
+            vectors += list(G * size[None])
+        vectors += [f / size] if self.autonomous else []
+        basis = jnp.eye(len(self.closed), dtype=y.dtype)
+        for k, vector in enumerate(vectors):
+            v = basis.T @ vector
+            v = v.at[:k].set(0.0)
+            sign = jnp.where(jax.lax.stop_gradient(v[k]) < 0, -1.0, 1.0)
+            v = v.at[k].add(sign * jnp.sqrt(jnp.sum(v**2)))
+            basis = basis - 2.0 * jnp.outer(basis @ v, v) / jnp.sum(v**2)
+        return basis[:, len(vectors) :]
+
+
+def packed_rates(args: OrbitArguments, t: Array, y: Array) -> Array:
+    """The rates of a packed state with the inputs of an orbit."""
+    state = unpacked(args.system, y)
+    signals = as_signals(args.inputs, args.system.inputs, jnp.stack([t, t + 1.0]), type(args.system).__name__)
+    return vector_field(args.system, t, y, inputs_at(args.system, signals, t, state))
+
+
+def section_value(system: System, section: str, t: Array, y: Array) -> Array:
+    """The event function of the section at a packed state."""
+    names = events_of(system, t, unpacked(system, y)).names
+    return event_values(system, t, y, jnp.zeros_like(y)).values[names.index(section)]
+
+
+def with_section(system: System, section: str, jumps: bool) -> System:
+    """The system without the event of the section, at which a simulation that starts there would end; or, if this event
+    changes the state, with an event that ends the simulation before the jump."""
+    if not section:
+        return system
+    kind: Any = type(system)
+    copy = object.__new__(_with_section(kind, section, jumps))
+    for field, value in vars(system).items():
+        object.__setattr__(copy, field, value)
+    return copy
+
+
+@functools.cache
+def _with_section(kind: Any, section: str, jumps: bool) -> Any:
+    class WithSection(kind):
+        def events(self, t, q, u):
+            events = super().events(t, q, u)
+            ending = {section: dataclasses.replace(events[section], stages=())} if jumps else {}
+            return {name: event for name, event in events.items() if name != section} | ending
+
+    WithSection.__name__ = WithSection.__qualname__ = kind.__name__
+    return WithSection

@@ -1,0 +1,496 @@
+"""Events that change the state: times, states, derivatives, order, batches, and what ends a simulation with jumps."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mechanisms import CompassGait, RimlessWheel
+
+import jaxkane as jk
+
+TS = jnp.linspace(0.0, 2.0, 21)
+TIGHT = {"rtol": 1e-12, "atol": 1e-12}
+
+
+class Ball(jk.System):
+    """A ball over a floor, with drag c |v| v. It counts its bounces."""
+
+    restitution: jk.Scalar = jk.parameter(0.8)
+    drag: jk.Scalar = jk.parameter(0.1, unit="kg/m")
+    gravity: jk.Scalar = jk.parameter(9.81)
+    coordinates, speeds, states, inputs = ("h",), ("v",), ("bounces",), ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["h"] * N.y, u["v"] * N.y), name="ball")])
+
+    def loads(self, t, q, u, motion, inputs):
+        resistance = (inputs["push"] - self.drag * u["v"] * jnp.abs(u["v"])) * motion.N.y
+        return jk.weight(motion, -self.gravity * motion.N.y), jk.Force(resistance, motion["ball"])
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return {}
+
+    def bounce(self, t, q, u, x):
+        return {"v": -self.restitution * u["v"], "bounces": x["bounces"] + 1.0}
+
+    def events(self, t, q, u):
+        return {"floor": jk.falling(q["h"], then=self.bounce)}
+
+
+def drop(p, ts=TS, system=Ball, **options):
+    """p: height, gravity, drag, restitution."""
+    return jk.simulate(system(p[3], p[2], p[1]), jk.State(p[:1], jnp.zeros(1)), ts, **{**TIGHT, **options})
+
+
+P = jnp.array([1.0, 9.81, 0.1, 0.8])
+# Closed form with 30 digits, in the order of P: times of the bounces; state at 2 s and its derivatives by mpmath.
+TIMES = [0.4590853109923369, 1.1280946846381106, 1.6405736265752897]
+
+
+def closed_form(p, t):
+    """Height and velocity at t between the bounces, by the formulas of a fall with drag (mass 1)."""
+    h, g, c, e = p
+    end = jnp.sqrt(g / c)
+    fall = jnp.arccosh(jnp.exp(c * h)) / jnp.sqrt(g * c)
+    v, start = e * end * jnp.sqrt(1 - jnp.exp(-2 * c * h)), fall
+    while True:
+        rise = jnp.arctan(v / end) / jnp.sqrt(g * c)
+        top = jnp.log(1 + (v / end) ** 2) / (2 * c)
+        down = jnp.arccosh(jnp.exp(c * top)) / jnp.sqrt(g * c)
+        s = t - start
+        if s < rise:
+            angle = jnp.arctan(v / end) - jnp.sqrt(g * c) * s
+            return jnp.stack([top + jnp.log(jnp.cos(angle)) / c, end * jnp.tan(angle)])
+        if s < rise + down:
+            angle = jnp.sqrt(g * c) * (s - rise)
+            return jnp.stack([top - jnp.log(jnp.cosh(angle)) / c, -end * jnp.tanh(angle)])
+        v, start = e * end * jnp.sqrt(1 - jnp.exp(-2 * c * top)), start + rise + down
+
+
+def test_a_bouncing_ball_with_drag():
+    atol = 1e-10
+    ride = drop(P)
+    assert ride.ok
+    assert int(ride.jumps.count) == 3
+    np.testing.assert_allclose(ride.jumps.t[:3], TIMES, atol=atol)
+    np.testing.assert_allclose([ride.end.q[0], ride.end.u[0]], closed_form(P, 2.0), atol=atol)
+    np.testing.assert_allclose(ride["bounces"], np.searchsorted(TIMES, TS), atol=0)
+    before, after = ride.jumps.before, ride.jumps.after
+    np.testing.assert_allclose(after.u[:3, 0], -0.8 * before.u[:3, 0], rtol=1e-14)
+    np.testing.assert_allclose(ride.jumps.energy[:3], 0.18 * before.u[:3, 0] ** 2, rtol=1e-12)
+    assert np.isnan(ride.jumps.t[3:]).all()
+    assert np.isnan(before.u[3:]).all()
+    assert ride.jumps.name(2) == "floor"
+    with pytest.raises(IndexError, match="3 jumps"):
+        ride.jumps.name(3)
+
+
+@pytest.mark.parametrize("adjoint", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
+def test_derivatives_through_jumps(adjoint):
+    """Of the state at the end and of the time of the last bounce, against the closed form.
+
+    The second derivative of |v| v jumps at the top, where no step ends: this limits the accuracy.
+    """
+    rtol = 1e-7
+    slopes = jax.jacfwd if adjoint == "forward" else jax.jacrev
+
+    def found(p):
+        ride = drop(p, adjoint=adjoint)
+        return jnp.stack([ride.end.q[0], ride.end.u[0], ride["h"][11], ride.jumps.t[2]])
+
+    def expected(p):
+        h, g, c, e = p
+        time, v = jnp.arccosh(jnp.exp(c * h)) / jnp.sqrt(g * c), e * jnp.sqrt(g / c * (1 - jnp.exp(-2 * c * h)))
+        for _ in range(2):
+            top = jnp.log(1 + v * v * c / g) / (2 * c)
+            time += (jnp.arctan(v * jnp.sqrt(c / g)) + jnp.arccosh(jnp.exp(c * top))) / jnp.sqrt(g * c)
+            v = e * jnp.sqrt(g / c * (1 - jnp.exp(-2 * c * top)))
+        return jnp.stack([*closed_form(p, 2.0), closed_form(p, 1.1)[0], time])
+
+    np.testing.assert_allclose(jax.jit(slopes(found))(P), jax.jacfwd(expected)(P), rtol=rtol)
+
+
+@pytest.mark.slow
+def test_second_derivatives_through_a_jump():
+    """Without drag, by height, gravity and restitution: the derivative of |v| v has a corner at the top."""
+    rtol, ts, p = 1e-8, jnp.linspace(0.0, 1.0, 6), jnp.array([1.0, 9.81, 0.8])
+
+    def end(p):
+        return drop(jnp.array([p[0], p[1], 0.0, p[2]]), ts, adjoint="forward").end.q[0]
+
+    def expected(p):
+        h, g, e = p
+        fall = jnp.sqrt(2 * h / g)
+        return e * g * fall * (1.0 - fall) - g * (1.0 - fall) ** 2 / 2
+
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(end)))(p), jax.hessian(expected)(p), rtol=rtol, atol=1e-8)
+    third = jax.jacfwd(jax.jacfwd(jax.jacfwd(lambda h: end(p.at[0].set(h)))))
+    assert np.isnan(jax.jit(third)(1.0))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"step": 0.01}, {"solver": diffrax.Heun(), "rtol": 1e-7, "atol": 1e-7}],
+    ids=["fixed steps", "without rates at ends"],
+)
+def test_other_methods(options):
+    options = {**({"rtol": None, "atol": None} if "step" in options else {}), **options}
+    ride = drop(P, **options)
+    assert int(ride.jumps.count) == 3
+    np.testing.assert_allclose(ride.jumps.t[:3], TIMES, atol=1e-6)
+    np.testing.assert_allclose([ride.end.q[0], ride.end.u[0]], closed_form(P, 2.0), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_an_implicit_solver():
+    ride = drop(P, solver=diffrax.Kvaerno5(), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose([ride.end.q[0], ride.end.u[0]], closed_form(P, 2.0), atol=1e-6)
+
+
+def test_each_member_of_a_batch_jumps_at_its_own_times():
+    """A member equals its own simulation, beside one without jumps and one with as many as are allowed."""
+    heights = jnp.array([0.01, 1.0, 30.0])
+
+    def run(h):
+        return drop(P.at[0].set(h), rtol=1e-8, atol=1e-8, max_jumps=5)
+
+    batch = jax.jit(jax.vmap(run))(heights)
+    assert batch.reason == ["max jumps", "completed", "completed"]
+    np.testing.assert_array_equal(batch.jumps.count, [5, 3, 0])
+    for i, h in enumerate(heights):
+        one = run(h)
+        np.testing.assert_allclose(batch.q[i], one.q, rtol=1e-12, atol=1e-13)
+        np.testing.assert_array_equal(batch.stats["steps"][i], one.stats["steps"])
+        np.testing.assert_allclose(batch.jumps.t[i], one.jumps.t, rtol=1e-12)
+
+
+@pytest.mark.parametrize("t0", [0.0, 1.7e9])
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_any_clock_and_any_scale_of_time(t0, scale):
+    """With g / scale^2 the motion is the same at times that are scaled."""
+    p = P.at[1].divide(scale**2)
+    with_times = np.asarray(TS) * scale + t0 if t0 == 0 or scale == 1e6 else None
+    if with_times is None:
+        pytest.skip("float64 cannot resolve microseconds there")
+    ride = drop(p, with_times, atol=1e-14)
+    assert int(ride.jumps.count) == 3
+    np.testing.assert_allclose((np.asarray(ride.jumps.t[:3]) - t0) / scale, TIMES, atol=1e-9)
+
+
+def test_float32():
+    p = P.astype(jnp.float32)
+    system = jax.tree.map(lambda x: x.astype(jnp.float32), Ball(p[3], p[2], p[1]))
+    start = jk.State(p[:1], jnp.zeros(1, jnp.float32))
+    ride = jk.simulate(system, start, jnp.asarray(TS, jnp.float32))
+    assert ride.q.dtype == jnp.float32
+    np.testing.assert_allclose(ride.jumps.t[:3], TIMES, atol=2e-4)
+    np.testing.assert_allclose(ride.end.q[0], closed_form(P, 2.0)[0], atol=1e-3)
+
+
+class Free(jk.System):
+    """A particle without forces. `mode` counts or marks jumps."""
+
+    coordinates, speeds, states = ("x",), ("v",), ("mode",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x))])
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return {}
+
+
+def moving(events, v=1.0, x=0.0, ts=TS, **options):
+    """A particle whose events are given by a function (t, q, u, x)."""
+    kind = type("Moving", (Free,), {"events": lambda self, t, q, u, x: events(t, q, u, x)})
+    return jk.simulate(kind(), jk.State(jnp.array([x]), jnp.array([v])), ts, **options)
+
+
+def kick(t, q, u, x):
+    """Once at x = 1, since the condition is no longer met after the jump."""
+    return {"kick": jk.rising(q["x"] - 1.0, when=0.5 - x["mode"], then={"v": 2.0 * u["v"], "mode": 1.0})}
+
+
+def test_a_sample_at_the_time_of_a_jump_has_the_value_after_it():
+    ride = moving(kick)
+    np.testing.assert_allclose(ride["v"], np.where(np.asarray(TS) < 1.0 - 1e-9, 1.0, 2.0))
+    at_end = moving(lambda t, q, u, x: {"kick": jk.rising(q["x"] - 2.0, then={"v": -3.0})})
+    assert at_end.ok
+    assert int(at_end.jumps.count) == 1
+    assert float(at_end["v"][-1]) == float(at_end.end.u[0]) == -3.0
+    np.testing.assert_allclose(at_end["x"], TS, atol=1e-12)
+
+
+def test_the_derivative_of_a_sample_at_a_jump():
+    """It does not exist if the time of the jump depends on the parameter. At a jump with a fixed time it does."""
+
+    def found(v, at_time):
+        def events(t, q, u, x):
+            new = {"v": 2.0 * u["v"], "mode": 1.0}
+            return {"kick": jk.rising((t if at_time else q["x"]) - 1.0, when=0.5 - x["mode"], then=new)}
+
+        return moving(events, v, adjoint="forward")["x"]
+
+    by_place = jax.jacfwd(lambda v: found(v, False))(1.0)
+    assert np.flatnonzero(np.isnan(by_place)).tolist() == [10]
+    by_time = jax.jacfwd(lambda v: found(v, True))(1.0)
+    np.testing.assert_allclose(by_time, np.where(TS <= 1.0, TS, 2 * TS - 1), atol=1e-9)
+
+
+def test_the_derivative_of_an_end_at_a_jump():
+    """It does not exist either if the time of the jump depends on the parameter."""
+
+    def end(v, at_time):
+        def events(t, q, u, x):
+            return {"kick": jk.rising((t if at_time else q["x"]) - 2.0, then={"v": -3.0 * u["v"]})}
+
+        ride = moving(events, v, adjoint="forward")
+        return jnp.stack([ride.end.q[0], ride.end.u[0]])
+
+    assert np.isnan(jax.jacfwd(lambda v: end(v, False))(1.0)).all()
+    np.testing.assert_allclose(jax.jacfwd(lambda v: end(v, True))(1.0), [2.0, -3.0], atol=1e-9)
+
+
+def test_simultaneous_events_follow_each_other_in_alphabetical_order():
+    """Each reads the state that the previous one left, and counts only if it still leaves in its direction."""
+
+    def events(t, q, u, x):
+        def at_one(new, until):
+            return jk.rising(q["x"] - 1.0, when=until - x["mode"], then={"mode": 10.0 * x["mode"] + new})
+
+        b = jk.rising(q["x"] - 1.0, then={"mode": 10.0 * x["mode"] + 2.0, "v": -u["v"]})
+        return {"a": at_one(1.0, 0.5), "b": b, "c": at_one(3.0, 100.0)}
+
+    ride = moving(events)
+    assert [ride.jumps.name(i) for i in range(int(ride.jumps.count))] == ["a", "b"]
+    np.testing.assert_allclose(ride.jumps.t[:2], 1.0, atol=1e-12)
+    assert float(ride["mode"][-1]) == 12.0
+    np.testing.assert_allclose(ride["x"][-1], 0.0, atol=1e-12)
+
+
+def test_two_events_almost_at_once():
+    for gap in (1e-13, 1e-9):
+
+        def events(t, q, u, x, gap=gap):
+            ones, tens = x["mode"] % 10.0, x["mode"] // 10.0
+            return {
+                "late": jk.rising(q["x"] - 1.0 - gap, when=0.5 - tens, then={"mode": x["mode"] + 10.0}),
+                "soon": jk.rising(q["x"] - 1.0, when=0.5 - ones, then={"mode": x["mode"] + 1.0}),
+            }
+
+        ride = moving(events)
+        assert float(ride["mode"][-1]) == 11.0
+        assert ride.jumps.name(0) == "soon" or gap < 1e-12
+
+
+def test_a_condition():
+    """Crossings while `when` is not positive have no effect, and do not hide later ones."""
+
+    def events(t, q, u, x):
+        new = {"x": q["x"] + 0.1, "mode": x["mode"] + 1.0}
+        return {"low": jk.falling(jnp.cos(4.0 * q["x"]), when=q["x"] - 1.0, then=new)}
+
+    ts = jnp.linspace(0.0, 5.0, 11)
+    ride = moving(events, ts=ts)
+    crossings = (np.pi / 2 + 2 * np.pi * np.arange(4)) / 4
+    expected = crossings[crossings > 1.0] - 0.1 * np.arange(3)
+    np.testing.assert_allclose(ride.jumps.t[: int(ride.jumps.count)], expected, atol=1e-9)
+    ends = moving(lambda t, q, u, x: {"low": jk.falling(jnp.cos(4.0 * q["x"]), when=q["x"] - 1.0)}, ts=ts)
+    assert ends.reason == "low"
+    np.testing.assert_allclose(ends.t_end, crossings[1], atol=1e-9)
+
+
+def test_stages_read_the_state_that_the_previous_one_left():
+    def swap(t, q, u, x):
+        return {"mode": u["v"], "v": 0.5 * u["v"]}
+
+    ride = moving(lambda t, q, u, x: {"kick": jk.rising(q["x"] - 1.0, then=({"v": -3.0 * u["v"]}, swap))})
+    assert float(ride["mode"][-1]) == -3.0
+    assert float(ride["v"][-1]) == -1.5
+
+
+def test_a_start_on_zero_jumps_at_once_if_it_leaves_in_its_direction():
+    def events(t, q, u, x):
+        return {"wall": jk.falling(q["x"], then={"v": -u["v"]})}
+
+    assert int(moving(events, v=1.0).jumps.count) == 0
+    back = moving(events, v=-1.0)
+    assert int(back.jumps.count) == 1
+    np.testing.assert_allclose(back["x"], TS, atol=1e-12)
+
+
+def test_both_zeros_of_a_gap_in_one_step():
+    """A ball that leaves the floor with 1e-7 m/s lands after 2e-8 s."""
+    ride = jk.simulate(Ball(0.5, 0.0), jk.State(jnp.zeros(1), jnp.array([1e-7])), TS, max_jumps=3)
+    np.testing.assert_allclose(ride.jumps.t[:2], 2e-7 / 9.81 * np.array([1.0, 1.5]), rtol=1e-6)
+    assert ride.reason == "max jumps"
+
+
+def test_a_jump_that_repeats_itself_has_a_status():
+    ride = moving(lambda t, q, u, x: {"wall": jk.rising(q["x"] - 1.0, then={"v": 0.5 * u["v"]})})
+    assert ride.reason == "repeated jump"
+    assert "then" in repr(ride)
+    np.testing.assert_allclose(ride.t_end, 1.0, atol=1e-12)
+    assert int(ride.jumps.count) == 1
+    rests = drop(P.at[3].set(0.0))
+    assert rests.reason == "repeated jump"
+    np.testing.assert_allclose(rests.t_end, TIMES[0], atol=1e-10)
+
+
+def test_jumps_that_accumulate_have_a_status():
+    ride = drop(P.at[3].set(0.3), max_jumps=20)
+    assert ride.reason == "max jumps"
+    assert int(ride.jumps.count) == 20
+    assert "max_jumps" in repr(ride)
+
+
+def test_a_jump_at_a_discontinuity_of_an_input():
+    """The push changes its sign where the ball lands."""
+    samples = jk.Samples(jnp.array([0.0, TIMES[0]]), jnp.array([0.0, 2.0]), zero_order_hold=True)
+    ride = drop(P, inputs={"push": samples})
+    p = P.at[1].set(9.81 - 2.0)
+    v = 0.8 * np.sqrt(9.81 / 0.1 * (1 - np.exp(-0.2)))
+    rise = np.arctan(v * np.sqrt(0.1 / p[1])) / np.sqrt(0.1 * p[1])
+    top = np.log(1 + v * v * 0.1 / p[1]) / 0.2
+    down = np.arccosh(np.exp(0.1 * top)) / np.sqrt(0.1 * p[1])
+    np.testing.assert_allclose(ride.jumps.t[:2], [TIMES[0], TIMES[0] + rise + down], atol=1e-9)
+
+
+def test_a_rimless_wheel_converges_to_its_gait():
+    """Rate after a step: cot(2 a) sqrt(4 (g / l) sin(a) sin(gamma)); each step multiplies deviations by cos(2 a)^2."""
+    rtol, a = 1e-10, 0.4
+    rate = np.sqrt(4 * 9.81 * np.sin(a) * np.sin(0.08)) / np.tan(2 * a)
+
+    def rates(factor):
+        start = jk.State(jnp.array([0.08 - a]), jnp.array([factor * rate]))
+        return np.asarray(jk.simulate(RimlessWheel(), start, 4 * TS, **TIGHT).jumps.after.u[:3, 0])
+
+    np.testing.assert_allclose(rates(1.0), rate, rtol=rtol)
+    squares = rates(1.1) ** 2 - rate**2
+    np.testing.assert_allclose(squares[1:] / squares[:-1], np.cos(2 * a) ** 2, rtol=1e-9)
+
+
+def test_a_compass_gait():
+    """The state after a step is that before it. Figures by mpmath and by Pinocchio's impulse dynamics."""
+    rtol = 1e-9
+    after = [-0.21866880293899055, 0.3233885580586503, 1.092383589883601, 0.3773739489071941]
+    start = jk.State(jnp.array(after[:2]), jnp.array(after[2:]))
+    ride = jk.simulate(CompassGait(), start, jnp.linspace(0.0, 1.0, 21), **TIGHT)
+    assert int(ride.jumps.count) == 1
+    np.testing.assert_allclose(ride.jumps.t[0], 0.7343463911587195, rtol=rtol)
+    found = [*ride.jumps.before.q[0], *ride.jumps.before.u[0]]
+    np.testing.assert_allclose(found, [after[1], after[0], 1.4942048971003625, 1.8056788689878192], rtol=rtol)
+    np.testing.assert_allclose([*ride.jumps.after.q[0], *ride.jumps.after.u[0]], after, rtol=rtol)
+    np.testing.assert_allclose(ride.jumps.impulses[0], [-2.619490477212034, 13.735598013322457], rtol=rtol)
+    assert ride.jumps.energy[0] > 0
+
+
+def test_the_energy_balance_over_jumps():
+    """The audit counts what the impacts lose, and no work where a jump moves a mass centre."""
+    p = P.at[2].set(0.0)
+    ride = drop(p, jnp.linspace(0.0, 2.0, 201), max_jumps=5)
+    audit = jk.audit(Ball(p[3], p[2], p[1]), ride)
+    np.testing.assert_allclose(audit.lost[-1], jnp.sum(ride.jumps.energy[:3]))
+    assert audit.energy_balance < 1e-9
+    assert "lost in jumps" in str(audit)
+    start = jk.State(jnp.array([-0.32]), jnp.array([1.2]))
+    wheel = jk.simulate(RimlessWheel(), start, jnp.linspace(0.0, 2.0, 201), **TIGHT)
+    assert int(wheel.jumps.count) > 0
+    assert jk.audit(RimlessWheel(), wheel).energy_balance < 1e-9
+
+
+def test_where_jumps_cannot_be_represented(tmp_path):
+    with pytest.raises(ValueError, match=r"events of Ball change its state: floor\. A Kalman filter cannot"):
+        jk.estimate.Filter(Ball(), {"h": 0.01})
+    with pytest.warns(UserWarning, match="do not contain them"):
+        jk.export.c(Ball(), tmp_path / "ball.c", ["rates"])
+
+
+def test_a_sweep_over_parameters_with_different_numbers_of_jumps():
+    heights = jnp.array([[0.5], [1.0], [9.0]])
+    batch = jk.sweep.sweep(Ball(drag=0.0), jk.State(heights, jnp.zeros((3, 1))), jnp.linspace(0.0, 1.0, 5), chunk=2)
+    np.testing.assert_array_equal(batch.jumps.count, [2, 1, 0])
+    first = np.sqrt(2 * heights[:2, 0] / 9.81)
+    np.testing.assert_allclose(batch.jumps.t[:2, 0], first, rtol=1e-7)
+    np.testing.assert_allclose(batch.jumps.t[0, 1], first[0] * 2.6, rtol=1e-7)
+
+
+def test_what_jumps_cannot_do():
+    def then(new):
+        return lambda t, q, u, x: {"kick": jk.rising(q["x"] - 1.0, then=new)}
+
+    with pytest.raises(ValueError, match="not a coordinate, an independent speed or a first-order state: w"):
+        moving(then({"w": 1.0}))
+    with pytest.raises(TypeError, match="must be a dict of new values by name"):
+        moving(then(3.0))
+    with pytest.raises(ValueError, match="empty tuple"):
+        moving(then(()))
+    with pytest.raises(ValueError, match="max_jumps"):
+        moving(then({"v": 2.0}), max_jumps=0)
+    with pytest.raises(ValueError, match="solver loop of jaxkane"):
+        moving(then({"v": 2.0}), controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))
+    with pytest.raises(TypeError, match="`when` is a boolean"):
+        moving(lambda t, q, u, x: {"kick": jk.rising(q["x"], when=q["x"] > 0)})
+    with pytest.raises(TypeError, match="the new value of 'v' must be one number"):
+        moving(then({"v": "2"}))
+    for new in ({"v": jnp.nan}, lambda t, q, u: jk.Impact(u["v"], restitution=1.0 + q["x"])):
+        ride = moving(then(new))
+        assert ride.reason == "impossible jump"
+        np.testing.assert_allclose(ride.t_end, 1.0, atol=1e-9)
+
+
+def test_a_jump_that_violates_a_configuration_constraint_ends_the_simulation():
+    class Kicked(jk.catalog.WhippleBicycle):
+        def events(self, t, q, u):
+            return {"kick": jk.falling(q["roll"] + 0.02, then={"steer": 0.5})}
+
+    bicycle = Kicked.benchmark()
+    start = jk.assemble(bicycle, {}, {"roll_rate": -0.2, "rear_wheel_rate": -4.6 / bicycle.rR})
+    assert jk.simulate(bicycle, start, jnp.linspace(0.0, 1.0, 3)).reason == "impossible jump"
+
+
+def test_the_last_sample_shortly_after_a_jump():
+    for late in (0.0, 1e-15, 1e-13, 1e-12, 1e-10):
+        ride = drop(P, jnp.array([0.0, TIMES[0] + late]))
+        assert ride.ok
+        assert int(ride.jumps.count) == 1
+        assert float(ride["v"][-1]) > 0
+        assert float(ride["bounces"][-1]) == 1.0
+
+
+def test_an_event_that_its_jump_does_not_change_occurs_once_at_each_crossing():
+    """A switch at a time, and a counter of crossings."""
+
+    def events(t, q, u, x):
+        count = {"mode": x["mode"] + 1.0}
+        return {"clock": jk.rising(jnp.sin(6 * jnp.pi * t + 1.0), then=count), "switch": jk.rising(t - 0.5, then=count)}
+
+    ride = moving(events)
+    assert ride.ok
+    crossings = [(2 * np.pi * k - 1.0) / (6 * np.pi) for k in range(1, 7)]
+    np.testing.assert_allclose(ride.jumps.t[:7], sorted([*crossings, 0.5]), atol=1e-9)
+    assert float(ride["mode"][-1]) == 7.0
+
+
+class OverMovingFloor(Ball):
+    def events(self, t, q, u):
+        floor, rate = 0.1 * jnp.sin(12 * t), 1.2 * jnp.cos(12 * t)
+        new = {"v": rate - self.restitution * (u["v"] - rate)}
+        return {"floor": jk.falling(q["h"] - floor, then=new)}
+
+
+def test_a_moving_floor_is_not_passed():
+    """Small dips through zero within long steps: the motion itself is a parabola, which does not limit them."""
+    ts = jnp.linspace(0.0, 5.0, 1001)
+    for h in (0.5446297531687792, 0.5278185456971314):
+        ride = drop(jnp.array([h, 9.81, 0.0, 0.9]), ts, OverMovingFloor, rtol=1e-8, atol=1e-8)
+        assert float(jnp.min(ride["h"] - 0.1 * jnp.sin(12 * ts))) > -1e-7
+
+
+def test_times_of_jumps_in_float32_on_a_posix_clock():
+    start = jk.State(jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32))
+    system = jax.tree.map(lambda x: x.astype(jnp.float32), Ball(0.8, 0.1))
+    ride = jk.simulate(system, start, 1.7e9 + np.asarray(TS, np.float64))
+    np.testing.assert_allclose(ride.jumps.t[:3] - 1.7e9, TIMES, atol=2e-4)

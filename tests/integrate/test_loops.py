@@ -1,0 +1,118 @@
+"""The fast loop and `diffrax.diffeqsolve` take the same steps; what only one of them supports works too."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from test_clocks import Particle, Thrown
+
+import jaxkane as jk
+from jaxkane._integrate import integrate
+
+# Without constraints, with a constraint of the configuration, and with dependent speeds and coordinates.
+SYSTEMS = ["DoublePendulum", *(pytest.param(x, marks=pytest.mark.slow) for x in ("SpinningTop", "WhippleBicycle"))]
+
+
+def both_loops(monkeypatch, simulate):
+    """What `simulate` returns by each loop."""
+    fast = simulate()
+    monkeypatch.setattr(integrate, "is_supported", lambda *_: False)
+    jk.forget()
+    try:
+        return fast, simulate()
+    finally:
+        monkeypatch.undo()
+        jk.forget()
+
+
+def assert_same(fast, other):
+    """To the last digit, but for what XLA makes of another program around the same kernels."""
+    assert fast.status == other.status
+    assert fast.stats["steps"] == other.stats["steps"]
+    for x, y in zip(jax.tree.leaves(fast), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_both_loops_take_the_same_steps(name, monkeypatch):
+    entry = jk.catalog.CATALOG[name]
+    system, state = entry.example(), jk.State(jnp.array(entry.q), jnp.array(entry.u))
+    assert_same(*both_loops(monkeypatch, lambda: jk.simulate(system, state, jnp.linspace(0.0, 0.2, 3))))
+
+
+SAMPLED = {"push": jk.Samples(np.linspace(0.0, 1.0, 5), np.array([1.0, -2.0, 0.5, 3.0, 1.0]), zero_order_hold=True)}
+
+
+@pytest.mark.parametrize(
+    ("system", "inputs", "options"),
+    [
+        (Thrown(), None, {}),
+        pytest.param(Particle(), SAMPLED, {}, marks=pytest.mark.slow),
+        pytest.param(Particle(), SAMPLED, {"step": 0.05}, marks=pytest.mark.slow),
+        pytest.param(Particle(), SAMPLED, {"solver": diffrax.Kvaerno3(), "rtol": 1e-6}, marks=pytest.mark.slow),
+        pytest.param(Particle(), None, {"max_steps": 3}, marks=pytest.mark.slow),
+    ],
+    ids=["event", "hold", "fixed", "implicit", "max steps"],
+)
+def test_both_loops_with_all_that_ends_a_step(system, inputs, options, monkeypatch):
+    state = jk.State([0.0], [0.4])
+    assert_same(*both_loops(monkeypatch, lambda: jk.simulate(system, state, [0.0, 0.5, 1.0], inputs, **options)))
+
+
+@pytest.mark.slow
+def test_both_loops_with_batches_and_derivatives(monkeypatch):
+    def ends(v):
+        ride = jax.vmap(lambda v: jk.simulate(Thrown(), jk.State(jnp.zeros(1), v[None]), [0.0, 1.0, 2.0]))(v)
+        return jnp.sum(ride.t_end), ride.t_end
+
+    found = both_loops(monkeypatch, lambda: jax.jit(jax.grad(ends, has_aux=True))(jnp.array([0.3, 0.7, 2.0])))
+    for x, y in zip(jax.tree.leaves(found[0]), jax.tree.leaves(found[1]), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-12)
+    np.testing.assert_allclose(found[0][0], [2.0, 2.0, 0.0], atol=1e-9)
+
+
+def swing(**options):
+    """A pendulum, and the derivative of its last angle by its length."""
+
+    def last(length):
+        system = jk.catalog.DoublePendulum(mass=1.0, length=length)
+        ride = jk.simulate(system, jk.State(jnp.array([1.0, -0.5]), jnp.zeros(2)), jnp.linspace(0.0, 0.3, 3), **options)
+        return ride.q[-1, 0], ride.status
+
+    (angle, status), slope = jax.jit(jax.value_and_grad(last, has_aux=True))(0.7)
+    return np.array([angle, slope, status])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"adjoint": diffrax.BacksolveAdjoint()},
+        {"solver": diffrax.KenCarp4()},
+        {"controller": diffrax.PIDController(rtol=1e-9, atol=1e-9, pcoeff=0.3, icoeff=0.4, norm=optx.max_norm)},
+        {"progress": True},
+    ],
+    ids=["backsolve", "imex", "controller", "progress"],
+)
+def test_what_diffrax_supports(options):
+    np.testing.assert_allclose(swing(**options), swing(), rtol=1e-6, atol=1e-6)
+
+
+def test_a_controller_still_ends_steps_at_events():
+    control = diffrax.PIDController(rtol=1e-7, atol=1e-7, pcoeff=0.2, icoeff=0.5)
+    ride = jk.simulate(Thrown(), jk.State([0.0], [1.5]), [0.0, 10.0], controller=control)
+    assert ride.reason == "back"
+    assert float(ride.t_end) == pytest.approx(3.0, abs=1e-9)
+
+
+def test_a_term_for_diffrax():
+    system, state = jk.catalog.DoublePendulum(), jk.State(jnp.array([1.0, -0.5]), jnp.zeros(2))
+    term, args = jk.ode_term(system, {"elbow_torque": lambda t, s: 0.3 * jnp.sin(t)})
+    control = diffrax.PIDController(rtol=1e-9, atol=1e-9)
+    solution = diffrax.diffeqsolve(term, diffrax.Tsit5(), 0.0, 0.5, 0.01, state, args, stepsize_controller=control)
+    ride = jk.simulate(system, state, [0.0, 0.5], {"elbow_torque": lambda t, s: 0.3 * jnp.sin(t)}, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(solution.ys.q[0], ride.q[-1], atol=1e-8)
+    with pytest.raises(ValueError, match="The samples of 'elbow_torque'"):
+        jk.ode_term(system, {"elbow_torque": np.zeros(3)})

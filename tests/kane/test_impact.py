@@ -1,0 +1,500 @@
+"""Impacts against Pinocchio, published gaits, closed forms, and multipliers on all speeds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mechanisms import CompassGait
+
+import jaxkane as jk
+from jaxkane import Scalar, parameter
+from jaxkane._kane.description import DescriptionEvaluator
+from jaxkane._system.motion import kinetic_energy_of
+from jaxkane.catalog import CATALOG
+
+RTOL = 1e-12
+
+
+class Chain(jk.System):
+    """Links on hinges about x, y, z in turn, with fixed numbers."""
+
+    def motion(self, t, q, u):
+        N, P = jk.inertial()
+        frame, bodies, points = N, [], {}
+        for i in range(len(self.coordinates)):
+            P = P.fixed(-(0.4 + 0.05 * i if i else 0.0) * frame.z, frame)
+            frame = frame.rotate(1 + i % 3, q[i], u[i], f"B{i}")
+            inertia = 0.02 * (i + 1), 0.03 * (i + 1), 0.01 * (i + 1)
+            center = P.fixed(frame.vector(0.03, -0.02, -0.2))
+            bodies.append(jk.Body(1.0 + 0.3 * i, inertia, center, frame, name=f"link {i}"))
+            points |= {f"hinge {i}": P, f"middle {i}": P.fixed(frame.vector(0.02, 0.0, -0.3))}
+        return jk.Motion(bodies, points=points | {"tip": P.fixed(frame.vector(0.0, 0.05, -0.45))})
+
+
+def chain(n):
+    names = tuple(f"q{i}" for i in range(n)), tuple(f"u{i}" for i in range(n))
+    return type(f"Chain{n}", (Chain,), {"coordinates": names[0], "speeds": names[1]})()
+
+
+def tip_z(t, q, u, motion):
+    return motion["tip"].velocity.dot(motion.N.z)
+
+
+def tip_and_middle_z(t, q, u, motion):
+    return tip_z(t, q, u, motion), motion[f"middle {len(q) // 2}"].velocity.dot(motion.N.z)
+
+
+def tip(t, q, u, motion):
+    return motion["tip"].velocity.express(motion.N)
+
+
+# Pinocchio's impulseDynamics: coordinates and speeds before; residuals, restitution, speeds after and impulses.
+THREE = [0.25019093320933394, 0.794427601939151, 0.551371380490387]
+THREE_BEFORE = [-1.0991712400376326, -0.7993348603550983, 1.4942137815850476]
+FIVE = [-0.9894693908688506, 0.6424568367655326, 0.5941388575040925, -0.06413009431255845, -0.39393514636137295]
+FIVE_BEFORE = [-0.8862975515969067, -0.9805216493835016, -0.2196947764694137, 0.018193035831813198, 0.21398940829796986]
+SEVEN = [0.9910005668687853, 0.5853238384275061, 0.24435845888232532, 0.9779202953637698]
+SEVEN += [-0.5693826035288021, -0.6795759322843109, 0.22507920854606156]
+SEVEN_BEFORE = [-1.8242319681544665, -1.8572788849056154, 0.05955528108548114, -0.1351758986988436]
+SEVEN_BEFORE += [1.668671092771409, 0.5169050179640418, 0.05647058639805547]
+THREE_AFTER = [-0.7628341445235738, 0.8971463950346212, 2.523253529194818]
+THREE_AFTER_BOTH = [0.05001258516848717, 0.48084859410187786, -3.7180542874703555]
+FIVE_AFTER = [-0.9557074281794495, -1.334257728599285, -0.7459636148503581, 1.8197091532420917, -2.256063058918521]
+FIVE_AFTER_XYZ = [
+    -1.3660969652185262,
+    -0.9296782824544791,
+    2.040213282260614,
+    3.1937900338427863,
+    0.0027525998585989364,
+]
+FIVE_AFTER_BOTH = [-0.11456926433005477, -1.140670282907006, -1.867846763756749, -0.2801753155468532]
+FIVE_AFTER_BOTH += [-0.6360612801314708]
+SEVEN_AFTER = [-1.7827289017742474, -2.8790300532229764, -0.24163788782176088, 1.2789382725394245]
+SEVEN_AFTER += [5.9838897170512935, 14.841073565622176, 13.549084689798324]
+SEVEN_AFTER_XYZ = [-1.3563514393445122, -2.6637676516466544, -0.9613895286644907, 0.6879535561186859]
+SEVEN_AFTER_XYZ += [5.071222142470407, 10.659303507005815, 4.549110952643275]
+SEVEN_AFTER_BOTH = [1.0856195139841676, 0.3009631159757902, -3.5923196307916183, -1.7864524976042615]
+SEVEN_AFTER_BOTH += [2.5661152788949373, 16.566114471663127, 9.843795202223731]
+Z, XYZ, BOTH = (tip_z, 0.5), (tip, 0.0), (tip_and_middle_z, 0.3)
+PINOCCHIO = {
+    "3 z": (THREE, THREE_BEFORE, *Z, THREE_AFTER, [2.4585216212613616]),
+    "3 both": (THREE, THREE_BEFORE, *BOTH, THREE_AFTER_BOTH, [-3.5064707305054093, 18.64332802349147]),
+    "5 z": (FIVE, FIVE_BEFORE, *Z, FIVE_AFTER, [-3.2862521141017305]),
+    "5 xyz": (FIVE, FIVE_BEFORE, *XYZ, FIVE_AFTER_XYZ, [-1.0750988666405135, 5.149824677630524, 0.7080449645907833]),
+    "5 both": (FIVE, FIVE_BEFORE, *BOTH, FIVE_AFTER_BOTH, [-2.7727064354180477, -5.436631883634892]),
+    "7 z": (SEVEN, SEVEN_BEFORE, *Z, SEVEN_AFTER, [21.623188281537338]),
+    "7 xyz": (SEVEN, SEVEN_BEFORE, *XYZ, SEVEN_AFTER_XYZ, [0.9059103479133794, 7.313235852643972, 18.257879576082015]),
+    "7 both": (SEVEN, SEVEN_BEFORE, *BOTH, SEVEN_AFTER_BOTH, [18.659152566194383, 36.64871975241565]),
+}
+
+
+@pytest.mark.parametrize("case", [pytest.param(x, marks=[pytest.mark.slow] * (x[0] > "3")) for x in PINOCCHIO])
+def test_impulses_of_pinocchio(case):
+    q, before, residuals, e, u, p = PINOCCHIO[case]
+    after = jk.impact(chain(len(q)), 0.0, q, before, residuals, e)
+    np.testing.assert_allclose(after.u, u, rtol=0, atol=RTOL * np.abs(u).max())
+    np.testing.assert_allclose(after.impulses, p, rtol=0, atol=RTOL * np.abs(p).max())
+    assert after.unique
+
+
+def in_plane(name):
+    def residuals(t, q, u, motion):
+        v = motion[name].velocity
+        return v.dot(motion.N.x), v.dot(motion.N.y)
+
+    return residuals
+
+
+toe = in_plane("toe")
+STRIKE_Q, STRIKE_U = jnp.array([0.3233885580586503, -0.21866880293899055]), [1.4942048971003625, 1.8056788689878192]
+STRIKE_U = jnp.array(STRIKE_U)
+
+
+def test_heel_strike_of_the_compass_gait():
+    # the periodic gait at a slope of 3 degrees; the legs have not been exchanged yet
+    walker = CompassGait()
+    after = jk.impact(walker, 0.0, STRIKE_Q, STRIKE_U, toe, release=("foot",))
+    np.testing.assert_allclose(after.u, [0.3773739489071941, 1.092383589883601], rtol=0, atol=RTOL)
+    np.testing.assert_allclose(after.impulses, [-2.619490477212034, 13.735598013322457], rtol=0, atol=RTOL * 14)
+    before = jk.kinetic_energy(walker, 0.0, STRIKE_Q, STRIKE_U)
+    exchanged = jk.kinetic_energy(walker, 0.0, STRIKE_Q[::-1], after.u[::-1])  # the new stance foot is at rest
+    np.testing.assert_allclose(after.energy_lost, before - exchanged, rtol=1e-11)
+
+
+def test_a_walker_that_does_not_release_its_foot_stops():
+    after = jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe)
+    np.testing.assert_allclose(after.u, 0.0, atol=RTOL)
+
+
+class Hoop(jk.System):
+    """A wheel over a road along x, N.z up. Its two contact residuals make it roll."""
+
+    height: Scalar = parameter(0.08)  # of a kerb [m]
+    radius: Scalar = parameter(0.35)
+    coordinates, speeds, dependent_speeds = ("angle", "x", "z"), ("rate",), ("x_dot", "z_dot")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        W = N.rotate(2, q["angle"], u["rate"], "W")
+        center = O.moving(q["x"] * N.x + q["z"] * N.z, u["x_dot"] * N.x + u["z_dot"] * N.z)
+        hoop = jk.Body(1.0, (0.0, self.radius**2, 0.0), center, W, name="hoop")
+        ground = center.fixed(-self.radius * N.z, W)
+        depth = self.radius - self.height
+        edge = center.fixed(jnp.sqrt(self.radius**2 - depth**2) * N.x - depth * N.z, W)
+        residuals = ground.velocity.dot(N.x), ground.velocity.dot(N.z)
+        return jk.Motion([hoop], residuals, points={"ground": ground, "edge": edge})
+
+
+def edge(t, q, u, motion):
+    v = motion["edge"].velocity
+    return v.dot(motion.N.x), v.dot(motion.N.z)
+
+
+def over_kerb(hoop, release=("ground",)):
+    return jk.impact(hoop, 0.0, [0.0, 0.0, 0.35], [4.5], edge, release=release)
+
+
+def test_a_hoop_strikes_a_kerb():
+    # Angular momentum about the edge. The velocity residuals of the road are released.
+    after = over_kerb(Hoop())
+    np.testing.assert_allclose(after.u, [3.9857142857142858], rtol=RTOL)
+    np.testing.assert_allclose(after.impulses, [-0.49885714285714283, 0.8876607184169006], rtol=0, atol=RTOL)
+    slope = jax.grad(lambda height: over_kerb(Hoop(height=height)).u[0])(0.08)
+    np.testing.assert_allclose(slope, -6.428571428571429, rtol=RTOL)
+    # If the road holds the wheel, it stops.
+    np.testing.assert_allclose(over_kerb(Hoop(), release=()).u, 0.0, atol=RTOL)
+
+
+class SliderCrank(jk.System):
+    """A crank, a rod and a slider on y = 0, closed by configuration constraints."""
+
+    coordinates, speeds = ("crank", "rod", "x"), ("crank_rate",)
+    dependent_coordinates, dependent_speeds = ("rod", "x"), ("rod_rate", "x_dot")
+
+    def ends(self, q):
+        return 0.15 * jnp.cos(q["crank"]) + 0.4 * jnp.cos(q["rod"]), 0.15 * jnp.sin(q["crank"]) + 0.4 * jnp.sin(
+            q["rod"]
+        )
+
+    def configuration_constraints(self, t, q):
+        x, y = self.ends(q)
+        return x - q["x"], y
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["crank"], u["crank_rate"], "A")
+        B = N.rotate(3, q["rod"], u["rod_rate"], "B")
+        pin = O.fixed(0.15 * A.x)
+        slider = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+        crank = jk.Body(0.6, (0.0, 0.0, 0.6 * 0.15**2 / 12), O.fixed(0.075 * A.x), A, name="crank")
+        rod = jk.Body(0.9, (0.0, 0.0, 0.9 * 0.4**2 / 12), pin.fixed(0.2 * B.x), B, name="rod")
+        return jk.Motion([crank, rod, jk.Body(0.5, 0.0, slider, name="slider")], points={"pin": pin})
+
+
+def test_a_struck_slider_crank_stays_closed():
+    system = SliderCrank()
+    q = jk.assemble(system, {"crank": 0.9, "rod": -0.3, "x": 0.5}, {}).q
+    after = jk.impact(system, 0.0, q, [12.0], lambda t, q, u, motion: u["x_dot"], 0.4)
+    np.testing.assert_allclose(after.u, [-4.8], rtol=RTOL)
+    np.testing.assert_allclose(after.impulses, [3.8496550548882733], rtol=RTOL)
+    u_dep = jk.dependent_speeds(system, 0.0, q, after.u)
+    np.testing.assert_allclose(u_dep, [1.1705385664793941, 0.7015325286138013], rtol=RTOL)
+    lost = 0.5 * 0.03349030561689822 * (12.0**2 - 4.8**2)
+    np.testing.assert_allclose(after.energy_lost, lost, rtol=RTOL)
+
+
+def by_multipliers(system, q, u, residuals, e):
+    """The speeds after an impact and its impulses, with multipliers for all residuals and without elimination."""
+    evaluator, q = DescriptionEvaluator(system), tuple(jnp.asarray(q, float))
+    u_all = jnp.concatenate([jnp.asarray(u, float), jk.dependent_speeds(system, 0.0, jnp.array(q), u)])
+
+    def energy(u):
+        return kinetic_energy_of(system.motion(0.0, q, tuple(u)))
+
+    def permanent(u):
+        return jnp.array(evaluator.residuals(0.0, q, tuple(u)))
+
+    def struck(u):
+        motion = system.motion(0.0, q, tuple(u))
+        return jnp.array([*residuals(0.0, q, tuple(u), motion)])
+
+    M, G, C, c = jax.jit(
+        lambda u: (jax.hessian(energy)(u), jax.jacfwd(permanent)(u), jax.jacfwd(struck)(u), struck(u))
+    )(u_all)
+    rows = np.concatenate([G, C])
+    zeros = np.zeros((len(rows), len(rows)))
+    right = np.concatenate([np.zeros(len(u_all) + len(G)), -(1 + e) * c])
+    solution = np.linalg.solve(np.block([[M, -rows.T], [rows, zeros]]), right)
+    return u_all + solution[: len(u_all)], solution[len(u_all) + len(G) :]
+
+
+@pytest.mark.slow
+def test_a_bicycle_keeps_its_nonholonomic_constraints():
+    bicycle, entry = CATALOG["WhippleBicycle"].example(), CATALOG["WhippleBicycle"]
+    q, u = jnp.array(entry.q), jnp.array(entry.u)
+    struck = in_plane("S")
+    after = jk.impact(bicycle, 0.0, q, u, lambda t, q, u, motion: struck(t, q, u, motion)[1], 0.3)
+    u_all, p = by_multipliers(bicycle, q, u, lambda *args: struck(*args)[1:], 0.3)
+    scale = RTOL * np.abs(u_all).max()
+    np.testing.assert_allclose(after.u, u_all[:3], rtol=0, atol=scale)
+    np.testing.assert_allclose(jk.dependent_speeds(bicycle, 0.0, q, after.u), u_all[3:], rtol=0, atol=scale)
+    np.testing.assert_allclose(after.impulses, p, rtol=RTOL)
+
+
+class Block(jk.System):
+    """A rectangle in a plane, with two lower corners."""
+
+    coordinates, speeds = ("x", "y", "angle"), ("x_dot", "y_dot", "rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(3, q["angle"], u["rate"], "B")
+        center = O.moving(q["x"] * N.x + q["y"] * N.y, u["x_dot"] * N.x + u["y_dot"] * N.y)
+        corners = {"left": center.fixed(-0.2 * B.x - 0.6 * B.y), "right": center.fixed(0.2 * B.x - 0.6 * B.y)}
+        body = jk.Body(1.0, (0.0, 0.0, 0.13), center, B, name="block")
+        return jk.Motion([body], points=corners | {"center": center})
+
+
+FALLS_Q, FALLS_U = [0.0, 0.6, 0.0], [0.3, -2.0, 0.7]
+left = in_plane("left")
+
+
+def both_corners(t, q, u, motion):
+    return *left(t, q, u, motion), *in_plane("right")(t, q, u, motion)
+
+
+def test_both_corners_of_a_block_stick():
+    """Four residuals have the rank 3. Impulses are those of the pseudo-inverse."""
+    after = jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, both_corners)
+    np.testing.assert_allclose(after.u, 0.0, atol=RTOL)
+    M = np.diag([1.0, 1.0, 0.13])
+    C = np.array([[1.0, 0.0, 0.6], [0.0, 1.0, -0.2], [1.0, 0.0, 0.6], [0.0, 1.0, 0.2]])
+    p = np.linalg.pinv(C.T) @ M @ (0.0 - np.array(FALLS_U))
+    np.testing.assert_allclose(after.impulses, p, rtol=0, atol=RTOL)
+    assert not after.unique
+    slopes = jax.jacfwd(lambda u: jk.impact(Block(), 0.0, FALLS_Q, u, both_corners).impulses)(jnp.array(FALLS_U))
+    np.testing.assert_allclose(slopes, -np.linalg.pinv(C.T) @ M, rtol=0, atol=RTOL)
+
+
+def test_a_repeated_residual_shares_its_impulse():
+    once = jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda *args: left(*args)[1], 0.5)
+    twice = jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda *args: left(*args)[1:] * 2, 0.5)
+    assert once.unique
+    assert not twice.unique
+    np.testing.assert_allclose(twice.u, once.u, rtol=RTOL)
+    np.testing.assert_allclose(twice.impulses, 0.5 * np.repeat(once.impulses, 2), rtol=RTOL)
+
+
+def test_residuals_that_contradict_each_other():
+    def after(u, e):
+        return jk.impact(Block(), 0.0, FALLS_Q, u, lambda *a: left(*a)[1:] * 2, (0.5, e)).u
+
+    with pytest.raises(ValueError, match="contradict each other"):
+        after(FALLS_U, 0.6)
+    u = jnp.array(FALLS_U)
+    value, slope = jax.jit(lambda u: (after(u, 0.6), jax.jacfwd(after)(u, 0.6)))(u)
+    assert np.isnan(value).all()
+    assert np.isnan(slope).all()
+    assert np.isfinite(jax.jit(after)(u, 0.5)).all()
+
+
+class Bat(jk.System):
+    """A ball before a surface whose velocity is prescribed."""
+
+    speed: Scalar = parameter(3.0)  # of the surface [m/s]
+    coordinates, speeds = ("x",), ("v",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(0.5, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="ball")])
+
+    def gap_rate(self, t, q, u, motion):
+        return u["v"] - self.speed * t
+
+
+def test_restitution_is_relative_to_a_moving_surface():
+    bat, t = Bat(), 2.0
+    after = jk.impact(bat, t, [0.0], {"v": -4.0}, bat.gap_rate, 0.7)
+    np.testing.assert_allclose(after.u, [6.0 - 0.7 * (-4.0 - 6.0)], rtol=RTOL)
+    np.testing.assert_allclose(after.impulses, [0.5 * (13.0 + 4.0)], rtol=RTOL)
+    np.testing.assert_allclose(after.energy_lost, 0.25 * (4.0**2 - 13.0**2), rtol=RTOL)
+
+
+class Carried(jk.System):
+    """A pendulum on a pivot with a prescribed velocity; its mass has a prescribed part of its velocity."""
+
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(3, q["angle"], u["rate"], "B")
+        pivot = O.moving(0.5 * t * t * N.x, t * N.x)
+        return jk.Motion([jk.Body(2.0, 0.0, pivot.fixed(-1.5 * B.y), name="bob")])
+
+
+def test_a_prescribed_pivot_keeps_its_velocity():
+    system, q, u, t = Carried(), [0.4], [1.3], 0.8
+    after = jk.impact(system, t, q, u, lambda t, q, u, m: m["bob"].center.velocity.dot(m.N.x), 0.25)
+    # v = t + 1.5 cos(angle) rate
+    v = t + 1.5 * np.cos(0.4) * 1.3
+    np.testing.assert_allclose(after.u, [(-0.25 * v - t) / (1.5 * np.cos(0.4))], rtol=RTOL)
+    energies = [jk.kinetic_energy(system, t, q, x) for x in (u, after.u)]
+    np.testing.assert_allclose(after.energy_lost, energies[0] - energies[1], rtol=RTOL)
+
+
+class Hanging(jk.System):
+    """The block of `Block` on a hinge at its left corner."""
+
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(3, q["angle"], u["rate"], "B")
+        hinge = O.fixed(0.0 * B.y)
+        center = hinge.fixed(0.2 * B.x + 0.6 * B.y)
+        body = jk.Body(1.0, (0.0, 0.0, 0.13), center, B, name="block")
+        return jk.Motion([body], points={"hinge": hinge, "right": hinge.fixed(0.4 * B.x), "center": center})
+
+
+def right_y(t, q, u, motion):
+    return motion["right"].velocity.dot(motion.N.y)
+
+
+def test_a_released_hinge_leaves_a_free_body():
+    # about the left corner: v = omega x r
+    rate = 0.9
+    free = jk.impact(Block(), 0.0, [0.0, 0.6, 0.0], [-0.6 * rate, 0.2 * rate, rate], right_y, 0.5)
+    after = jk.impact(Hanging(), 0.0, [0.0], [rate], right_y, 0.5, release="hinge")
+    np.testing.assert_allclose(after.u, free.u[2:], rtol=RTOL)
+    np.testing.assert_allclose(after.impulses, free.impulses, rtol=RTOL)
+    np.testing.assert_allclose(after.energy_lost, free.energy_lost, rtol=RTOL)
+
+
+def test_a_released_point_that_already_moves_stays_with_its_speeds():
+    """Its auxiliary speeds along x and y have the same partial velocities as the speeds."""
+    free, released = (jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, left, release=x) for x in ((), ("center",)))
+    np.testing.assert_allclose(released.u, free.u, rtol=RTOL)
+    np.testing.assert_allclose(released.impulses, free.impulses, rtol=RTOL)
+
+
+def strike(x, e, leg, q):
+    """All results of a heel strike, in one row."""
+    after = jk.impact(CompassGait(leg=leg), 0.0, q, x, toe, (e, 0.5 * e), ("foot",))
+    return jnp.concatenate([after.u, after.impulses, after.energy_lost[None]])
+
+
+def test_derivatives_are_those_of_differences():
+    # central differences; truncation h^2 = 1e-10
+    point = STRIKE_U, jnp.array(0.3), jnp.array(5.0), STRIKE_Q
+    f, h = jax.jit(strike), 1e-5
+    forward, reverse = (jax.jit(jac(strike, argnums=(0, 1, 2, 3)))(*point) for jac in (jax.jacfwd, jax.jacrev))
+    for i, (x, a, b) in enumerate(zip(point, forward, reverse, strict=True)):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * np.abs(a).max())
+        for place in np.ndindex(x.shape):
+            e = jnp.zeros_like(x).at[place].set(h)
+            low, high = (f(*point[:i], x + sign * e, *point[i + 1 :]) for sign in (-1.0, 1.0))
+            np.testing.assert_allclose(a[(..., *place)], (high - low) / (2 * h), rtol=0, atol=1e-8 * np.abs(a).max())
+
+
+def test_a_batch_equals_its_members():
+    us = STRIKE_U[None] + jnp.array([[0.0, 0.0], [0.3, -0.1], [-0.2, 0.4]])
+    e = jnp.array([0.0, 0.5, 1.0])
+    each = [strike(u, x, 5.0, STRIKE_Q) for u, x in zip(us, e, strict=True)]
+    batch = jax.jit(jax.vmap(lambda u, x: strike(u, x, 5.0, STRIKE_Q)))(us, e)
+    np.testing.assert_allclose(batch, np.stack(each), rtol=0, atol=1e-13)
+
+
+def test_an_elastic_impact_loses_no_energy():
+    after = jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe, 1.0, "foot")
+    assert abs(after.energy_lost) < RTOL * jk.kinetic_energy(CompassGait(), 0.0, STRIKE_Q, STRIKE_U)
+
+
+def test_float32_stays_float32():
+    walker = jax.tree.map(lambda x: x.astype(jnp.float32), CompassGait())
+    after = jk.impact(walker, 0.0, STRIKE_Q.astype(jnp.float32), STRIKE_U.astype(jnp.float32), toe, 0.3, ("foot",))
+    wide = jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe, 0.3, ("foot",))
+    assert {x.dtype for x in (after.u, after.impulses, after.energy_lost)} == {jnp.dtype(jnp.float32)}
+    assert after.unique
+    np.testing.assert_allclose(after.u, wide.u, rtol=0, atol=1e-5)
+    twice = jk.impact(walker, 0.0, STRIKE_Q.astype(jnp.float32), STRIKE_U.astype(jnp.float32), lambda *a: toe(*a) * 2)
+    assert not twice.unique
+    np.testing.assert_allclose(twice.u, 0.0, atol=1e-5)
+
+
+class Train(jk.System):
+    """13 wagons on a line; the coordinates are their distances. The mass matrix is an array."""
+
+    coordinates, speeds = tuple(f"q{i}" for i in range(13)), tuple(f"u{i}" for i in range(13))
+
+    def motion(self, t, q, u):
+        N, P = jk.inertial()
+        points = {}
+        for i in range(13):
+            P = points[f"P{i}"] = P.moving(q[i] * N.x, u[i] * N.x, N)
+        return jk.Motion([jk.Body(1.0 + i, 0.0, P) for i, P in enumerate(points.values())], points=points)
+
+
+def test_many_speeds():
+    u = np.linspace(-1.0, 2.0, 13)
+    after = jk.impact(Train(), 0.0, np.ones(13), u, lambda t, q, u, m: m["P5"].velocity.dot(m.N.x), 0.2)
+    velocities = np.cumsum(u)
+    velocities[5] *= -0.2  # a free mass
+    np.testing.assert_allclose(np.cumsum(after.u), velocities, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(after.impulses, [-6.0 * 1.2 * np.sum(u[:6])], rtol=1e-11)
+    np.testing.assert_allclose(after.energy_lost, 3.0 * (1 - 0.2**2) * np.sum(u[:6]) ** 2, rtol=1e-11)
+
+
+@pytest.mark.parametrize("case", ["walker", "block", "hoop", "singular"])
+def test_arrays_equal_written_out_scalars(case, monkeypatch):
+    cases = {
+        "walker": (CompassGait(), STRIKE_Q, STRIKE_U, toe, (0.2, 0.1), ("foot",)),
+        "block": (Block(), FALLS_Q, FALLS_U, both_corners, 0.5, ("center",)),
+        "hoop": (Hoop(), [0.0, 0.0, 0.35], [4.5], edge, 0.0, ("ground",)),
+        "singular": (CompassGait(hip=0.0, leg=0.0), STRIKE_Q, STRIKE_U, toe),
+    }
+    system, *arguments = cases[case]
+    few = jax.jit(lambda: jk.impact(system, 0.0, *arguments))()
+    monkeypatch.setattr("jaxkane._scalarjit.components._UNROLL_UP_TO", 0)
+    many = jax.jit(lambda: jk.impact(system, 0.0, *arguments))()
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=1e-12), many, few)
+    assert np.isnan(few.energy_lost) == (case == "singular")
+
+
+def test_a_singular_mass_matrix_is_explained():
+    with pytest.raises(ValueError, match="mass"):
+        jk.impact(CompassGait(hip=0.0, leg=0.0), 0.0, STRIKE_Q, STRIKE_U, toe)
+
+
+def test_impacts_of_events_have_residuals_and_coefficients():
+    N, _ = jk.inertial()
+    hit = jk.Impact(1.0 * N.x, [2.0, 3.0], restitution=(0.5, 0.25), release="foot")
+    assert hit.residuals == (1.0, 0.0, 0.0, 2.0, 3.0)
+    assert hit.restitution == (0.5, 0.5, 0.5, 0.25, 0.25)
+    assert hit.release == ("foot",)
+
+
+MISUSES = {
+    "no residuals": (lambda: jk.Impact(), "at least one velocity residual"),
+    "no number": (lambda: jk.Impact("toe"), "numbers and Vectors"),
+    "above one": (lambda: jk.Impact(1.0, restitution=1.1), "restitution is 1.1"),
+    "not a number": (lambda: jk.Impact(1.0, restitution=float("nan")), "between 0 and 1"),
+    "a word": (lambda: jk.Impact(1.0, restitution="plastic"), "one number"),
+    "too many": (lambda: jk.Impact(1.0, 2.0, restitution=(0.1, 0.2, 0.3)), "2 residuals, but 3 coefficients"),
+    "release": (lambda: jk.Impact(1.0, release=(1,)), "names of points and frames"),
+    "negative": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, left, -0.1), "restitution is -0.1"),
+    "returns nothing": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda *args: ()), "at least one"),
+    "no function": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, 1.0), "pass a function"),
+    "position": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda t, q, u, m: q["y"]), "does not depend on"),
+    "square": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda t, q, u, m: u["y_dot"] ** 2), "not affine"),
+    "unknown": (lambda: jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe, 0.0, "heel"), "heel"),
+    "nothing": (lambda: jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe, 0.0, "toe"), "has no effect"),
+    "inertial": (lambda: jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe, 0.0, "N"), "inertial frame"),
+    "shape": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U[:2], left), "shape"),
+}
+
+
+@pytest.mark.parametrize("case", MISUSES)
+def test_misuse_is_explained(case):
+    call, message = MISUSES[case]
+    with pytest.raises((ValueError, TypeError, KeyError), match=message):
+        call()

@@ -1,0 +1,339 @@
+"""Compiled programs are freed with the functions that they were traced with, and beyond a number of memory mappings."""
+
+import dataclasses
+import functools
+import gc
+import os
+import pickle
+import threading
+import warnings
+import weakref
+
+import jax
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._integrate.integrate import solve
+from jaxkane._scalarjit import cache
+from jaxkane._scalarjit.cache import LIMIT, Cache, memory_mappings
+
+TS = np.linspace(0.0, 0.2, 3)
+START = jk.State(np.array([0.5]), np.zeros(1))
+RTOL = 1e-9
+CELL = """
+import jaxkane as jk
+class Spring(jk.System):
+    mass: jk.Scalar = jk.parameter(1.0)
+    coordinates, speeds, inputs = ("x",), ("v",), ("push",)
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force((inputs["push"] - STIFFNESS * q[0]) * motion.N.x, motion.bodies[0])]
+"""
+
+on_linux = pytest.mark.skipif(not os.path.exists("/proc/self/maps"), reason="only Linux limits memory mappings")
+
+
+def class_of_cell(stiffness=4.0):
+    """A class as a notebook cell defines it."""
+    namespace = {"__name__": "__main__"}
+    exec(CELL.replace("STIFFNESS", str(stiffness)), namespace)
+    return namespace["Spring"]
+
+
+def last(system, inputs=None, **options):
+    return jk.simulate(system, START, TS, inputs, **options)["x"][-1]
+
+
+def expected(stiffness, push=0.0):
+    w = np.sqrt(stiffness)
+    return push / stiffness + (0.5 - push / stiffness) * np.cos(w * TS[-1])
+
+
+@pytest.fixture(scope="module")
+def system():
+    return class_of_cell()()
+
+
+@pytest.fixture
+def limit(monkeypatch):
+    """`limit(n)`: programs are dropped when this process has n mappings more than now."""
+
+    def set_to(more):
+        gc.collect()
+        monkeypatch.setattr(LIMIT, "mappings", memory_mappings()[0] + more)
+        return LIMIT.mappings
+
+    monkeypatch.setattr(LIMIT, "dropped", set())
+    return set_to
+
+
+def rerun(system):
+    del system
+    assert last(class_of_cell()()) == pytest.approx(expected(4.0), rel=1e-5)
+
+
+def differentiate(system):
+    del system
+    kind = class_of_cell()
+    assert np.isfinite(jax.grad(lambda mass: last(kind(mass)))(1.0))
+
+
+def fit(system):
+    del system
+    trial = jk.fit.Trial(TS, {"x": 0.5 * np.cos(TS)}, sigma=1.0)
+    jk.fit.fit(class_of_cell()(), trial, ["mass"])
+
+
+def sweep(system):
+    del system
+    jk.sweep.sweep(class_of_cell()(), START, TS, table={"mass": np.array([1.0, 2.0])})
+
+
+@on_linux
+@pytest.mark.parametrize(
+    ("cell", "times", "each"),
+    [
+        (rerun, 5, 100),
+        pytest.param(rerun, 40, 100, marks=pytest.mark.slow),
+        pytest.param(differentiate, 6, 500, marks=pytest.mark.slow),
+        pytest.param(fit, 8, 250, marks=pytest.mark.slow),
+        pytest.param(sweep, 8, 200, marks=pytest.mark.slow),
+    ],
+)
+def test_a_cell_that_is_run_again_frees_the_programs_of_its_old_class(cell, times, each, limit, system):
+    """`each`: the mappings of one run, for which it was refused after some 150 to 700 runs."""
+    jk.forget()  # programs of other tests that are dropped and requested again would raise the bound
+    cell(system)
+    bound = limit(2 * each)
+    for _ in range(times):
+        cell(system)
+    assert LIMIT.mappings == bound  # no program was requested again
+    assert memory_mappings()[0] < bound + each
+
+
+class Controller:
+    """With an attribute that has no weak references, and one that changes."""
+
+    def __init__(self, push):
+        self.rng, self.push, self.traced = np.random.default_rng(1), push, 0
+
+    def method(self, t, state):
+        counts[id(self)] = counts.get(id(self), 0) + 1
+        return self.push + 0.0 * self.rng.random()
+
+    def __call__(self, t, state):
+        return {"push": self.push}
+
+
+counts: dict[int, int] = {}
+
+
+def closure(push):
+    return {"push": lambda t, state: push}
+
+
+KINDS = {
+    "closure": closure,
+    "partial": lambda push: {"push": functools.partial(lambda push, t, state: push, push)},
+    "method": lambda push: {"push": Controller(push).method},
+    "object": lambda push: Controller(push),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_programs_are_freed_with_the_functions_that_they_were_traced_with(kind, system):
+    def simulated(push):
+        inputs = KINDS[kind](push)
+        assert last(system, inputs, step=0.1) == pytest.approx(expected(4.0, push), rel=1e-5)
+        f = inputs["push"] if isinstance(inputs, dict) else inputs
+        return weakref.ref(getattr(f, "__self__", f))
+
+    gone = [simulated(1.0)]
+    before, mapped = len(solve.programs), memory_mappings()[0]
+    gone += [simulated(push) for push in (2.0, 3.0)]
+    gc.collect()
+    assert [ref() for ref in gone] == [None] * 3
+    assert len(solve.programs) <= before
+    assert memory_mappings()[0] < mapped + 30  # a program has some 80
+
+
+def test_reduce_functions_are_freed_with_their_programs(system):
+    def swept(factor):
+        reduce = lambda trajectory: factor * trajectory["x"][-1]  # noqa: E731
+        table = {"mass": np.array([1.0, 2.0])}
+        jk.sweep.sweep(system, START, TS, table=table, reduce=reduce, step=0.1)
+        return weakref.ref(reduce)
+
+    gone = swept(2.0)
+    gc.collect()
+    assert gone() is None
+
+
+def test_a_method_of_an_object_without_weak_references_is_compiled_once(system):
+    controller, other = Controller(1.0), Controller(1.0)
+    pushed = [last(system, {"push": controller.method}, step=0.1)]
+    n = counts[id(controller)]
+    pushed.append(last(system, {"push": controller.method}, step=0.1))
+    assert counts[id(controller)] == n
+    assert pushed == pytest.approx([expected(4.0, 1.0)] * 2, rel=1e-5)
+    controller.rng = np.random.default_rng(1)  # another object
+    last(system, {"push": controller.method}, step=0.1)
+    assert counts[id(controller)] > n
+    last(system, {"push": other.method}, step=0.1)
+    assert counts[id(other)] > 0
+
+
+def test_functions_with_the_same_code_keep_their_own_programs(system):
+    functions = [{"push": lambda t, state, push=push: push} for push in (1.0, 2.0, 3.0)]
+    for _ in range(2):
+        values = [last(system, f, step=0.1) for f in functions]
+        assert values == pytest.approx([expected(4.0, push) for push in (1.0, 2.0, 3.0)], rel=1e-5)
+
+
+def test_classes_of_the_same_name_keep_their_own_programs():
+    systems = [class_of_cell(k)() for k in (4.0, 9.0)]
+    for forget in (False, True):
+        if forget:
+            jk.forget()
+        assert [last(s) for s in systems] == pytest.approx([expected(4.0), expected(9.0)], rel=1e-5)
+
+
+def test_a_class_that_was_copied_by_cloudpickle_is_simulated():
+    """`motion_number` was copied with it, and counted for itself."""
+    cloudpickle = pytest.importorskip("cloudpickle")
+    kind = class_of_cell()
+    [last(kind(), step=0.1) for _ in range(2)]
+    copy = pickle.loads(cloudpickle.dumps(kind))
+    assert last(copy(), step=0.1) == pytest.approx(expected(4.0), rel=1e-5)
+
+
+@dataclasses.dataclass
+class Constant:
+    push: float
+
+    def __call__(self, t, state):
+        return {"push": self.push}
+
+
+@dataclasses.dataclass(slots=True)
+class ConstantWithSlots:
+    push: float
+
+    def __call__(self, t, state):
+        return {"push": self.push}
+
+
+class EqualToAll(Constant):
+    __eq__ = lambda self, other: True  # noqa: E731
+    __hash__ = lambda self: 1  # noqa: E731
+
+
+@pytest.mark.parametrize("kind", [Constant, ConstantWithSlots, EqualToAll])
+def test_controllers_that_are_compared_by_value(kind, system):
+    """The first two have no hash, the second no weak references."""
+    for push in (1.0, 2.0):
+        assert last(system, kind(push), step=0.1) == pytest.approx(expected(4.0, push), rel=1e-5)
+
+
+@on_linux
+def test_models_that_are_used_in_turn_are_not_compiled_in_every_round(limit):
+    systems = [class_of_cell(k)() for k in (4.0, 5.0, 6.0)]
+    last(systems[0])
+    limit(0)
+    for _ in range(4):
+        assert [last(s) for s in systems] == pytest.approx([expected(k) for k in (4.0, 5.0, 6.0)], rel=1e-5)
+    before = solve.programs.uses()
+    [last(s) for s in systems]
+    assert len(solve.programs.uses()) == len(before)
+
+
+class Mapped:
+    """A process in which each result of some caches is `each` memory mappings, and other code has `others`."""
+
+    def __init__(self, monkeypatch, each, others=0, most=65530):
+        self.caches = [Cache(programs=True), Cache(programs=True)]
+        self.each, self.others, self.most = each, others, most
+        monkeypatch.setattr(cache, "memory_mappings", self.count)
+        monkeypatch.setattr(Cache, "all", lambda: self.caches)
+        self.limit = cache._Limit()
+        monkeypatch.setattr(cache, "LIMIT", self.limit)
+
+    def count(self):
+        return self.others + self.each * sum(map(len, self.caches)), self.most
+
+
+def test_the_least_recently_used_programs_are_dropped(monkeypatch):
+    process = Mapped(monkeypatch, each=100, others=1000)
+    a, b = process.caches
+    for i in range(100):
+        (a if i % 2 else b).keep(i, [i])
+        a.known(1, None)
+        assert process.count()[0] <= 4100
+    assert a.known(1) == [1]
+    assert a.known(99) == [99]
+    assert a.known(3, None) is b.known(0, None) is None
+    assert process.limit.mappings == 4000
+
+
+def test_the_limit_rises_where_dropped_programs_are_used_again(monkeypatch):
+    process, made = Mapped(monkeypatch, each=100), []
+    for _ in range(5):
+        made.append(0)
+        for i in range(60):
+            process.caches[0].get(i, lambda: made.__setitem__(-1, made[-1] + 1))
+    assert made[0] == 60
+    assert made[2:] == [0, 0, 0]
+    assert process.limit.mappings == 8000
+
+
+def test_mappings_of_other_code_do_not_drop_programs_each_time(monkeypatch):
+    process = Mapped(monkeypatch, each=10, others=5000)
+    for i in range(20):
+        process.caches[0].keep(i, i)
+    assert len(process.caches[0]) == 20
+
+
+def test_a_warning_before_the_limit(monkeypatch):
+    process = Mapped(monkeypatch, each=10, others=50_000)
+    with pytest.warns(UserWarning, match=r"50\d\d\d memory mappings, and Linux terminates it at 65530.*jaxkane.forget"):
+        process.caches[0].keep(0, 0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        process.caches[0].keep(1, 1)
+
+
+def test_a_result_is_dropped_with_any_of_its_owners():
+    class Owner:
+        pass
+
+    results, a, b = Cache(), Owner(), Owner()
+    results.keep("both", 1, [a, b])
+    results.keep("b", 2, [b])
+    del a
+    assert (results.known("both", None), results.known("b", None), len(results)) == (None, 2, 1)
+
+
+def test_threads_share_caches_whose_owners_end():
+    class Owner:
+        pass
+
+    results, failed = Cache(50), []
+
+    def use(start):
+        try:
+            for i in range(500):
+                owner = Owner()
+                results.keep(start + i % 60, i, [owner])
+                results.known(start, None)
+                len(results)
+        except (RuntimeError, KeyError) as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=use, args=(1000 * n,)) for n in range(8)]
+    [t.start() for t in threads]
+    [t.join() for t in threads]
+    assert not failed
+    assert len(results) == 0

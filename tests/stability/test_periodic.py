@@ -1,0 +1,416 @@
+"""Periodic orbits and their families: closed forms, the van der Pol oscillator, and walkers with impacts."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mechanisms import CompassGait, RimlessWheel
+from scipy.special import ellipk
+
+import jaxkane as jk
+from jaxkane import Scalar, parameter
+from jaxkane.stability import equilibrium, family, limit_cycle, periodic
+
+
+class Particle(jk.System):
+    """A particle of 1 kg on a line."""
+
+    coordinates, speeds = ("x",), ("v",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="particle")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return (jk.Force(self.force(t, q["x"], u["v"]) * motion.N.x, motion["particle"]),)
+
+
+class VanDerPol(Particle):
+    mu: Scalar = parameter(1.0)
+
+    def force(self, t, x, v):
+        return self.mu * (1 - x**2) * v - x
+
+
+class WithSections(VanDerPol):
+    def events(self, t, q, u):
+        return {"top": jk.falling(u["v"]), "far": jk.rising(q["x"] - 9.0), "both": q["x"] - 8.0}
+
+
+class Circle(Particle):
+    """x'' + x = x' (mu - x^2 - x'^2): a circle of radius sqrt(mu) with the period 2 pi, from a Hopf point at mu = 0."""
+
+    mu: Scalar = parameter(0.1)
+
+    def force(self, t, x, v):
+        return v * (self.mu - x**2 - v**2) - x
+
+
+class Oscillator(Particle):
+    damping: Scalar = parameter(0.1)
+    cubic: Scalar = parameter(0.0)
+    amplitude: Scalar = parameter(1.0)
+    frequency: Scalar = parameter(1.3)
+
+    def force(self, t, x, v):
+        return self.amplitude * jnp.cos(self.frequency * t) - x - self.damping * v - self.cubic * x**3
+
+
+class Pendulum(jk.System):
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["angle"], u["rate"])
+        return jk.Motion([jk.Body(1.0, 0.0, O.fixed(-1.0 * A.y), name="bob")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+
+# x_max, period and multiplier, and their derivatives in mu: integration in 30 digits
+MU_1 = (2.0086198608748433, 6.66328685932313, 0.0008596950636038052)
+MU_1_SLOPES = (0.01387413165103662, 0.7315965977659252, -0.007372959119115083)
+MU_5 = (2.0215080615623213, 11.61223066771957, 7.738555086859359e-38)
+NEAR = jk.State([2.0], [0.1])
+
+
+def numbers(mu, guess=NEAR):
+    orbit = periodic(WithSections(mu), guess, section="top", period=6.6)
+    return jnp.stack([orbit["x"], orbit.period, orbit.multipliers[0].real])
+
+
+def test_van_der_pol():
+    orbit = periodic(WithSections(1.0), NEAR, section="top", period=6.6)
+    np.testing.assert_allclose([orbit["x"], orbit.period], MU_1[:2], rtol=1e-11)
+    np.testing.assert_allclose(orbit.multipliers, MU_1[2:], rtol=1e-8)
+    np.testing.assert_allclose(orbit.trivial_multiplier, 1.0, rtol=1e-11)
+    assert orbit.stable
+    assert orbit.residual < 1e-11
+    assert "period 6.663286859 s, stable, largest multiplier 0.000859695" in repr(orbit)
+
+
+@pytest.mark.slow
+def test_van_der_pol_slopes_in_both_modes_and_a_batch():
+    for mode in (jax.jacfwd, jax.jacrev):
+        slopes = jax.jit(mode(numbers))(1.0)
+        np.testing.assert_allclose(slopes, MU_1_SLOPES, rtol=1e-8)
+    found = jax.jit(jax.vmap(numbers))(jnp.array([0.3, 1.0]))
+    np.testing.assert_allclose(found[1], MU_1, rtol=1e-9)
+    np.testing.assert_allclose(found[0, 1], 6.31844320345411, rtol=1e-11)
+
+
+@pytest.mark.slow
+def test_without_a_section_and_without_a_period():
+    orbit = periodic(VanDerPol(1.0), NEAR)
+    ride = orbit.ride
+    assert ride.ok
+    np.testing.assert_allclose(ride["x"][-1], ride["x"][0], rtol=1e-11)
+    np.testing.assert_allclose(orbit.period, MU_1[1], rtol=1e-11)
+    np.testing.assert_allclose(orbit.multipliers, MU_1[2:], rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_many_segments_find_an_unstable_orbit_and_a_tiny_multiplier():
+    """With -mu, time runs backwards: the multiplier is 1e37, and a simulation of the orbit does not return to it."""
+    orbit = periodic(WithSections(5.0), NEAR, section="top", segments=40)
+    np.testing.assert_allclose([orbit["x"], orbit.period], MU_5[:2], rtol=1e-11)
+    np.testing.assert_allclose(orbit.multipliers, MU_5[2:], rtol=1e-7)
+    forwards = orbit.ride
+    backwards = dataclasses.replace(forwards, q=forwards.q[::-1], u=-forwards.u[::-1])
+    orbit = periodic(WithSections(-5.0), backwards, section="top", segments=40)
+    np.testing.assert_allclose(orbit.period, MU_5[1], rtol=1e-11)
+    np.testing.assert_allclose(orbit.multipliers, 1.0 / MU_5[2], rtol=1e-6)
+    assert not orbit.stable
+
+
+def period_of(system):
+    return 2 * jnp.pi / system.frequency
+
+
+FORCED = {"period": period_of, "autonomous": False}
+REST = jk.State([0.0], [0.0])
+
+
+def forced(frequency, xp=np):
+    """x + i v / frequency at t = 0, and the magnitude of the multipliers."""
+    response = 1 / (1 - frequency**2 + 0.1j * frequency)
+    return xp.stack(
+        [response.real, -frequency * response.imag, 2 * np.pi / frequency, xp.exp(-0.1 * np.pi / frequency)]
+    )
+
+
+@pytest.mark.slow
+def test_a_forced_linear_oscillator():
+    orbit = periodic(Oscillator(), REST, **FORCED)
+    found = [orbit["x"], orbit["v"], orbit.period, jnp.abs(orbit.multipliers[1])]
+    np.testing.assert_allclose(found, forced(1.3), rtol=1e-10)
+    assert np.isnan(orbit.trivial_multiplier)
+
+
+@pytest.mark.slow
+def test_slopes_of_a_forced_orbit_contain_those_of_its_period():
+    def found(frequency):
+        orbit = periodic(Oscillator(frequency=frequency), REST, **FORCED)
+        return jnp.stack([orbit["x"], orbit["v"], orbit.period, jnp.abs(orbit.multipliers[1])])
+
+    slopes = jax.jit(jax.jacrev(found))(1.3)
+    np.testing.assert_allclose(slopes, jax.jacfwd(lambda w: forced(w, jnp))(1.3), rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_the_folds_of_duffings_oscillator():
+    """At a fold one multiplier is 1, and their product is exp(-damping * period) everywhere."""
+    system = Oscillator(cubic=1.0, amplitude=0.3, frequency=0.6)
+    start = periodic(system, REST, **FORCED)
+    found = family(system, start, towards={"frequency": 1}, until={"frequency": 2.0}, step=0.05, max_step=0.2)
+    assert [x.kind for x in found.bifurcations] == ["fold", "fold"]
+    assert "fold at 1.779719524" in repr(found)
+    assert found.reason == "frequency = 2"
+    for fold in found.bifurcations:
+        np.testing.assert_allclose(fold.orbit.multipliers[0], 1.0, rtol=1e-6)
+        np.testing.assert_allclose(fold.orbit.multipliers[1], jnp.exp(-0.1 * fold.orbit.period), rtol=1e-6)
+    np.testing.assert_allclose(found["frequency"][-1], 2.0, rtol=1e-14)
+    assert np.all(np.diff(found.arclength) > 0)
+    assert not np.all(found.stable)
+    orbit = found.orbit(5)
+    np.testing.assert_allclose(periodic(orbit.system, orbit, **FORCED)["x"], orbit["x"], rtol=1e-10)
+
+
+def period_of_a_pendulum(angle):
+    return 4 / np.sqrt(9.81) * ellipk(np.sin(np.asarray(angle) / 2) ** 2)
+
+
+@pytest.mark.slow
+def test_orbits_of_a_conservative_system_hold_a_quantity():
+    pendulum, released = Pendulum(), jk.State([1.0], [0.0])
+    orbit = periodic(pendulum, released, hold=("angle",), period=2.1)
+    np.testing.assert_allclose(orbit.period, period_of_a_pendulum(1.0), rtol=1e-11)
+    np.testing.assert_allclose(orbit.multipliers, 1.0, rtol=1e-6)
+    with pytest.raises(ValueError, match="form a family, along which angle, period change"):
+        periodic(pendulum, released, period=orbit.period)
+
+
+@pytest.mark.slow
+def test_a_family_of_a_conservative_system():
+    orbit = periodic(Pendulum(), jk.State([0.5], [0.0]), hold=("angle",), period=2.0)
+    found = family(Pendulum(), orbit, towards={"angle": 1}, until={"angle": 2.5})
+    np.testing.assert_allclose(found.period, period_of_a_pendulum(found["angle"]), rtol=1e-10)
+    with pytest.raises(ValueError, match="rate, which is not in the `hold`"):
+        family(Pendulum(), orbit, towards={"rate": 1})
+
+
+@pytest.mark.slow
+def test_a_pendulum_that_rotates_advances_by_one_turn():
+    turn = {"angle": 2 * np.pi}
+    orbit = periodic(Pendulum(), jk.State([0.0], [8.0]), hold={"rate": 8.0}, advance=turn, period=1.0)
+    np.testing.assert_allclose(orbit.period, 4 / 8 * ellipk(4 * 9.81 / 64), rtol=1e-11)
+
+
+@pytest.mark.slow
+def test_a_hopf_point_starts_a_family_of_limit_cycles():
+    system = Circle(0.001)
+    orbit = limit_cycle(system, equilibrium(system), {"x": 0.1}, parameter="mu")
+    np.testing.assert_allclose([orbit.system.mu, orbit.period], [0.01, 2 * np.pi], rtol=1e-9)
+    found = family(orbit.system, orbit, towards={"mu": 1}, until={"mu": 0.5}, step=0.5, max_step=2.0)
+    np.testing.assert_allclose(found["x"] ** 2 + found["v"] ** 2, found["mu"], rtol=1e-9)
+    np.testing.assert_allclose(found.multipliers[-1, 0], 0.04321391826377225, rtol=1e-9)
+    with pytest.raises(ValueError, match="there is no parameter 'nu'"):
+        limit_cycle(system, equilibrium(system), {"x": 0.1}, parameter="nu")
+    with pytest.raises(ValueError, match="`amplitude` must be one of x, v"):
+        limit_cycle(system, equilibrium(system), {"y": 0.1}, parameter="mu")
+
+
+class Excited(jk.System):
+    """A limit cycle x = cos t, whose square excites a second oscillator: its mean damping is `damping` - 0.03 / 2."""
+
+    damping: Scalar = parameter(0.1)
+    coordinates, speeds = ("x", "y"), ("v", "w")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        names = ("first", "second")
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[i] * N.x, u[i] * N.x), name=k) for i, k in enumerate(names)])
+
+    def loads(self, t, q, u, motion, inputs):
+        x, v, y, w = q["x"], u["v"], q["y"], u["w"]
+        first = v * (1.0 - x**2 - v**2) - x + 0.1 * y
+        second = (0.03 * x**2 - self.damping) * w - 1.7 * y
+        return jk.Force(first * motion.N.x, motion["first"]), jk.Force(second * motion.N.x, motion["second"])
+
+
+@pytest.mark.slow
+def test_a_neimark_sacker_point():
+    start = periodic(Excited(), jk.State([1.0, 0.0], [0.0, 0.0]), period=6.3)
+    (point,) = family(Excited(), start, towards={"damping": -1}, until={"damping": -0.1}).bifurcations
+    assert point.kind == "Neimark-Sacker"
+    np.testing.assert_allclose(point.value, 0.015, rtol=1e-9)
+    np.testing.assert_allclose(jnp.abs(point.orbit.multipliers[:2]), 1.0, rtol=1e-9)
+
+
+class Pushed(Excited):
+    """The second particle has damping, and the square of a limit cycle pushes it: its place drifts."""
+
+    def loads(self, t, q, u, motion, inputs):
+        x, v = q["x"], u["v"]
+        first, second = v * (0.1 - x**2 - v**2) - x, x**2 - 0.2 * u["w"]
+        return jk.Force(first * motion.N.x, motion["first"]), jk.Force(second * motion.N.x, motion["second"])
+
+
+@pytest.mark.slow
+def test_a_cyclic_coordinate_drifts():
+    orbit = periodic(Pushed(), jk.State([0.3, 5.0], [0.0, 0.2]), period=6.3)
+    np.testing.assert_allclose(orbit.multipliers, [0.5334880910911032, np.exp(-0.4 * np.pi)], rtol=1e-10)
+    moved = orbit.ride["y"][-1] - orbit.ride["y"][0]
+    np.testing.assert_allclose(moved, 0.05 / 0.2 * orbit.period, rtol=1e-9)
+    np.testing.assert_allclose(orbit["y"], 5.0, rtol=1e-14)
+
+
+class Bead(jk.System):
+    """The pendulum in Cartesian coordinates, with a constraint."""
+
+    coordinates, speeds = ("x", "y"), ("v",)
+    dependent_coordinates, dependent_speeds = ("y",), ("w",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["x"] * N.x + q["y"] * N.y, u["v"] * N.x + u["w"] * N.y)
+        return jk.Motion([jk.Body(1.0, 0.0, P, name="bead")], (q["x"] * u["v"] + q["y"] * u["w"],))
+
+    def configuration_constraints(self, t, q):
+        return (q["x"] ** 2 + q["y"] ** 2 - 1.0,)
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+
+@pytest.mark.slow
+def test_constraints_have_no_multipliers():
+    released = jk.assemble(Bead(), {"x": np.sin(1.0), "y": -np.cos(1.0)}, {"v": 0.0})
+    orbit = periodic(Bead(), released, hold=("x",), period=2.1)
+    np.testing.assert_allclose(orbit.period, period_of_a_pendulum(1.0), rtol=1e-10)
+    np.testing.assert_allclose(orbit.multipliers, [1.0], rtol=1e-5)
+
+
+# -- walkers: the section is an event with a jump
+
+
+def wheel_by_formula(half, slope):
+    rate = jnp.sqrt(4 * 9.81 * jnp.sin(half) * jnp.sin(slope)) / jnp.tan(2 * half)
+    return jnp.stack([rate, jnp.cos(2 * half) ** 2])
+
+
+def wheel(half, slope):
+    orbit = periodic(RimlessWheel(half, slope), jk.State([-0.32], [1.2]), section="step", period=1.2)
+    return jnp.stack([orbit["rate"], orbit.multipliers[0].real])
+
+
+def test_rimless_wheel():
+    orbit = periodic(RimlessWheel(), jk.State([-0.32], [1.2]), section="step")
+    np.testing.assert_allclose([orbit["rate"], orbit.multipliers[0].real], wheel_by_formula(0.4, 0.08), rtol=1e-11)
+    np.testing.assert_allclose([orbit["angle"], orbit.trivial_multiplier], [0.08 - 0.4, 1.0], rtol=1e-11)
+    np.testing.assert_allclose(orbit.ride["angle"][-1], 0.08 + 0.4, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_slopes_of_the_rimless_wheel():
+    found = jax.jit(jax.jacrev(wheel, argnums=(0, 1)))(0.4, 0.08)
+    expected = jax.jacfwd(wheel_by_formula, argnums=(0, 1))(0.4, 0.08)
+    np.testing.assert_allclose(jnp.stack(found), jnp.stack(expected), rtol=1e-8, atol=1e-8)
+
+
+class SimplestWalker(jk.System):
+    """Garcia, Chatterjee, Ruina and Coleman (1998), as two particles of 1 kg whose forces are the accelerations."""
+
+    slope: Scalar = parameter(0.009, unit="rad")
+    coordinates, speeds = ("theta", "phi"), ("theta_dot", "phi_dot")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        names = ("stance", "swing")
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[i] * N.x, u[i] * N.x), name=k) for i, k in enumerate(names)])
+
+    def loads(self, t, q, u, motion, inputs):
+        N, phi = motion.N, q["phi"]
+        stance = jnp.sin(q["theta"] - self.slope)
+        swing = stance + (u["theta_dot"] ** 2 - jnp.cos(q["theta"] - self.slope)) * jnp.sin(phi)
+        return jk.Force(stance * N.x, motion["stance"]), jk.Force(swing * N.x, motion["swing"])
+
+    def strike(self, t, q, u):
+        c, rate = jnp.cos(2.0 * q["theta"]), u["theta_dot"]
+        new = {"theta": -q["theta"], "phi": -2.0 * q["theta"]}
+        return new | {"theta_dot": c * rate, "phi_dot": c * (1 - c) * rate}
+
+    def events(self, t, q, u):
+        ahead = -0.05 - q["theta"]  # passes over the scuffing at mid-stance
+        return {"strike": jk.rising(q["phi"] - 2.0 * q["theta"], when=ahead, then=self.strike)}
+
+
+@pytest.mark.slow
+def test_simplest_walker():
+    """Fixed point and multipliers by an integration in 30 digits; the third multiplier is zero, because the swing leg
+    after the strike does not depend on its motion before."""
+    orbit = periodic(SimplestWalker(), jk.State([0.2, 0.4], [-0.2, -0.016]), section="strike")
+    found = [orbit["theta"], orbit["theta_dot"], orbit.period]
+    np.testing.assert_allclose(found, [0.20031090054424708, -0.19983247300495235, 3.882463752851374], rtol=1e-10)
+    pair = -0.19009984106588815 + np.array([1j, -1j]) * 0.5575987766820683
+    np.testing.assert_allclose(orbit.multipliers[:2], pair, rtol=1e-9)
+    np.testing.assert_allclose(orbit.multipliers[2], 0.0, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_the_gait_of_the_compass_and_its_period_doubling():
+    guess = jk.State([-0.22, 0.32], [1.09, 0.38])
+    orbit = periodic(CompassGait(), guess, section="heel_strike")
+    found = [orbit["stance"], orbit["swing"], orbit["stance_rate"], orbit["swing_rate"], orbit.period]
+    expected = [-0.21866880293899055, 0.3233885580586503, 1.092383589883601, 0.3773739489071941, 0.7343463911587195]
+    np.testing.assert_allclose(found, expected, rtol=1e-10)
+    gaits = family(CompassGait(), orbit, towards={"slope": 1}, until={"slope": 0.08})
+    (doubling,) = gaits.bifurcations
+    assert doubling.kind == "period doubling"
+    np.testing.assert_allclose(doubling.value, 0.07663563158, rtol=1e-9)  # 4.39 degrees
+    expected = [-1.0, -0.30505240096878733, 0.10566775299514994]
+    np.testing.assert_allclose(doubling.orbit.multipliers, expected, rtol=1e-8)
+
+
+# -- bad input
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"section": "tap"}, "there is no event 'tap'; did you mean 'top'"),
+        ({"section": "both"}, "'both' has no direction"),
+        ({"section": "far"}, "the simulation of the guess ends at 0.04[0-9]* s: top"),
+        ({"period": 0.0}, "`period` must be positive and finite .s.; got 0"),
+        ({"period": float("nan")}, "`period` must be positive"),
+        ({"autonomous": False}, "pass the period of the force"),
+        ({"autonomous": False, "period": 6.6, "section": "top"}, "Omit `section`"),
+        ({"hold": ("z",)}, "unknown: z; there are x, v"),
+        ({"segments": 0}, "`segments` must be a positive whole number"),
+    ],
+)
+def test_bad_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        periodic(WithSections(), NEAR, **options)
+
+
+@pytest.mark.slow
+def test_guesses_without_an_orbit():
+    with pytest.raises(ValueError, match="the guess is an equilibrium or a steady motion"):
+        periodic(WithSections(), REST, section="top", period=6.6)
+    with pytest.raises(ValueError, match="the equations depend on the time"):
+        periodic(Oscillator(), NEAR, period=1.0)
+    with pytest.raises(ValueError, match=r"no periodic orbit was found|does not reach the end|ended at an equilibrium"):
+        periodic(WithSections(), jk.State([0.5], [0.0]), section="top", period=1.0)
+    with pytest.raises(ValueError, match="crosses the section 'top' against the direction"):
+        periodic(WithSections(), jk.State([-2.0], [0.0]), section="top", period=6.66)
+    with pytest.raises(ValueError, match="the section 'step' is not crossed within"):
+        periodic(RimlessWheel(), jk.State([-0.32], [0.1]), section="step")
+
+
+def test_under_a_trace_there_is_no_exception():
+    with pytest.raises(ValueError, match=r"under jax\.jit, jax\.vmap and derivatives, pass `period`"):
+        jax.eval_shape(lambda mu: periodic(WithSections(mu), NEAR, section="top").period, 1.0)
