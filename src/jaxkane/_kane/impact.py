@@ -394,7 +394,7 @@ class ImpulseCoordinates(NamedTuple):
         B = X.T @ released.M_own
         S = released.M - B.T @ B
         sizes = [released.M[i, i] for i in range(len(S))]
-        X_a = stack(_inverse_root(_rows(S), sizes)).astype(M.dtype)
+        X_a = stack(inverse_root(_rows(S), sizes)).astype(M.dtype)
         lower = jnp.concatenate([jnp.zeros_like(released.M_own.T), X_a], axis=1)
         X = jnp.concatenate([jnp.concatenate([X, -X @ B @ X_a], axis=1), lower], axis=0)
         return cls(X, jnp.concatenate([C, released.C], axis=1), jnp.concatenate([before.h, released.h]))
@@ -430,13 +430,13 @@ def _rows(A: Array) -> list[list[Component]]:
 def _own_root(M: Array) -> Array:
     """X (n, n) with X^T M X = 1, upper triangular. NaN if M is singular within rounding."""
     if is_written_out(len(M)):
-        return stack(_inverse_root(_rows(M))).astype(M.dtype)
+        return stack(inverse_root(_rows(M))).astype(M.dtype)
     K = jnp.linalg.cholesky(M)
     K = jnp.where(jnp.all(jnp.diag(K) ** 2 > rounding_of_pivots(M.dtype) * jnp.diag(M)), K, jnp.nan)
     return jsl.solve_triangular(K, jnp.eye(len(M), dtype=M.dtype), lower=True).T
 
 
-def _inverse_root(M: Rows, sizes: Sequence[Component] | None = None) -> Rows:
+def inverse_root(M: Rows, sizes: Sequence[Component] | None = None) -> Rows:
     """X (n, n) with X^T M X = 1, upper triangular, by the Cholesky factors M = K K^T, X = K^-T.
 
     A pivot that is zero within rounding gives NaN. If the `sizes` (n,) of the diagonal before cancellation are passed,
