@@ -12,9 +12,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from .._kane.contact import NO_CONTACTS, ContactLayout, layout_of
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
@@ -164,6 +166,9 @@ class Events(NamedTuple):
     - `conditions`: for each event its place among those with `when`, or None.
     - `read_rates`: whether any event uses speeds or first-order states, whose rates the solver must evaluate.
     - `read_time`: whether any event uses the time.
+    - `contacts`: for each event that belongs to a contact its place and 0 for the normal, 1 for the tangential
+      direction; None for the events of the system.
+    - `layout`: the contacts.
     """
 
     names: tuple[str, ...]
@@ -172,6 +177,23 @@ class Events(NamedTuple):
     conditions: tuple[int | None, ...]
     read_rates: bool
     read_time: bool
+    contacts: tuple[tuple[int, int] | None, ...] = ()
+    layout: ContactLayout = NO_CONTACTS
+
+    def with_contacts(self, layout: ContactLayout) -> Events:
+        """The same with two events for each contact, in alphabetical order.
+
+        **Raises:** `ValueError` if a contact has the name of an event.
+        """
+        if not layout.names:
+            return self
+        if both := set(self.names) & set(layout.names):
+            raise ValueError(f"The name {both.pop()!r} is used twice, for an event and for a contact. Rename one.")
+        own = [*zip(*self[:4], [None] * len(self.names), strict=True)]
+        of_contacts = [(name, -1, 1, None, (i, side)) for i, name in enumerate(layout.names) for side in (0, 1)]
+        columns = zip(*sorted([*own, *of_contacts], key=lambda event: event[0]), strict=True)
+        names, directions, stages, conditions, contacts = (tuple(column) for column in columns)
+        return Events(names, directions, stages, conditions, True, self.read_time, contacts, layout)
 
     @property
     def continue_(self) -> bool:
@@ -199,7 +221,7 @@ def events_of(system: System, t: Array, state: State) -> Events:
         tuple(conditional.index(name) if name in conditional else None for name in found),
         any(depends_on(program, [2, 3])),
         any(depends_on(program, [0])),
-    )
+    ).with_contacts(layout_of(system))
 
 
 def crossings(system: System, t: Component, q: Any, u_all: Any, x: Any, dtype: DTypeLike) -> dict[str, Crossing]:
@@ -292,6 +314,10 @@ class EventValues(NamedTuple):
         rates = jnp.abs(self.rates) if before is None else jnp.maximum(jnp.abs(self.rates), jnp.abs(before))
         vanishes = jnp.abs(self.values) <= rates * rounding
         values = jnp.where(vanishes, jnp.zeros_like(self.values), self.values)
+        if any(contact is not None for contact in events.contacts):
+            # The states of the contacts were just found, so none of their functions vanishes here.
+            of_contacts = np.array([contact is not None for contact in events.contacts])
+            values = jnp.where(of_contacts, jnp.maximum(values, jnp.finfo(values.dtype).tiny), values)
         return self._replace(values=values).passed(events, vanishes)
 
     def passed(self, events: Events, near: Any) -> EventValues:
@@ -417,6 +443,13 @@ def next_point(system: System, origin, point: EventPoint, y_dot, read_rates, rea
     `origin`: the start of the simulation [s]. `read_rates`: y_dot, None if no event uses speeds.
     """
     quantities = event_values(system, origin + point.t, point.y, read_rates)
+    return moved_to_event(quantities, point, y_dot, reach, which, happened)
+
+
+def moved_to_event(
+    quantities: EventValues, point: EventPoint, y_dot: Array, reach: Array, which: Array, happened: Array
+) -> EventPoint:
+    """`next_point`, with the event functions at the point."""
     g, g_dot = quantities.values[0], quantities.rates[0]
     for i in range(1, len(quantities.values)):
         g, g_dot = (jnp.where(which == i, x[i], x0) for x, x0 in ((quantities.values, g), (quantities.rates, g_dot)))

@@ -178,7 +178,7 @@ def _after_stage(system: System, t: Component, y: Array, name: str, stage: int) 
             new.append(component(then[key]) if key in then else y[i])
         except TypeError as error:
             raise TypeError(f"{label}: the new value of {key!r} must be one number, got {then[key]!r}.") from error
-    return as_vector(new, y), ()
+    return jnp.concatenate([as_vector(new, y), y[len(names) :]]), ()
 
 
 @jax.custom_jvp

@@ -258,7 +258,9 @@ def as_state(system: System, state: State) -> State:
         if not hasattr(values, "shape"):
             raise TypeError(f"{title}: state.{label} must be an array of numbers, or a dict by name; got {values!r}.")
         arrays.append(values)
-    return State(*_of_one_type(arrays))
+    arrays = _of_one_type([*arrays, *(() if state.contacts is None else (state.contacts,))])
+    contacts = None if state.contacts is None else arrays.pop()
+    return State(*arrays[:2], arrays[2] if system.states else None, contacts)
 
 
 def _of_one_type(arrays: list[Any]) -> list[Any]:

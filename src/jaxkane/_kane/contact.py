@@ -30,15 +30,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._scalarjit.components import Component, add, as_vector, component, cross, is_exact, is_zero, stack
+from .._scalarjit.components import Component, add, as_vector, component, cross, is_exact, is_written_out, is_zero, stack
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
 from .._system.system import System
 from .arguments import Row, is_concrete, is_one_number
-from .description import jvp
+from .description import dtype_of, jvp
 from .impact import checked_restitution, inverse_root, least_norm
 from .kanes_method import KaneEquations, unit
+from .scaling import term_sizes
 from .unilateral import MOST_CONTACTS, OPEN, SLIDES, STICKS
 
 
@@ -188,7 +189,7 @@ def has_contacts(system: System) -> bool:
 
 
 def layout_of(system: System) -> ContactLayout:
-    """The contacts of a system. They are traced once.
+    """The contacts of a system, which are traced for this.
 
     **Raises:** `TypeError` or `ValueError` for contacts that are not a dict of contacts by name; `ValueError` for more
     than four contacts, and for a system with too many speeds.
@@ -202,13 +203,18 @@ def layout_of(system: System) -> ContactLayout:
         found.append(_traced_layout(kane))
         return t
 
-    q, u = (jnp.zeros(len(names)) for names in (system.coordinates, system.speeds))
-    jax.eval_shape(trace, jnp.zeros(()), q, u)
+    if not is_written_out(len(system.speeds)):
+        raise ValueError(
+            f"{type(system).__name__}: contacts need a system with at most 12 speeds, and this one has "
+            f"{len(system.speeds)}. Use MuJoCo for large systems with contacts."
+        )
+    dtype = dtype_of(system)
+    q, u = (jnp.zeros(len(names), dtype) for names in (system.coordinates, system.speeds))
+    jax.eval_shape(trace, jnp.zeros((), dtype), q, u)
     return found[0]
 
 
 def _contacts(kane: KaneEquations, t: Component, q: Row, u: Row) -> tuple[Motion, dict[str, Any]]:
-    # The method may divide by a speed. An exact zero would raise ZeroDivisionError, so pass arrays.
     motion = kane.motion(t, q, u)
     contacts = kane.system.contacts(t, q, u, motion)
     label = f"{kane.name}.contacts"
@@ -495,8 +501,8 @@ def solve_forces(layout: ContactLayout, terms: ContactTerms, memory: ContactMemo
     else:
         known, ratios = jnp.zeros(c * r, w.dtype), jnp.zeros((c, r), w.dtype)
     # F = W z:  the friction of a contact that slides is proportional to its normal force
-    blocks = jnp.eye(r, dtype=w.dtype)[None] + ratios[:, :, None] * np.eye(r, dtype=w.dtype)[None, :1]
-    W = (jnp.eye(c, dtype=w.dtype)[:, None, :, None] * blocks[:, :, None, :]).reshape(c * r, c * r)
+    blocks = np.eye(r, dtype=w.dtype)[None] + ratios[:, :, None] * np.eye(r, dtype=w.dtype)[None, :1]
+    W = (np.eye(c, dtype=w.dtype)[:, None, :, None] * blocks[:, :, None, :]).reshape(c * r, c * r)
     mask = active.reshape(-1)
     A = jnp.where(mask[:, None] & mask[None], (B @ B.T) @ W, 0.0)
     z = least_norm(A, jnp.where(mask, -(B @ w + terms.b), 0.0))[0]
@@ -548,9 +554,21 @@ def forces_in_contact(
 
 
 @ScalarFunction
-def terms_at(system: System, t: Component, q: Array, u: Array, values: Any, layout: Any) -> ContactTerms:
-    """The terms of all contacts at unprojected speeds. `layout` is static, in a Module."""
-    return _terms(KaneEquations(system, t, q, u, values), layout.layout)
+def terms_at(system: System, t: Component, q: Array, u: Array, values: Any) -> ContactTerms:
+    """The terms of all contacts at speeds that are not projected."""
+    return _terms(KaneEquations(system, t, q, u, values), layout_of(system))
+
+
+@ScalarFunction.compile_cheaply
+def gap_sizes(system: System, t: Component, q: Array, u: Array) -> tuple[Array, Array]:
+    """The gaps (c,) of all contacts and the sizes of their terms. Of a bearing 1."""
+    layout = layout_of(system)
+
+    def gaps(system: System, t: Component, q: Array, u: Array) -> Array:
+        kane = KaneEquations(system, t, q, u)
+        return as_vector(ContactRows(kane, layout).gaps(kane.t, kane.q, kane.u_all), q)
+
+    return gaps(system, t, q, u), term_sizes(gaps, system, t, q, u)
 
 
 def event_functions(
