@@ -24,10 +24,13 @@ from .._kane.contact import (
     ContactMemory,
     ContactTerms,
     event_functions,
+    event_sizes,
     forces_in_contact,
+    gap_sizes,
     layout_of,
     projected_speeds,
     terms_at,
+    without_gaps,
 )
 from .._kane.right_hand_side import values_of
 from .._kane.unilateral import OPEN, SLIDES, STICKS, Slip, contact_impact
@@ -131,7 +134,9 @@ def changed_contacts(
     )
     u = projected_speeds(layout, after, new, u)
     n_q, n_u = len(system.coordinates), len(system.speeds)
-    y = jnp.concatenate([state.q, u, y[n_q + n_u : y.size - layout.memory_size], new.packed()])
+    # Gaps of closed contacts drift by the error of the solver.
+    q = without_gaps(after, takes_part & (event.touches | near | closed) & ~event.is_start, state.q)
+    y = jnp.concatenate([q, u, y[n_q + n_u : y.size - layout.memory_size], new.packed()])
     delay = jnp.max(jnp.where(rests & (new.states != OPEN), bounces, 0.0), initial=0.0)
     return Change(y, delay, impulses, is_determined & (~is_impact | hit.determined))
 
@@ -215,10 +220,13 @@ def _unit_rows(x: Array) -> Array:
 
 
 @ScalarFunction
-def contact_event_values(system: System, t: Array, y: Array, inputs: dict[str, Array]) -> Array:
-    """The event functions of all contacts (2 c,): normal and tangential ones."""
+def contact_event_values(system: System, t: Array, y: Array, inputs: dict[str, Array]) -> tuple[Array, Array]:
+    """The event functions of all contacts (2 c,), normal and tangential ones, and their rounding errors."""
     layout, state = layout_of(system), unpacked(system, y)
     values = values_of(system, state.x, inputs)
     _, _, forces, terms = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
-    functions = event_functions(layout, terms, ContactMemory.unpacked(layout, state.contacts), forces.forces)
-    return jnp.stack(functions, axis=1).reshape(-1)
+    memory = ContactMemory.unpacked(layout, state.contacts)
+    functions = event_functions(layout, terms, memory, forces.forces)
+    sizes = event_sizes(layout, terms, memory, forces.forces, gap_sizes.__wrapped__(system, t, state.q, state.u)[1])
+    noise = 4 * float(jnp.finfo(y.dtype).eps) * jax.lax.stop_gradient(jnp.stack(sizes, axis=1).reshape(-1))
+    return jnp.stack(functions, axis=1).reshape(-1), noise

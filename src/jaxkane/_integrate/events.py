@@ -290,12 +290,15 @@ class EventValues(NamedTuple):
     - `bound`: det C_dep, whose sign must not change. If it is zero, the independent speeds do not determine the
       dependent speeds.
     - `conditions` (m,): the quantities `when` of the events that have one.
+    - `noise` (n,): rounding errors of the functions of contacts, zero for events of the system; None without contacts.
+      At the start of a step it is None.
     """
 
     values: Array
     rates: Array
     bound: Array
     conditions: Array
+    noise: Array | None = None
 
     def packed(self) -> Array:
         return jnp.concatenate([self.bound[None], self.values, self.rates, self.conditions])
@@ -317,7 +320,9 @@ class EventValues(NamedTuple):
         if any(contact is not None for contact in events.contacts):
             # The states of the contacts were just found, so none of their functions vanishes here.
             of_contacts = np.array([contact is not None for contact in events.contacts])
+            own = jnp.where(of_contacts & vanishes, jnp.maximum(self.rates, 0.0), self.rates)
             values = jnp.where(of_contacts, jnp.maximum(values, jnp.finfo(values.dtype).tiny), values)
+            return self._replace(values=values, rates=own).passed(events, vanishes)
         return self._replace(values=values).passed(events, vanishes)
 
     def passed(self, events: Events, near: Any) -> EventValues:
@@ -408,7 +413,11 @@ def first_event(events: Events, rounding: Array, start: EventValues, end: EventV
     slopes = [jnp.where(jnp.abs(rates) < jnp.inf, h * rates, chord) for rates in (start.rates, end.rates)]
     x = first_crossing(start.values, slopes[0], end.values, slopes[1], direction)
     coming = (jnp.sign(end.values) * jnp.sign(end.rates) < 0) & (direction * end.rates >= 0)
-    coming &= jnp.abs(end.values) <= jnp.abs(end.rates) * rounding
+    is_small = jnp.abs(end.values) <= jnp.abs(end.rates) * rounding
+    if end.noise is not None:
+        # A gap of two large coordinates does not change in steps that are too short for their digits.
+        is_small |= jnp.abs(end.values) <= end.noise
+    coming &= is_small
     x = jnp.where(coming, jnp.minimum(x, 1.0), x)
     event, place = jnp.full_like(h, -1.0), jnp.full_like(h, jnp.inf)
     for i in reversed(range(len(events.directions))):

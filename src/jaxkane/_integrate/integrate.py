@@ -291,18 +291,18 @@ class Problem(NamedTuple):
         if not events.layout.names:
             return own
 
-        def of_contacts(t: Array, y: Array) -> Array:
+        def of_contacts(t: Array, y: Array) -> tuple[Array, Array]:
             return contact_event_values(args.system, args.clock(t), y, args.inputs(system, t, unpacked(system, y)))
 
-        values, rates = jax.jvp(of_contacts, (t, y), (jnp.ones_like(t), y_dot))
+        (values, noise), (rates, _) = jax.jvp(of_contacts, (t, y), (jnp.ones_like(t), y_dot))
         # The own events and the contacts, each in alphabetical order
         order: list[int] = []
         for contact in events.contacts:
             own_place = len(order) - sum(x >= len(own.values) for x in order)
             order.append(own_place if contact is None else len(own.values) + 2 * contact[0] + contact[1])
-        both = ((own.values, values), (own.rates, rates))
-        values, rates = (jnp.stack([jnp.concatenate(pair)[i] for i in order]) for pair in both)
-        return own._replace(values=values, rates=rates)
+        pairs = (own.values, values), (own.rates, rates), (jnp.zeros_like(own.values), noise)
+        values, rates, noise = (jnp.stack([jnp.concatenate(pair)[i] for i in order]) for pair in pairs)
+        return own._replace(values=values, rates=rates, noise=noise)
 
     def jump(self, t: Array, y: Array, event: Array, reach: Array) -> Jump:
         """The jump of an event, from a time and a packed state near it."""

@@ -311,6 +311,7 @@ class ContactTerms(NamedTuple):
     - `laws`: restitution and friction.
     - `tangents` (c, d, 3): directions of the slip in N.
     - `gap_rates` (c,): rates of the gaps.
+    - `Q` (n_q, n): derivatives of the rates of the coordinates by the independent speeds.
     """
 
     gaps: Array
@@ -323,6 +324,7 @@ class ContactTerms(NamedTuple):
     laws: Laws
     tangents: Array
     gap_rates: Array
+    Q: Array
 
     @property
     def B(self) -> Array:
@@ -428,7 +430,9 @@ def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True)
         gap_rates = as_vector(rows.gap_rates(t, q, u), like)
     else:
         b, w, gap_rates = jnp.zeros_like(v), jnp.zeros(kane.n, kane.dtype), jnp.zeros_like(gaps)
-    return ContactTerms(gaps, v.reshape(c, r), size.reshape(c, r), C, b, X, w, laws, T, gap_rates)
+    along_q = [kane.along_speeds(lambda u: kane.rates(t, q, u), kane.with_dependent(unit(kane.n, i))) for i in range(kane.n)]
+    Q = stack(along_q).astype(kane.dtype).T
+    return ContactTerms(gaps, v.reshape(c, r), size.reshape(c, r), C, b, X, w, laws, T, gap_rates, Q)
 
 
 def _laws(contact: Any) -> tuple[Component, Component, Component]:
@@ -534,6 +538,15 @@ def projected_speeds(layout: ContactLayout, terms: ContactTerms, memory: Contact
     return u + terms.X @ least_norm(B, jnp.where(mask, -terms.v.reshape(-1), 0.0))[0]
 
 
+def without_gaps(terms: ContactTerms, closed: Array, q: Array) -> Array:
+    """The nearest coordinates (n_q,) at which the gaps of `closed` contacts (c,) vanish, to the first order.
+
+    The displacement is that of virtual speeds, so it satisfies the velocity constraints.
+    """
+    rows = jnp.where(closed[:, None], terms.B.reshape(*terms.v.shape, -1)[:, 0], 0.0)
+    return q + terms.Q @ (terms.X @ least_norm(rows, jnp.where(closed, -terms.gaps, 0.0))[0])
+
+
 def _projected(
     system: System, layout: ContactLayout, t: Component, q: Array, u: Array, memory: ContactMemory, values: Any
 ) -> tuple[KaneEquations, Array]:
@@ -604,3 +617,19 @@ def _norm(x: Array) -> Array:
         return jnp.abs(x[:, 0])
     squares = jnp.sum(x**2, axis=1)
     return jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1.0)), 0.0)
+
+
+def event_sizes(
+    layout: ContactLayout, terms: ContactTerms, memory: ContactMemory, forces: Array, gap_sizes: Array
+) -> tuple[Array, Array]:
+    """The sizes of the terms of both `event_functions` of each contact (c,)."""
+    c, r = terms.v.shape
+    closed, d = memory.states >= SLIDES, layout.d
+    needed = (jnp.abs(terms.B) @ jnp.abs(terms.w) + jnp.abs(terms.b)).reshape(c, r)
+    stiffness = jnp.sum(terms.B.reshape(c, r, -1) ** 2, axis=2)
+    sizes = needed / jnp.where(stiffness > 0, stiffness, 1.0) + jnp.abs(forces)
+    normal = jnp.where(jnp.asarray(layout.is_bearing), 0.0, jnp.where(closed, sizes[:, 0], gap_sizes))
+    if not d:
+        return normal, jnp.zeros_like(normal)
+    tangential = jnp.where(memory.states == STICKS, jnp.sum(sizes[:, 1:], axis=1), jnp.sum(terms.size[:, 1:], axis=1))
+    return normal, jnp.where(closed & jnp.asarray(layout.has_friction), tangential, 0.0)
