@@ -34,6 +34,7 @@ from .._kane.contact import (
 )
 from .._kane.right_hand_side import values_of
 from .._kane.unilateral import OPEN, SLIDES, STICKS, Slip, contact_impact
+from .._scalarjit.nan import constant
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.system import System, unpacked
 
@@ -110,12 +111,16 @@ def changed_contacts(
     closed = (memory.states >= SLIDES) & ~bearing
     v_N = before.v[:, 0]
     # -- The impact, if contacts close.
-    near = (memory.states == OPEN) & ~bearing & (jnp.abs(before.gaps) <= jnp.abs(v_N) * reach)
+    # Events are simultaneous within their rounding errors, which are large for a gap of large coordinates.
+    errors = 256 * float(jnp.finfo(y.dtype).eps) * constant(gap_sizes(system, t, state.q, state.u)[1])
+    near = (memory.states == OPEN) & ~bearing & (jnp.abs(before.gaps) <= jnp.abs(v_N) * reach + errors)
     closes = v_N < -_negligible(before)[:, 0]
     takes_part = (closed | event.touches | near) & ~bearing & ~(event.is_start & closes)
     strikes = takes_part & closes & ~(closed & event.is_own)
     bounces = _rest_of_bounces(before, strikes)
-    rests, is_impact = strikes & (bounces < rest), jnp.any(strikes)
+    # A bounce that is lower than the rounding error of the gap cannot be simulated.
+    is_low = 0.5 * (before.laws.restitution * v_N) ** 2 <= -before.a[:, 0] * (errors / 16)
+    rests, is_impact = strikes & (bounces < jnp.inf) & ((bounces < rest) | is_low), jnp.any(strikes)
     e = jnp.where(strikes & ~rests, before.laws.restitution, 0.0)
     has_friction = [has and not b for has, b in zip(layout.has_friction, layout.is_bearing, strict=True)]
     friction = jnp.where(bearing, 0.0, before.laws.friction)
@@ -228,5 +233,11 @@ def contact_event_values(system: System, t: Array, y: Array, inputs: dict[str, A
     memory = ContactMemory.unpacked(layout, state.contacts)
     functions = event_functions(layout, terms, memory, forces.forces)
     sizes = event_sizes(layout, terms, memory, forces.forces, gap_sizes.__wrapped__(system, t, state.q, state.u)[1])
-    noise = 4 * float(jnp.finfo(y.dtype).eps) * jax.lax.stop_gradient(jnp.stack(sizes, axis=1).reshape(-1))
+    normal, tangential = jax.lax.stop_gradient(sizes)
+    eps, tiny = float(jnp.finfo(y.dtype).eps), float(jnp.finfo(y.dtype).tiny)
+    # A contact without a force, as of two balls side by side, does not open. So the force must be negative.
+    rests = (memory.states >= SLIDES) & ~jnp.asarray(layout.is_bearing)
+    margins = jnp.where(rests, normal, 0.0), jnp.where(memory.states == STICKS, tangential, 0.0)
+    functions = [f + (64 * eps * margin + 1e3 * tiny) for f, margin in zip(functions, margins, strict=True)]
+    noise = 4 * eps * jnp.stack([normal, tangential], axis=1).reshape(-1)
     return jnp.stack(functions, axis=1).reshape(-1), noise

@@ -30,7 +30,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._scalarjit.components import Component, add, as_vector, component, cross, is_exact, is_written_out, is_zero, stack
+from .._scalarjit.components import (
+    Component,
+    add,
+    as_vector,
+    component,
+    cross,
+    is_exact,
+    is_written_out,
+    is_zero,
+    stack,
+)
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
@@ -430,7 +440,9 @@ def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True)
         gap_rates = as_vector(rows.gap_rates(t, q, u), like)
     else:
         b, w, gap_rates = jnp.zeros_like(v), jnp.zeros(kane.n, kane.dtype), jnp.zeros_like(gaps)
-    along_q = [kane.along_speeds(lambda u: kane.rates(t, q, u), kane.with_dependent(unit(kane.n, i))) for i in range(kane.n)]
+    along_q = [
+        kane.along_speeds(lambda u: kane.rates(t, q, u), kane.with_dependent(unit(kane.n, i))) for i in range(kane.n)
+    ]
     Q = stack(along_q).astype(kane.dtype).T
     return ContactTerms(gaps, v.reshape(c, r), size.reshape(c, r), C, b, X, w, laws, T, gap_rates, Q)
 

@@ -188,7 +188,9 @@ def outputs_at(system: System, t: Array, q: Array, u: Array, inputs: Mapping[str
     return _outputs_at(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
-def outputs_in_contact(system: System, t: Array, y: Array, inputs: Mapping[str, Array]) -> tuple[Array, dict[str, Array]]:
+def outputs_in_contact(
+    system: System, t: Array, y: Array, inputs: Mapping[str, Array]
+) -> tuple[Array, dict[str, Array]]:
     """The projected speeds (n,), and outputs by name with the contact forces, at a state with contact states."""
     state = unpacked(system, y)
     values = dict(values_of(system, state.x, inputs))
