@@ -287,3 +287,128 @@ class CompassGait(jk.System):
         height = 2.0 * self.slope - q["stance"] - q["swing"]
         ahead = q["stance"] - q["swing"]
         return {"heel_strike": jk.falling(height, when=ahead, then=(lands, self.exchange))}
+
+
+class BouncingBall(jk.System):
+    """A ball in air over a floor."""
+
+    restitution: Scalar = parameter(0.8, within=(0.0, 1.0))
+    drag: Scalar = parameter(0.1, unit="kg/m")
+    coordinates, speeds = ("h",), ("v",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        ball = jk.Body(1.0, 0.0, O.moving(q["h"] * N.y, u["v"] * N.y), name="ball")
+        return jk.Motion([ball])
+
+    def loads(self, t, q, u, motion, inputs):
+        resistance = -self.drag * u["v"] * jnp.abs(u["v"]) * motion.N.y
+        return jk.weight(motion, -9.81 * motion.N.y), jk.Force(resistance, motion["ball"])
+
+    def contacts(self, t, q, u, motion):
+        return {"floor": jk.Contact(gap=q["h"], restitution=self.restitution)}
+
+
+class Belt(jk.System):
+    """A block on a moving belt, held by a spring."""
+
+    stiffness: Scalar = parameter(4.0, unit="N/m")
+    speed: Scalar = parameter(0.5, unit="m/s")
+    kinetic: Scalar = parameter(2.5, positive=True, unit="N")
+    static: Scalar = parameter(4.0, positive=True, unit="N")
+    coordinates, speeds = ("x",), ("x_dot",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["x_dot"] * N.x), name="block")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(-self.stiffness * q["x"] * motion.N.x, motion["block"])
+
+    def contacts(self, t, q, u, motion):
+        return {"belt": jk.DryFriction(u["x_dot"] - self.speed, self.kinetic, static=self.static)}
+
+
+class KerbWheel(jk.System):
+    """A disc over a road with a kerb: it flies, lands, rolls, slides."""
+
+    radius: Scalar = parameter(0.35)
+    height: Scalar = parameter(0.08)  # of the kerb, which ends at x = 0
+    friction: Scalar = parameter(0.8)
+    coordinates = ("yaw", "lean", "spin", "x", "y", "z")
+    speeds = ("yaw_rate", "lean_rate", "spin_rate", "x_dot", "y_dot", "z_dot")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        Y = N.rotate(3, q["yaw"], u["yaw_rate"])
+        L = Y.rotate(1, q["lean"], u["lean_rate"], "L")
+        W = L.rotate(2, q["spin"], u["spin_rate"], "W")
+        center = O.moving(N.vector(*q["x":"z"]), N.vector(*u["x_dot":"z_dot"]))
+        disc = jk.Body(1.5, (0.09, 0.18, 0.09), center, L, W.angular_velocity, name="disc")
+        rim = center.fixed(-self.radius * L.z, W)
+        return jk.Motion([disc], points={"rim": rim, "center": center}, frames={"W": W})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.z)
+
+    def contacts(self, t, q, u, motion):
+        N, rim, center = motion.N, motion["rim"], motion["center"]
+        out = q["x":"z"][0], q["x":"z"][2] - self.height  # from the edge to the centre, in the plane x z
+        distance = jnp.sqrt(out[0] ** 2 + out[1] ** 2)
+        away = (out[0] / distance) * N.x + (out[1] / distance) * N.z
+        edge = center.fixed(-self.radius * away, motion["W"])
+        return {
+            "road": jk.Contact(rim, N.z, friction=self.friction),
+            "kerb": jk.Contact(edge, away, gap=distance - self.radius, friction=self.friction),  # upright wheel
+        }
+
+
+class Backlash(jk.System):
+    """A motor and a load with play between them."""
+
+    play: Scalar = parameter(0.02, unit="rad")
+    coordinates, speeds = ("motor", "load"), ("motor_rate", "load_rate")
+    inputs = ("torque",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        M = N.rotate(3, q["motor"], u["motor_rate"], "M")
+        L = N.rotate(3, q["load"], u["load_rate"], "L")
+        bodies = [jk.Body(0.1, (0.0, 0.0, 1e-3), O, M, name="rotor"), jk.Body(1.0, (0.0, 0.0, 5e-3), O, L, name="arm")]
+        return jk.Motion(bodies)
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Torque(inputs["torque"] * motion.N.z, motion["rotor"])
+
+    def contacts(self, t, q, u, motion):
+        lead = q["motor"] - q["load"]
+        return {
+            "drive": jk.Contact(gap=0.5 * self.play - lead, restitution=0.3),
+            "coast": jk.Contact(gap=0.5 * self.play + lead, restitution=0.3),
+        }
+
+
+class TwoCornerBlock(jk.System):
+    """A block that rocks, slides and jumps on a floor: two corners."""
+
+    width: Scalar = parameter(0.4, unit="m")
+    height: Scalar = parameter(1.2, unit="m")
+    friction: Scalar = parameter(0.6)
+    restitution: Scalar = parameter(0.0)
+    coordinates, speeds = ("x", "y", "angle"), ("x_dot", "y_dot", "rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(3, q["angle"], u["rate"], "B")
+        center = O.moving(q["x"] * N.x + q["y"] * N.y, u["x_dot"] * N.x + u["y_dot"] * N.y)
+        I = (self.width**2 + self.height**2) / 12
+        down = -0.5 * self.height * B.y
+        left, right = (center.fixed(down + s * self.width * B.x) for s in (-0.5, 0.5))
+        return jk.Motion([jk.Body(1.0, (I, I, I), center, B, name="block")], points={"left": left, "right": right})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def contacts(self, t, q, u, motion):
+        law = {"restitution": self.restitution, "friction": self.friction}
+        return {name: jk.Contact(motion[name], motion.N.y, **law) for name in ("left", "right")}
