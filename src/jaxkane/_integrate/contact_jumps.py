@@ -3,8 +3,8 @@
 All of them happen at jumps. A jump has two stages:
 
 1. If contacts close, one impact with all of them and with the contacts that are closed already (`unilateral`).
-2. The contacts that neither approach nor separate get the state that their accelerations allow: the same conditions, with
-   accelerations and forces instead of velocities and impulses.
+2. The contacts that neither approach nor separate get the state that their accelerations allow: the same conditions,
+   with accelerations and forces instead of velocities and impulses.
 
 A contact rests if the rest of its bounces takes a negligible time (see `REST`). This time is added, so that the end of
 infinitely many bounces has a derivative.
@@ -102,7 +102,8 @@ def changed_contacts(
     - `tolerances`: relative and absolute, of a step.
     """
     state = unpacked(system, y)
-    memory = ContactMemory.unpacked(layout, state.contacts)  # pyright: ignore[reportArgumentType]
+    assert state.contacts is not None
+    memory = ContactMemory.unpacked(layout, state.contacts)
     values, bearing = values_of(system, state.x, inputs), jnp.asarray(layout.is_bearing)
     before: ContactTerms = terms_at(system, t, state.q, state.u, values)
     # Closed contacts have no velocity: the error of the solver must not become an impact.
@@ -229,6 +230,7 @@ def contact_event_values(system: System, t: Array, y: Array, inputs: dict[str, A
     """The event functions of all contacts (2 c,), normal and tangential ones, and their rounding errors."""
     layout, state = layout_of(system), unpacked(system, y)
     values = values_of(system, state.x, inputs)
+    assert state.contacts is not None
     _, _, forces, terms = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
     memory = ContactMemory.unpacked(layout, state.contacts)
     functions = event_functions(layout, terms, memory, forces.forces)

@@ -193,7 +193,7 @@ class Events(NamedTuple):
         of_contacts = [(name, -1, 1, None, (i, side)) for i, name in enumerate(layout.names) for side in (0, 1)]
         columns = zip(*sorted([*own, *of_contacts], key=lambda event: event[0]), strict=True)
         names, directions, stages, conditions, contacts = (tuple(column) for column in columns)
-        return Events(names, directions, stages, conditions, True, self.read_time, contacts, layout)
+        return Events(names, directions, stages, conditions, True, self.read_time | layout.reads_time, contacts, layout)
 
     @property
     def continue_(self) -> bool:

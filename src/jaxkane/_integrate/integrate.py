@@ -19,6 +19,7 @@ from .._kane.constraint_residuals import configuration_is_met, correction, has_c
 from .._kane.contact import ContactMemory, gap_sizes, layout_of
 from .._kane.kanes_method import KaneEquations
 from .._kane.right_hand_side import outputs_at, outputs_in_contact, rates_are_native, values_of, vector_field
+from .._kane.unilateral import OPEN, SLIDES, STICKS
 from .._scalarjit.cache_key import captured_tracers, captures_any, jit
 from .._scalarjit.components import as_vector
 from .._scalarjit.jaxpr import LARGEST_SUM
@@ -33,7 +34,6 @@ from .._scalarjit.nan import (
 )
 from .._scalarjit.scalar_function import Packed, ScalarFunction, tree_of
 from .._system.parameters import ANY, ParameterInfo, parameters_in
-from .._kane.unilateral import OPEN, SLIDES, STICKS
 from .._system.system import State, System, names_of, packed, units_of, unpacked
 from .contact_jumps import REST, Change, ContactEvent, changed_contacts, contact_event_values
 from .discontinuities import Discontinuities, all_end_steps, discontinuities_of, rounding
@@ -101,6 +101,10 @@ def solve(
         state = State(state.q, state.u, state.x, memory)
         touches, is_apart = gaps_at_start(system, origin, state)
         others_are_valid &= is_apart
+    if layout.names and jnp.ndim(settings.atol):
+        # Contact states have no error.
+        padded = jnp.concatenate([settings.atol, jnp.ones(layout.memory_size, settings.atol.dtype)])
+        settings = dataclasses.replace(settings, atol=padded)
     valid, start, system = initial_check(system, packed(state), origin, others_are_valid)
     if fixed and discontinuities is not None:
         # Fixed steps do not end there. JAX would compute a derivative of 0 for these times, which is wrong.
@@ -353,7 +357,7 @@ class Problem(NamedTuple):
     def _changed_contacts(self, t: Array, y: Array, what: ContactEvent, reach: Array) -> Change:
         args, system, settings = dataclasses.replace(self.args, within=None), self.system, self.settings
         inputs = args.inputs(tree_of(args.system), t, unpacked(system, y))
-        tolerances = jnp.asarray(settings.rtol, y.dtype), jnp.asarray(settings.atol, y.dtype)
+        tolerances = jnp.asarray(settings.rtol, y.dtype), jnp.max(jnp.asarray(settings.atol, y.dtype))
         rest = REST * self.taus[-1]
         return changed_contacts(
             tree_of(args.system), self.events.layout, args.clock(t), y, inputs, what, reach, rest, tolerances
