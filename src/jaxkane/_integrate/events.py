@@ -202,6 +202,11 @@ class Events(NamedTuple):
 
 
 def events_of(system: System, t: Array, state: State) -> Events:
+    """The events of a system and of its contacts."""
+    return own_events_of(system, t, state).with_contacts(layout_of(system))
+
+
+def own_events_of(system: System, t: Array, state: State) -> Events:
     """The events of a system. They are traced once to detect their directions and what they use."""
     dtype = state.q.dtype
     u_all = jnp.zeros(len(system.speeds) + len(system.dependent_speeds), dtype)
@@ -221,7 +226,7 @@ def events_of(system: System, t: Array, state: State) -> Events:
         tuple(conditional.index(name) if name in conditional else None for name in found),
         any(depends_on(program, [2, 3])),
         any(depends_on(program, [0])),
-    ).with_contacts(layout_of(system))
+    )
 
 
 def crossings(system: System, t: Component, q: Any, u_all: Any, x: Any, dtype: DTypeLike) -> dict[str, Crossing]:
