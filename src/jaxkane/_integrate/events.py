@@ -468,7 +468,10 @@ def moved_to_event(
     for i in range(1, len(quantities.values)):
         g, g_dot = (jnp.where(which == i, x[i], x0) for x, x0 in ((quantities.values, g), (quantities.rates, g_dot)))
     g_dot = jax.lax.stop_gradient(g_dot)
-    is_small = jnp.abs(g) <= jnp.abs(g_dot) * reach
+    limit = jnp.abs(g_dot) * reach
+    if quantities.noise is not None:
+        limit += 2 * sum(jnp.where(which == i, x, 0.0) for i, x in enumerate(quantities.noise))
+    is_small = jnp.abs(g) <= limit
     moves = happened & is_small & (g_dot != 0)
     step = jnp.where(moves, -g / jnp.where(moves, g_dot, jnp.ones_like(g_dot)), jnp.zeros_like(g))
     return EventPoint(point.t + step, point.y + step * y_dot, step, point.smooth & is_small)

@@ -21,8 +21,8 @@ from .._integrate.jumps import stages_of, state_after
 from .._integrate.simulate import simulate
 from .._integrate.status import Status
 from .._integrate.trajectory import Trajectory
-from .._kane.contact import has_contacts
 from .._kane.constraint_residuals import configuration_residual, coordinate_units, projected
+from .._kane.contact import has_contacts
 from .._kane.right_hand_side import vector_field
 from .._system.system import System, packed_motion, unpacked
 
