@@ -3,8 +3,8 @@
 All of them happen at jumps. A jump has two stages:
 
 1. If contacts close, one impact with all of them and with the contacts that are closed already (`unilateral`).
-2. The contacts that neither approach nor separate get the state that their accelerations allow: the same conditions, with
-   accelerations and forces instead of velocities and impulses.
+2. The contacts that neither approach nor separate get the state that their accelerations allow: the same conditions,
+   with accelerations and forces instead of velocities and impulses.
 
 A contact rests if the rest of its bounces takes a negligible time (see `REST`). This time is added, so that the end of
 infinitely many bounces has a derivative.
@@ -32,11 +32,11 @@ from .._kane.contact import (
     terms_at,
     without_gaps,
 )
-from .._kane.right_hand_side import values_of
+from .._kane.right_hand_side import values_of, vector_field
 from .._kane.unilateral import OPEN, SLIDES, STICKS, Slip, contact_impact
 from .._scalarjit.nan import constant
 from .._scalarjit.scalar_function import ScalarFunction
-from .._system.system import System, unpacked
+from .._system.system import State, System, packed, unpacked
 
 REST = 1e-9
 """A contact rests if the rest of its bounces, 2 v / (a (1 - e)), takes less than this share of the duration."""
@@ -63,6 +63,23 @@ class ContactEvent(NamedTuple):
     def of_start(cls, touches: Array) -> ContactEvent:
         no = jnp.zeros_like(touches)
         return cls(touches, no, no, no, jnp.array(False), jnp.array(True))
+
+
+def gaps_at_start(system: System, t: Array, state: State) -> tuple[Array, Array]:
+    """Which contacts touch (c,), and whether none penetrates by more than a rounding error."""
+    gaps, sizes = gap_sizes(*constant((system, t, state.q, state.u)))
+    tolerance = float(jnp.finfo(gaps.dtype).eps) ** 0.6 * sizes
+    return jnp.abs(gaps) <= tolerance, jnp.all(gaps >= -tolerance)
+
+
+def rates_from_motion(system: System, t: Array, y: Array, inputs: dict[str, Array]) -> Array:
+    """The packed rates without those of the contact states, at a packed state without contact states."""
+    layout = layout_of(system)
+    state = unpacked(system, jnp.concatenate([y, jnp.zeros(layout.memory_size, y.dtype)]))
+    zero = jnp.zeros_like(t)
+    event = ContactEvent.of_start(gaps_at_start(system, t, state)[0])
+    found = changed_contacts(system, layout, t, packed(state), inputs, event, zero, zero, (zero, zero))
+    return vector_field(system, t, found.y, inputs)[: y.size]
 
 
 class Change(NamedTuple):
@@ -102,7 +119,8 @@ def changed_contacts(
     - `tolerances`: relative and absolute, of a step.
     """
     state = unpacked(system, y)
-    memory = ContactMemory.unpacked(layout, state.contacts)  # pyright: ignore[reportArgumentType]
+    assert state.contacts is not None
+    memory = ContactMemory.unpacked(layout, state.contacts)
     values, bearing = values_of(system, state.x, inputs), jnp.asarray(layout.is_bearing)
     before: ContactTerms = terms_at(system, t, state.q, state.u, values)
     # Closed contacts have no velocity: the error of the solver must not become an impact.
@@ -229,6 +247,7 @@ def contact_event_values(system: System, t: Array, y: Array, inputs: dict[str, A
     """The event functions of all contacts (2 c,), normal and tangential ones, and their rounding errors."""
     layout, state = layout_of(system), unpacked(system, y)
     values = values_of(system, state.x, inputs)
+    assert state.contacts is not None
     _, _, forces, terms = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
     memory = ContactMemory.unpacked(layout, state.contacts)
     functions = event_functions(layout, terms, memory, forces.forces)

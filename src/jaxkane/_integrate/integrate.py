@@ -16,9 +16,10 @@ from jaxtyping import Array
 from .._kane.api import _kinetic_energy
 from .._kane.checks import bodies_are_possible
 from .._kane.constraint_residuals import configuration_is_met, correction, has_configuration_constraints, projected
-from .._kane.contact import ContactMemory, gap_sizes, layout_of
+from .._kane.contact import ContactMemory, layout_of
 from .._kane.kanes_method import KaneEquations
 from .._kane.right_hand_side import outputs_at, outputs_in_contact, rates_are_native, values_of, vector_field
+from .._kane.unilateral import OPEN, SLIDES, STICKS
 from .._scalarjit.cache_key import captured_tracers, captures_any, jit
 from .._scalarjit.components import as_vector
 from .._scalarjit.jaxpr import LARGEST_SUM
@@ -33,9 +34,8 @@ from .._scalarjit.nan import (
 )
 from .._scalarjit.scalar_function import Packed, ScalarFunction, tree_of
 from .._system.parameters import ANY, ParameterInfo, parameters_in
-from .._kane.unilateral import OPEN, SLIDES, STICKS
 from .._system.system import State, System, names_of, packed, units_of, unpacked
-from .contact_jumps import REST, Change, ContactEvent, changed_contacts, contact_event_values
+from .contact_jumps import REST, Change, ContactEvent, changed_contacts, contact_event_values, gaps_at_start
 from .discontinuities import Discontinuities, all_end_steps, discontinuities_of, rounding
 from .events import EventPoint, Events, EventValues, event_values, events_of, moved_to_event, next_point
 from .inputs import (
@@ -101,6 +101,10 @@ def solve(
         state = State(state.q, state.u, state.x, memory)
         touches, is_apart = gaps_at_start(system, origin, state)
         others_are_valid &= is_apart
+    if layout.names and jnp.ndim(settings.atol):
+        # Contact states have no error.
+        padded = jnp.concatenate([settings.atol, jnp.ones(layout.memory_size, settings.atol.dtype)])
+        settings = dataclasses.replace(settings, atol=padded)
     valid, start, system = initial_check(system, packed(state), origin, others_are_valid)
     if fixed and discontinuities is not None:
         # Fixed steps do not end there. JAX would compute a derivative of 0 for these times, which is wrong.
@@ -155,13 +159,6 @@ class End(NamedTuple):
     y: Array
     smooth: Array
     by_event: Array
-
-
-def gaps_at_start(system: System, t: Array, state: State) -> tuple[Array, Array]:
-    """Which contacts touch (c,), and whether none penetrates by more than a rounding error."""
-    gaps, sizes = gap_sizes(*constant((system, t, state.q, state.u)))
-    tolerance = float(jnp.finfo(gaps.dtype).eps) ** 0.6 * sizes
-    return jnp.abs(gaps) <= tolerance, jnp.all(gaps >= -tolerance)
 
 
 class Problem(NamedTuple):
@@ -308,8 +305,8 @@ class Problem(NamedTuple):
         """The jump of an event, from a time and a packed state near it."""
         point = self.event_point(t, y, None, event, reach, jnp.array(True))
         after, none = point.y, float(Status.COMPLETED)
-        if any(n for n, contact in zip(self.events.stages, self._contacts_of_events(), strict=True) if not contact):
-            after = state_after(self.args.system, self.args.clock(point.t), point.y, event, stages_of(self.events))
+        if any((which := stages_of(self.events)).stages):
+            after = state_after(self.args.system, self.args.clock(point.t), point.y, event, which)
         is_possible = jnp.all(jnp.isfinite(after))
         if self.constrained:
             q = unpacked(self.system, jnp.where(is_possible, after, point.y)).q
@@ -319,9 +316,6 @@ class Problem(NamedTuple):
             jump = self.contact_jump(jump._replace(after=jnp.where(is_possible, after, point.y)), event, reach)
         status = jnp.where(is_possible, jump.status, float(Status.IMPOSSIBLE_JUMP))
         return jump._replace(status=constant(jnp.where(jump.status == none, status, jump.status)))
-
-    def _contacts_of_events(self) -> tuple[Any, ...]:
-        return self.events.contacts or (None,) * len(self.events.names)
 
     def contact_jump(self, jump: Jump, event: Array, reach: Array) -> Jump:
         """The same with the impact and the new states of the contacts."""
@@ -353,7 +347,7 @@ class Problem(NamedTuple):
     def _changed_contacts(self, t: Array, y: Array, what: ContactEvent, reach: Array) -> Change:
         args, system, settings = dataclasses.replace(self.args, within=None), self.system, self.settings
         inputs = args.inputs(tree_of(args.system), t, unpacked(system, y))
-        tolerances = jnp.asarray(settings.rtol, y.dtype), jnp.asarray(settings.atol, y.dtype)
+        tolerances = jnp.asarray(settings.rtol, y.dtype), jnp.max(jnp.asarray(settings.atol, y.dtype))
         rest = REST * self.taus[-1]
         return changed_contacts(
             tree_of(args.system), self.events.layout, args.clock(t), y, inputs, what, reach, rest, tolerances

@@ -28,8 +28,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
+from .._scalarjit.cache import Cache
+from .._scalarjit.compat import depends_on
 from .._scalarjit.components import (
     Component,
     add,
@@ -46,7 +48,7 @@ from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
 from .._system.system import System
 from .arguments import Row, is_concrete, is_one_number
-from .description import dtype_of, jvp
+from .description import dtype_of, jvp, structure_of
 from .impact import checked_restitution, inverse_root, least_norm
 from .kanes_method import KaneEquations, unit
 from .scaling import term_sizes
@@ -170,7 +172,8 @@ class ContactLayout(NamedTuple):
     - `is_bearing` (c,): whether it is a `DryFriction`.
     - `in_space`: whether the slip has two components.
     - `planes` (c,): the axis of N along which no point of the contact moves, or None.
-    - `has_both` (c,): whether a contact has a point and a gap of its own.
+    - `has_point` (c,): whether a contact has a point.
+    - `reads_time`: whether any contact uses the time.
     """
 
     names: tuple[str, ...]
@@ -178,7 +181,8 @@ class ContactLayout(NamedTuple):
     is_bearing: tuple[bool, ...]
     in_space: bool
     planes: tuple[int | None, ...]
-    has_both: tuple[bool, ...]
+    has_point: tuple[bool, ...]
+    reads_time: bool = False
 
     @property
     def d(self) -> int:
@@ -208,10 +212,12 @@ def layout_of(system: System) -> ContactLayout:
         return NO_CONTACTS
     found: list[ContactLayout] = []
 
-    def trace(t: Array, q: Array, u: Array) -> Array:
+    def trace(t: Array, q: Array, u: Array) -> Any:
         kane = KaneEquations(system, t, q, u)
         found.append(_traced_layout(kane))
-        return t
+        rows = ContactRows(kane, found[-1])
+        laws = [_laws(x) for x in _contacts(kane, kane.t, kane.q, kane.u_all)[1].values()]
+        return rows.velocities(kane.t, kane.q, kane.u_all), rows.gaps(kane.t, kane.q, kane.u_all), laws
 
     if not is_written_out(len(system.speeds)):
         raise ValueError(
@@ -220,8 +226,8 @@ def layout_of(system: System) -> ContactLayout:
         )
     dtype = dtype_of(system)
     q, u = (jnp.zeros(len(names), dtype) for names in (system.coordinates, system.speeds))
-    jax.eval_shape(trace, jnp.zeros((), dtype), q, u)
-    return found[0]
+    program = jax.make_jaxpr(trace)(jnp.zeros((), dtype), q, u)
+    return found[0]._replace(reads_time=bool(any(depends_on(program, [0]))))
 
 
 def _contacts(kane: KaneEquations, t: Component, q: Row, u: Row) -> tuple[Motion, dict[str, Any]]:
@@ -249,8 +255,8 @@ def _traced_layout(kane: KaneEquations) -> ContactLayout:
     frictions = [b or not _is_zero(x.friction) for b, x in zip(bearings, contacts.values(), strict=True)]
     planes = [_plane(x, motion.N) if isinstance(x, Contact) and x.point is not None else 2 for x in contacts.values()]
     in_space = any(f and p is None for f, p in zip(frictions, planes, strict=True))
-    both = [isinstance(x, Contact) and x.point is not None and x.gap is not None for x in contacts.values()]
-    return ContactLayout(tuple(contacts), tuple(frictions), tuple(bearings), in_space, tuple(planes), tuple(both))
+    points = [isinstance(x, Contact) and x.point is not None for x in contacts.values()]
+    return ContactLayout(tuple(contacts), tuple(frictions), tuple(bearings), in_space, tuple(planes), tuple(points))
 
 
 def _is_zero(x: Any) -> bool:
@@ -453,6 +459,58 @@ def _laws(contact: Any) -> tuple[Component, Component, Component]:
     return component(contact.restitution), component(contact.friction), component(contact.static)
 
 
+def speeds_in_contact(system: System, t: Component, q: Array, u: Array, touching: Sequence[str]) -> Array:
+    """The nearest speeds (n,), in the metric of M, for which the `touching` contacts neither approach nor separate."""
+    layout = layout_of(system)
+    states = jnp.asarray([SLIDES if name in touching else OPEN for name in layout.names], q.dtype)
+    memory = ContactMemory(states, jnp.zeros((len(states), layout.memory_size // len(states) - 1), q.dtype))
+    return projected_speeds(layout, terms_at(system, t, q, u, {}), memory, u)
+
+
+@ScalarFunction
+def _gap_rates_and_velocities(system: System, t: Component, q: Array, u: Array) -> tuple[Array, Array]:
+    kane, layout = KaneEquations(system, t, q, u), layout_of(system)
+    rows = ContactRows(kane, layout)
+    rates = rows.gap_rates(kane.t, kane.q, kane.u_all)
+    return as_vector(rates, q), as_vector([row[0] for row in rows.velocities(kane.t, kane.q, kane.u_all)], q)
+
+
+_CHECKED = Cache()  # structures
+
+
+def check_contacts(system: System, t: Component, q: Array) -> None:
+    """Raise `ValueError` if the rate of a gap is not the normal velocity of its point, or if bodies penetrate.
+
+    The rates are compared once for each structure, at speeds of size 1.
+    """
+    layout = layout_of(system)
+    if not layout.names or not is_concrete(system, t, q):
+        return
+    t, u = np.asarray(t, q.dtype), np.random.default_rng(0).uniform(0.5, 1.5, len(system.speeds)).astype(q.dtype)
+    label = f"{type(system).__name__}.contacts"
+
+    def compare() -> bool:
+        rates, velocities = _gap_rates_and_velocities.numpy(system, t, np.asarray(q), u)
+        size = np.abs(rates) + np.abs(velocities) + np.finfo(q.dtype).tiny
+        for name, i in ((name, i) for i, name in enumerate(layout.names) if layout.has_point[i]):
+            if abs(rates[i] - velocities[i]) > 1e3 * float(np.finfo(q.dtype).eps) ** 0.75 * size[i]:
+                raise ValueError(
+                    f"{label}: the gap of {name!r} changes by {rates[i]:.6g}, but the velocity of its point along the "
+                    f"normal is {velocities[i]:.6g} (at speeds of size 1). Pass the point of the body that touches, "
+                    "with the velocity of its material, and the gap of this point."
+                )
+        return True
+
+    _CHECKED.get(structure_of(system), compare)
+    gaps, sizes = gap_sizes.numpy(system, t, np.asarray(q), np.zeros_like(u))
+    for name, gap, size in zip(layout.names, gaps, sizes, strict=True):
+        if gap < -(float(np.finfo(q.dtype).eps) ** 0.6) * size:
+            raise ValueError(
+                f"{label}: the gap of {name!r} is {gap:.6g} at the start. It must not be negative. Find touching "
+                f"coordinates with jaxkane.assemble(system, q, touching=({name!r},))."
+            )
+
+
 class ContactMemory(NamedTuple):
     """The contact states: `states` (c,) as floats, and `directions` (c, k) of the slip at its start.
 
@@ -504,7 +562,7 @@ def solve_forces(layout: ContactLayout, terms: ContactTerms, memory: ContactMemo
     c, r = terms.v.shape
     is_bearing = jnp.asarray(layout.is_bearing)
     closed = (memory.states >= SLIDES) & ~is_bearing
-    sticks, slides = (memory.states == x for x in (STICKS, SLIDES))
+    slides = memory.states == SLIDES
     active = _active_rows(layout, memory)
     dirs, B, w = slip_directions(layout, terms, memory), terms.B, terms.w
     if layout.d:
@@ -522,7 +580,7 @@ def solve_forces(layout: ContactLayout, terms: ContactTerms, memory: ContactMemo
     mask = active.reshape(-1)
     A = jnp.where(mask[:, None] & mask[None], (B @ B.T) @ W, 0.0)
     z = least_norm(A, jnp.where(mask, -(B @ w + terms.b), 0.0))[0]
-    forces = W @ z
+    forces = jnp.asarray(W) @ z
     u_dot = terms.X @ (w + B.T @ forces)
     return ContactForces((forces + known).reshape(c, r), u_dot)
 

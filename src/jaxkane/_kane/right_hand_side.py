@@ -202,6 +202,7 @@ def outputs_in_contact(
 @ScalarFunction
 def _contact_forces(system, t, y, values):
     state, layout = unpacked(system, y), layout_of(system)
+    assert state.contacts is not None
     _, u, (forces, u_dot), _ = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
     named = {}
     for i, (name, has_friction, is_bearing) in enumerate(zip(*layout[:3], strict=True)):
@@ -329,6 +330,7 @@ def _vector_field(system, t, y, inputs):
 def _rates_in_contact(system: System, t: Component, y: Array, values: dict[str, Any]) -> Array:
     """The packed rates of a state with contact states, whose rates are zero."""
     state, layout = unpacked(system, y), layout_of(system)
+    assert state.contacts is not None
     kane, _, forces, _ = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
     x_dot = None
     if system.states:

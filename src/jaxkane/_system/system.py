@@ -272,6 +272,11 @@ def packed(state: State) -> Float[Array, "*batch n"]:
     return jnp.concatenate([part for part in parts if part is not None], axis=-1)
 
 
+def packed_motion(state: State) -> Float[Array, "*batch n"]:
+    """`packed` without the contact states, which follow from the motion."""
+    return packed(State(state.q, state.u, state.x))
+
+
 def unpacked(system: System, y: Float[Array, "*batch n"]) -> State:
     """The inverse of `packed`."""
     n_q = len(system.coordinates)
