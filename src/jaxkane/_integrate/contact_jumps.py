@@ -165,8 +165,9 @@ def changed_contacts(
 
 
 def _negligible(terms: ContactTerms) -> Array:
-    """Velocities (c, r) that are rounding errors."""
-    return 1e3 * float(jnp.finfo(terms.v.dtype).eps) * terms.size
+    """Velocities (c, r) that are rounding errors. All velocities of a contact have the size of the largest."""
+    size = jnp.max(terms.size, axis=1, keepdims=True)
+    return 1e3 * float(jnp.finfo(terms.v.dtype).eps) * jnp.broadcast_to(size, terms.size.shape)
 
 
 def _rest_of_bounces(terms: ContactTerms, strikes: Array) -> Array:

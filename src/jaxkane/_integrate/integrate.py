@@ -311,7 +311,12 @@ class Problem(NamedTuple):
         if self.constrained:
             q = unpacked(self.system, jnp.where(is_possible, after, point.y)).q
             is_possible &= configuration_is_met(self.system, self.args.clock(point.t), q)
-        jump = Jump(point.t, point.y, after, point.smooth.astype(y.dtype), y[:0], jnp.zeros_like(event))
+        smooth = point.smooth
+        if self.discontinuities is not None:
+            # An event function that jumps across zero with an input vanishes nowhere: its time is that of the input.
+            apart = jnp.abs(constant(point.t) - constant(self.discontinuities.times))
+            smooth |= jnp.any(apart <= 2 * reach)
+        jump = Jump(point.t, point.y, after, smooth.astype(y.dtype), y[:0], jnp.zeros_like(event))
         if self.events.layout.names:
             jump = self.contact_jump(jump._replace(after=jnp.where(is_possible, after, point.y)), event, reach)
         status = jnp.where(is_possible, jump.status, float(Status.IMPOSSIBLE_JUMP))
