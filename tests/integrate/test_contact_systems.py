@@ -1,0 +1,341 @@
+"""Contacts of several bodies, of a block with two corners, in space, and of mechanisms with loops."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mechanisms import Backlash, KerbWheel, TwoCornerBlock
+
+import jaxkane as jk
+
+TIGHT = {"rtol": 1e-12, "atol": 1e-12}
+OPEN, SLIDES, STICKS = 0, 1, 2
+
+
+def end_of(ride):
+    return np.concatenate([ride.end.q, ride.end.u])
+
+
+def jumps_of(ride):
+    """The times of the jumps that exist."""
+    return np.asarray(ride.jumps.t)[: int(ride.jumps.count)]
+
+
+# -- A block with two corners.
+def tilted(angle, width=0.4, height=1.2, **speeds):
+    """A block that stands on one corner. A positive angle lifts the right corner."""
+    side = np.sign(angle) * width / 2
+    y = side * np.sin(angle) + height / 2 * np.cos(angle)
+    return jk.State({"x": -height / 2 * np.sin(angle) + side * np.cos(angle) - side, "y": y, "angle": angle}, speeds)
+
+
+def test_a_rocking_block_changes_its_corner():
+    # Quadrature; the energy ratio of an impact is r^2 with r = 1 - 3/2 sin^2(alpha).
+    atol = 1e-10
+    ride = jk.simulate(TwoCornerBlock(friction=2.0), tilted(0.25), jnp.linspace(0, 2.2, 21), **TIGHT)
+    np.testing.assert_allclose(jumps_of(ride), [0.6402887800202485, 1.338581180728541, 1.8563203472495828], atol=atol)
+    np.testing.assert_allclose(
+        ride.jumps.after.u[:3, 2], [-0.9051977448109763, 0.7694180830893298, -0.6540053706259303], atol=atol
+    )
+    state = [0.021247441986547815, 0.6066692039354292, -0.03521304161358452, -0.25908375349019, -0.07633795052670474]
+    np.testing.assert_allclose(end_of(ride), [*state, 0.4270593460316235], atol=atol)
+    energies = 0.5 * jnp.sum(ride.jumps.before.u[:3] ** 2 * jnp.array([[1.0, 1.0, 1.6 / 12]]), axis=1)
+    np.testing.assert_allclose(ride.jumps.energy[:3] / energies, 1 - 0.85**2, rtol=1e-9)
+    left = np.searchsorted(jumps_of(ride), ride.t) % 2 == 0
+    np.testing.assert_array_equal(ride.contacts["left"], np.where(left, STICKS, OPEN))
+    np.testing.assert_array_equal(ride.contacts["right"], np.where(left, OPEN, STICKS))
+
+
+def test_both_corners_of_a_wide_block_stick():
+    """It falls on its whole base and stays there. Its Delassus matrix is singular: four rows, three speeds."""
+    wide = TwoCornerBlock(width=1.2, height=0.6, friction=2.0)
+    ride = jk.simulate(wide, tilted(0.1, 1.2, 0.6), jnp.linspace(0, 100, 21), **TIGHT)
+    assert ride.ok
+    assert int(ride.jumps.count) == 1
+    for name in ("left", "right"):
+        np.testing.assert_array_equal(ride.contacts[name][1:], STICKS)
+        # 100 s at rest: the block does not sink, and both corners carry half of its weight.
+        np.testing.assert_allclose(ride[f"{name}.normal"][1:], 9.81 / 2, rtol=1e-10)
+    np.testing.assert_allclose(ride["y"][1:], 0.3, atol=1e-12)
+    np.testing.assert_allclose([ride["x"][1:] - ride["x"][1], ride["angle"][1:]], 0.0, atol=1e-12)
+
+
+def test_a_block_slides_on_both_corners():
+    block = TwoCornerBlock(friction=0.2)
+    ride = jk.simulate(block, jk.State({"y": 0.6}, {"x_dot": 1.0}), jnp.linspace(0, 2, 21), **TIGHT)
+    stops = 1 / (0.2 * 9.81)
+    np.testing.assert_allclose(jumps_of(ride), [stops], atol=1e-10)
+    np.testing.assert_allclose(end_of(ride), [stops / 2, 0.6, 0, 0, 0, 0], atol=1e-10)
+    # Moments about the mass centre: (N_left - N_right) b = mu m g h
+    slides = np.asarray(ride.t) < stops
+    difference = np.where(slides, 0.2 * 9.81 * 1.2 / 0.4, 0.0)
+    np.testing.assert_allclose((ride["right.normal"] - ride["left.normal"])[slides], difference[slides], rtol=1e-9)
+    np.testing.assert_allclose(ride["left.normal"] + ride["right.normal"], 9.81, rtol=1e-10)
+
+
+# -- Balls in a row (exact fractions).
+class BallsInARow(jk.System):
+    restitution: jk.Scalar = jk.parameter(0.9)
+    coordinates = ("a", "b", "c", "d", "e")
+    speeds = ("a_dot", "b_dot", "c_dot", "d_dot", "e_dot")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(0.8**i, 0.0, O.moving(q[i] * N.x, u[i] * N.x), name=f"ball {i}") for i in range(5)])
+
+    def contacts(self, t, q, u, motion):
+        return {f"{i} and {i + 1}": jk.Contact(gap=q[i + 1] - q[i], restitution=self.restitution) for i in range(4)}
+
+
+@pytest.mark.slow
+def test_balls_strike_one_after_another_or_at_once():
+    atol = 1e-12
+    start = jk.State({"b": 1.0, "c": 2.0, "d": 3 + 1 / 7, "e": 4.0}, {"a_dot": 1.0})
+    ride = jk.simulate(BallsInARow(), start, jnp.linspace(0, 5, 21), **TIGHT)
+    np.testing.assert_allclose(jumps_of(ride), [1.0, 37 / 19, 7513 / 2527, 177739 / 48013], atol=atol)
+    np.testing.assert_allclose(
+        ride.end.u, [7 / 45, 133 / 810, 2527 / 14580, 48013 / 262440, 130321 / 104976], atol=atol
+    )
+    # Three balls that touch: one impact of both contacts, with v = (1, 0, 0) and masses 1, 4/5, 16/25.
+    touching = jk.State(jnp.array([0.0, 1.0, 1.0, 5.0, 9.0]), jnp.eye(5)[0])
+    ride = jk.simulate(BallsInARow(1.0), touching, jnp.linspace(0, 2, 21), **TIGHT)
+    rest = 2 / (1 + 1.44)
+    np.testing.assert_allclose(ride.end.u, [rest - 1, rest, rest, 0, 0], atol=atol)
+    assert int(ride.jumps.count) == 1
+    # Gaps that differ by 1e-13: two events at almost the same time.
+    ride = jk.simulate(
+        BallsInARow(1.0), jk.State(touching.q.at[2].add(1e-13), touching.u), jnp.linspace(0, 2, 21), **TIGHT
+    )
+    assert ride.ok
+    energy = 0.5 * jnp.sum(ride.end.u**2 * 0.8 ** jnp.arange(5.0))
+    np.testing.assert_allclose(energy, 0.5, rtol=1e-12)
+    np.testing.assert_allclose(jnp.sum(ride.end.u * 0.8 ** jnp.arange(5.0)), 1.0, rtol=1e-12)
+
+
+# -- In space.
+class Particle(jk.System):
+    """A particle over a plane through O, whose normal is N.z. Gravity has a component along N.x."""
+
+    friction: jk.Scalar = jk.parameter(0.5)
+    restitution: jk.Scalar = jk.parameter(0.5)
+    slope: jk.Scalar = jk.parameter(0.0, unit="rad")
+    coordinates, speeds = ("x", "y", "z"), ("vx", "vy", "vz")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(N.vector(*q), N.vector(*u))
+        return jk.Motion([jk.Body(1.0, 0.0, P, name="particle")], points={"P": P})
+
+    def loads(self, t, q, u, motion, inputs):
+        N = motion.N
+        return jk.weight(motion, 9.81 * (jnp.sin(self.slope) * N.x - jnp.cos(self.slope) * N.z))
+
+    def contacts(self, t, q, u, motion):
+        law = {"restitution": self.restitution, "friction": self.friction}
+        return {"plane": jk.Contact(motion["P"], motion.N.z, **law)}
+
+
+def test_a_particle_on_a_slope_changes_the_direction_of_its_slip():
+    """For mu = tan(slope), |v| + v_x is constant: the particle that started sideways ends with half of its speed."""
+    rtol = 1e-10
+    ts = jnp.linspace(0, 3, 21)
+    ride = jk.simulate(Particle(0.5, 0.5, np.arctan(0.5)), jk.State({}, {"vy": 2.0}), ts, **TIGHT)
+    speed = np.hypot(ride["vx"], ride["vy"])
+    np.testing.assert_allclose(speed + ride["vx"], 2.0, rtol=rtol)
+    assert float(ride["vx"][-1]) > 0.99 * 1.0
+    np.testing.assert_array_equal(ride.contacts["plane"], SLIDES)
+    np.testing.assert_allclose(ride["plane.normal"], 9.81 * np.cos(np.arctan(0.5)), rtol=rtol)
+
+
+def test_a_particle_bounces_and_stops_in_space():
+    """Impulses of friction mu L_N along the slip, then friction mu m g until it stops; all along one line."""
+    atol = 1e-9
+    ride = jk.simulate(
+        Particle(0.1, 0.5), jk.State({"z": 1.0}, {"vx": 1.2, "vy": 1.6}), jnp.linspace(0, 3, 21), **TIGHT
+    )
+    # The figures of a particle with vx = 2 in a plane
+    np.testing.assert_allclose(jumps_of(ride)[-1], 1.3545709229571927 + 0.6841650607329194, atol=atol)
+    np.testing.assert_allclose(end_of(ride)[:3], [0.6 * 2.138735983690112, 0.8 * 2.138735983690112, 0.0], atol=atol)
+    np.testing.assert_array_equal(ride.end.u, 0.0)
+    np.testing.assert_array_equal(ride.contacts["plane"], np.repeat([OPEN, SLIDES, STICKS], [10, 4, 7]))
+
+
+class Billiard(jk.System):
+    """A ball of 1 kg on a table. Its attitude has Euler parameters."""
+
+    radius: jk.Scalar = jk.parameter(0.1, unit="m")
+    friction: jk.Scalar = jk.parameter(0.2)
+    coordinates, speeds = ("x", "y", "z", "e1", "e2", "e3", "e4"), ("vx", "vy", "vz", "wx", "wy", "wz")
+    dependent_coordinates = ("e4",)
+
+    def configuration_constraints(self, t, q):
+        return [sum(e**2 for e in q["e1":"e4"]) - 1.0]
+
+    def q_dot(self, t, q, u):
+        N, _ = jk.inertial()
+        B = N.rotate_euler(q["e1":"e4"], N.vector(*u["wx":"wz"]), "B")
+        w = B.angular_velocity.components_in(B)
+        return (*u["vx":"vz"], *jk.rotations.euler_parameter_rates(q["e1":"e4"], w))
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate_euler(q["e1":"e4"], N.vector(*u["wx":"wz"]), "B")
+        C = O.moving(N.vector(*q["x":"z"]), N.vector(*u["vx":"vz"]))
+        I = 0.4 * self.radius**2
+        return jk.Motion([jk.Body(1.0, (I, I, I), C, B, name="ball")], points={"C": C}, frames={"B": B})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.z)
+
+    def contacts(self, t, q, u, motion):
+        bottom = motion["C"].fixed(-self.radius * motion.N.z, motion["B"])
+        return {"table": jk.Contact(bottom, motion.N.z, friction=self.friction)}
+
+
+@pytest.mark.slow
+def test_a_billiard_ball_with_side_spin():
+    """The slip keeps its direction e and vanishes after 2 s0 / (7 mu g): v = v0 - (2/7) s0 e."""
+    atol = 1e-9
+    start = jk.State({"z": 0.1, "e4": 1.0}, {"vx": 2.0, "vy": 0.5, "wx": 30.0, "wy": -12.0, "wz": 8.0})
+    ride = jk.simulate(Billiard(), start, jnp.linspace(0, 1, 21), **TIGHT)
+    # v + w x (-r N.z) = (vx - r wy, vy + r wx)
+    v0, s0 = np.array([2.0, 0.5]), np.array([2.0 + 0.1 * 12.0, 0.5 + 0.1 * 30.0])
+    t = 2 * np.linalg.norm(s0) / (7 * 0.2 * 9.81)
+    v = v0 - 2 / 7 * s0
+    np.testing.assert_allclose(jumps_of(ride), [t], atol=atol)
+    np.testing.assert_allclose(ride.end.u, [*v, 0.0, -v[1] / 0.1, v[0] / 0.1, 8.0], atol=atol)
+    np.testing.assert_allclose(ride.end.q[:3], [*((v0 + v) / 2 * t + v * (1 - t)), 0.1], atol=atol)
+    np.testing.assert_array_equal(ride.contacts["table"], np.where(ride.t < t, SLIDES, STICKS))
+
+
+@pytest.mark.slow
+def test_a_wheel_strikes_a_kerb():
+    """It rolls, and its angular momentum about the edge is that before: the ratio of the rates has a closed form."""
+    atol, R, h = 1e-9, 0.35, 0.08
+    start = jk.State({"x": -0.6, "z": R}, {"x_dot": 4.5 * R, "spin_rate": 4.5})
+    ride = jk.simulate(KerbWheel(), start, jnp.linspace(0, 0.4, 21), **TIGHT)
+    t = (0.6 - np.sqrt(R**2 - (R - h) ** 2)) / (4.5 * R)
+    about_edge = 0.18 + 1.5 * R**2
+    after = 4.5 * (0.18 + 1.5 * R * (R - h)) / about_edge
+    np.testing.assert_allclose(ride.jumps.t[0], t, atol=atol)
+    np.testing.assert_allclose(ride.jumps.after.u[0, 2], after, atol=atol)
+    np.testing.assert_allclose(ride.jumps.energy[0], 0.5 * about_edge * (4.5**2 - after**2), rtol=1e-9)
+    np.testing.assert_array_equal(ride.contacts["road"], np.where(ride.t < t, STICKS, OPEN))
+    # On the kerb it turns about the edge, with constant energy.
+    on_edge = np.asarray(ride.contacts["kerb"]) == STICKS
+    assert on_edge.any()
+    energy = 0.5 * about_edge * ride["spin_rate"] ** 2 + 1.5 * 9.81 * (ride["z"] - R)
+    np.testing.assert_allclose(energy[on_edge], 0.5 * about_edge * after**2, rtol=1e-9)
+
+
+# -- Stops and loops.
+@pytest.mark.slow
+def test_a_gear_with_backlash():
+    """The play is not exceeded, and the angular momentum is the integral of the torque."""
+    torque = {"torque": lambda t, state: 0.01 * jnp.sin(6.0 * t)}
+    ride = jk.simulate(Backlash(), jk.State({}, {}), jnp.linspace(0, 2, 41), torque, **TIGHT, max_jumps=200)
+    assert ride.ok
+    lead = np.asarray(ride["motor"] - ride["load"])
+    assert np.abs(lead).max() < 0.01 + 1e-12
+    momentum = 1e-3 * ride["motor_rate"] + 5e-3 * ride["load_rate"]
+    np.testing.assert_allclose(momentum, 0.01 * (1 - np.cos(6 * ride.t)) / 6, atol=1e-12)
+    closed = np.asarray(ride.contacts["drive"]) > OPEN
+    assert closed.any()
+    np.testing.assert_allclose(lead[closed], 0.01, atol=1e-12)
+
+
+class SliderInGuides(jk.System):
+    """A slider crank whose slider has four corners between two guides (Flores and Glocker)."""
+
+    coordinates, speeds = ("crank", "rod", "slider"), ("crank_rate", "rod_rate", "slider_rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A, B, S = (N.rotate(3, x, rate) for x, rate in zip(q, u, strict=True))
+        pin = O.fixed(0.153 * A.x)
+        P = pin.fixed(0.306 * B.x)
+        crank = jk.Body(0.038, (0.0, 0.0, 7.4e-5), O.fixed(0.0765 * A.x), A, name="crank")
+        rod = jk.Body(0.038, (0.0, 0.0, 5.9e-4), pin.fixed(0.153 * B.x), B, name="rod")
+        places = itertools.product((0.025, -0.025), (-0.05, 0.05))
+        corners = {f"corner {i}": P.fixed(x * S.x + y * S.y) for i, (y, x) in enumerate(places)}
+        return jk.Motion([crank, rod, jk.Body(0.076, (0.0, 0.0, 2.7e-6), P, S, name="slider")], points=corners)
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def contacts(self, t, q, u, motion):
+        law, N = {"restitution": 0.4, "friction": 0.01}, motion.N
+        sides = {f"corner {i}": (-1.0 if i < 2 else 1.0) * N.y for i in range(4)}
+        return {
+            name: jk.Contact(motion[name], side, gap=0.026 + motion[name].position.dot(side), **law)
+            for name, side in sides.items()
+        }
+
+
+@pytest.mark.slow
+def test_a_slider_in_guides_with_clearance():
+    # Integration in extended precision: 23 impacts of two corners, then both slide, then they lift off.
+    ride = jk.simulate(
+        SliderInGuides(), jk.State({}, {"crank_rate": 150.0, "rod_rate": -75.0}), jnp.linspace(0, 0.024, 21), **TIGHT
+    )
+    times = [0.002692502752021212, 0.005612363190210417, 0.00747505621239663, 0.008421767934249298]
+    np.testing.assert_allclose(ride.jumps.t[:4], times, atol=1e-11)
+    normal = ride.jumps.impulses[:2, ::2]
+    np.testing.assert_allclose(normal[0], [0.05574032307375234, 0.055185692993416496, 0, 0], rtol=1e-9)
+    np.testing.assert_allclose(normal[1], [0.01667721707019048, 0.016511274611780626, 0, 0], rtol=1e-9)
+    # The two corners slide on the upper guide from 9.15 ms to 15.03 ms.
+    np.testing.assert_array_equal(ride.contacts["corner 0"], np.repeat([OPEN, SLIDES, OPEN], [8, 5, 8]))
+    np.testing.assert_array_equal(ride.contacts["corner 3"], OPEN)
+    np.testing.assert_allclose(jumps_of(ride)[-1], 0.015028651748459592, atol=1e-9)
+    state = [1.9234696776339004, -0.4885840511083045, 0.0, 84.84423130850142, 15.15940314237841, 0.0]
+    np.testing.assert_allclose(end_of(ride), state, rtol=1e-8, atol=1e-8)
+
+
+class StruckSliderCrank(jk.System):
+    """A crank, a rod and a slider on y = 0, closed by configuration constraints. A wall stops the slider."""
+
+    wall: jk.Scalar = jk.parameter(unit="m")
+    coordinates, speeds = ("crank", "rod", "x"), ("crank_rate",)
+    dependent_coordinates, dependent_speeds = ("rod", "x"), ("rod_rate", "x_dot")
+
+    def configuration_constraints(self, t, q):
+        y = 0.15 * jnp.sin(q["crank"]) + 0.4 * jnp.sin(q["rod"])
+        return 0.15 * jnp.cos(q["crank"]) + 0.4 * jnp.cos(q["rod"]) - q["x"], y
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["crank"], u["crank_rate"], "A")
+        B = N.rotate(3, q["rod"], u["rod_rate"], "B")
+        pin = O.fixed(0.15 * A.x)
+        slider = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+        crank = jk.Body(0.6, (0.0, 0.0, 0.6 * 0.15**2 / 12), O.fixed(0.075 * A.x), A, name="crank")
+        rod = jk.Body(0.9, (0.0, 0.0, 0.9 * 0.4**2 / 12), pin.fixed(0.2 * B.x), B, name="rod")
+        return jk.Motion([crank, rod, jk.Body(0.5, 0.0, slider, name="slider")])
+
+    def contacts(self, t, q, u, motion):
+        return {"wall": jk.Contact(gap=q["x"] - self.wall, restitution=0.4)}
+
+
+@pytest.mark.slow
+def test_a_struck_slider_crank_stays_closed():
+    # The wall is where the slider is for a crank angle of 0.9 rad. Without loads, the kinetic energy is constant.
+    atol = 1e-9
+    rod = -np.arcsin(0.15 * np.sin(0.9) / 0.4)
+    wall = 0.15 * np.cos(0.9) + 0.4 * np.cos(rod)
+    system = StruckSliderCrank(wall)
+    before = jk.assemble(system, {"crank": 0.9, "rod": -0.3, "x": 0.5}, {"crank_rate": 12.0})
+    ride = jk.simulate(system, before, jnp.linspace(0, 0.05, 21), **TIGHT)
+    assert ride.ok
+    np.testing.assert_allclose(ride.jumps.t[0], 0.0, atol=1e-9)
+    np.testing.assert_allclose(ride.jumps.after.u[0], [-4.8], atol=1e-7)
+    np.testing.assert_allclose(ride.jumps.impulses[0], [3.8496550548882733], atol=1e-7)
+    x = 0.15 * np.cos(ride["crank"]) + 0.4 * np.cos(ride["rod"])
+    np.testing.assert_allclose(ride["x"], x, atol=atol)
+    from_far = jk.assemble(system, {"crank": 0.8, "rod": -0.3, "x": 0.5}, {"crank_rate": 12.0})
+    ride = jk.simulate(system, from_far, jnp.linspace(0, 0.05, 21), **TIGHT)
+    np.testing.assert_allclose(ride.jumps.before.q[0], before.q, atol=atol)
+    np.testing.assert_allclose(ride.jumps.after.u[0], -0.4 * ride.jumps.before.u[0], rtol=1e-10)
+    lost = 0.5 * 0.03349030561689822 * (1 - 0.4**2) * ride.jumps.before.u[0, 0] ** 2
+    np.testing.assert_allclose(ride.jumps.energy[0], lost, rtol=1e-8)
