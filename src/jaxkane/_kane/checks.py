@@ -62,6 +62,8 @@ def check_system(system: System, t: Component, q: Numbers, *, bodies: bool = Tru
     """
     if in_batches(system):
         return
+    if hasattr(system, "multiplier_residuals"):
+        system = getattr(system, "inner")  # noqa: B009  # its constraints belong to its dependent speeds
     system, t, q = without_derivatives((system, t, q))
     # Use one type for t: a Python number and an array would be compiled as two programs.
     t = t if isinstance(t, Tracer) else np.asarray(t, jnp.result_type(float) if q is None else q.dtype)

@@ -32,7 +32,7 @@ from .constraint_residuals import (
     scales_by_unit,
     violations,
 )
-from .contact import ContactRows, layout_of, speeds_in_contact
+from .contact import ContactRows, has_multipliers, layout_of, speeds_in_contact
 from .description import at_random_point, structure_of
 from .kanes_method import KaneEquations
 from .scaling import SMALLEST_SIZE
@@ -390,7 +390,7 @@ def assemble(
         if bad:
             raise ValueError(f"{name}: {', '.join(bad)} is not finite.")
     q0 = _solve_configuration(with_touching(system, touching) if touching else system, q0, t, problem)
-    if touching:
+    if touching or has_multipliers(system):
         u0 = speeds_in_contact(system, jnp.asarray(t, q0.dtype), q0, u0, touching)
     if is_concrete(system, q0, u0, t):
         check_system(system, t, q0)
