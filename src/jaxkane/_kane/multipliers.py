@@ -18,7 +18,7 @@ from .._system.motion import Motion
 from .._system.system import System, has_outputs
 from .arguments import Row, check_is_system
 from .contact import has_contacts, has_multipliers
-from .description import DescriptionEvaluator
+from .description import DescriptionEvaluator, jvp
 
 
 class _WithMultipliers(System):
@@ -53,7 +53,12 @@ class _WithMultipliers(System):
         return self.inner.events(t, q, u)
 
     def multiplier_residuals(self, t: Any, q: Row, u: Row) -> Row:
-        return DescriptionEvaluator(self.inner).residuals(t, tuple(q), tuple(u))
+        evaluator, q, u = DescriptionEvaluator(self.inner), tuple(q), tuple(u)
+        c = evaluator.read("velocity_residuals", t, q, u)
+        if self.inner.dependent_speeds and len(c) >= len(self.inner.dependent_speeds):
+            return c  # the configuration constraints, if any, are integrals of these residuals
+        rates = evaluator.rates(t, q, u)
+        return (*c, *jvp(lambda t, *q: evaluator.configuration(t, q), (t, *q), (1.0, *rates))[1])
 
 
 for _name in ("coordinates", "dependent_coordinates", "inputs", "states", "units", "check_inertia"):
@@ -81,19 +86,18 @@ def with_multipliers(system: System) -> System:
 
     **Arguments:**
 
-    - `system`: the system, with at most 12 independent and dependent speeds and without auxiliary speeds.
+    - `system`: the system, with at most 12 independent and dependent speeds and without auxiliary speeds. It may have
+        more constraints than dependent speeds, or no dependent speeds at all.
 
     **Returns:** a system for `assemble`, `simulate` and `sweep`. Its parameters are those of `.inner`. `State.u` also
     contains the dependent speeds. The speeds of a simulation are projected onto the constraints.
 
-    **Raises:** `ValueError` for a system without dependent speeds or with auxiliary speeds.
+    **Raises:** `ValueError` for a system with auxiliary speeds.
     """
     check_is_system(system)
     name = type(system).__name__
     if has_multipliers(system):
         return system
-    if not system.dependent_speeds:
-        raise ValueError(f"with_multipliers({name}): the system has no dependent speeds, so it needs no multipliers.")
     if system.auxiliary_speeds:
         raise ValueError(f"with_multipliers({name}): auxiliary speeds are not supported. Remove them.")
     return _class_of(type(system), has_outputs(system), has_contacts(system))(system)
