@@ -2,7 +2,6 @@
 
 import itertools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -215,7 +214,7 @@ def test_a_wheel_strikes_a_kerb():
     """It rolls, and its angular momentum about the edge is that before: the ratio of the rates has a closed form."""
     atol, R, h = 1e-9, 0.35, 0.08
     start = jk.State({"x": -0.6, "z": R}, {"x_dot": 4.5 * R, "spin_rate": 4.5})
-    ride = jk.simulate(KerbWheel(), start, jnp.linspace(0, 0.4, 21), **TIGHT)
+    ride = jk.simulate(KerbWheel(friction=2.0), start, jnp.linspace(0, 0.4, 21), **TIGHT)
     t = (0.6 - np.sqrt(R**2 - (R - h) ** 2)) / (4.5 * R)
     about_edge = 0.18 + 1.5 * R**2
     after = 4.5 * (0.18 + 1.5 * R * (R - h)) / about_edge
@@ -288,7 +287,10 @@ def test_a_slider_in_guides_with_clearance():
     # The two corners slide on the upper guide from 9.15 ms to 15.03 ms.
     np.testing.assert_array_equal(ride.contacts["corner 0"], np.repeat([OPEN, SLIDES, OPEN], [8, 5, 8]))
     np.testing.assert_array_equal(ride.contacts["corner 3"], OPEN)
-    np.testing.assert_allclose(jumps_of(ride)[-1], 0.015028651748459592, atol=1e-9)
+    lifts = np.flatnonzero(
+        np.any(ride.jumps.before.contacts > 0, axis=1) & np.all(ride.jumps.after.contacts == 0, axis=1)
+    )
+    np.testing.assert_allclose(ride.jumps.t[lifts], [0.015028651748459592], atol=1e-10)
     state = [1.9234696776339004, -0.4885840511083045, 0.0, 84.84423130850142, 15.15940314237841, 0.0]
     np.testing.assert_allclose(end_of(ride), state, rtol=1e-8, atol=1e-8)
 
