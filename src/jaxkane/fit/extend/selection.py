@@ -202,6 +202,7 @@ def forward_selection(
         problem = fit.problem.with_specification(extended_specification(terms.base, best.model.terms))
         start = mapped_point(best.model.problem, best.model.point, problem, best.model.names)
         after = solve(problem, LeastSquares(), start=start)
+    # A subset of the selected model is an earlier stage of it, not an alternative.
     others = {branch.model.key: branch for branch in accepted if not branch.model.key <= best.model.key}
     others = sorted(others.values(), key=lambda branch: branch.model.rank)
     selected = tuple(c.name for c in best.model.terms if c in terms.candidates)

@@ -227,6 +227,7 @@ def _projection(
         row[base.fixed] = 10.0 * np.sqrt(max(eigenvalues.max(initial=0.0), 1e-300))
         root = np.vstack([root, row])
     has_prior = parameters.has_prior
+    # `least_squares` calls `residuals` and `slopes` at the same x. Both come from one evaluation.
     memory: dict[bytes, Any] = {}
 
     def evaluate(x: np.ndarray) -> Any:

@@ -74,6 +74,8 @@ def spline(trial: Trial, name: str, y: np.ndarray, spacing: float) -> Any:
     inner, last = [], 0
     for knot in np.linspace(t[0], t[-1], n + 1)[1:-1]:
         upto = int(np.searchsorted(t, knot))
+        # Without samples between two knots, the least-squares problem is singular (condition of Schoenberg and
+        # Whitney).
         if upto - last >= 2 and len(t) - upto >= 2:
             inner.append(knot)
             last = upto

@@ -327,6 +327,7 @@ class Parameters(eqx.Module):
         if not self.joint_target.size:
             return jnp.zeros(0, self.start.dtype)
         values = jnp.asarray(self.all_values(x))
+        # A parameter without a log-normal prior may be negative. Its factor of zero times NaN would be NaN.
         both = jnp.concatenate([values, jnp.log(jnp.where(self._logarithmic, values, 1.0))])
         return (self.joint_matrix @ both - self.joint_target) / self.joint_deviation
 

@@ -175,6 +175,7 @@ class Trial:
             if isinstance(value, np.ma.MaskedArray):  # masked samples are missing samples
                 value = np.ma.filled(value.astype(float), np.nan) if value.dtype.kind in "iuf" else value.data
             array = np.asarray(value)
+            # `astype(float)` alone would accept booleans, dates and the text "1.5" without an error.
             if array.dtype.kind not in "iuf":
                 raise ValueError(f"their type is {array.dtype}")
             return array.astype(float)

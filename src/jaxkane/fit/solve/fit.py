@@ -335,6 +335,8 @@ def _is_stiff(problem: Problem, history: Sequence[float]) -> bool:
 def _first(problem: Problem, optimizer: Optimizer, start: Unknowns, steps: int) -> _Run:
     whole = np.array([n for _, _, n in problem.slices])
     for share in optimizer.horizons or ():
+        # Without `horizons=()`, `_first` would call itself without end. `rtol=1.0`, because only a start for the next
+        # share is needed.
         coarse: Any = dataclasses.replace(optimizer, rtol=1.0, horizons=())  # type: ignore[type-var]
         part = problem.shortened(np.maximum(2, np.round(share * whole).astype(int)))
         run = _first(part, coarse, start, steps)
