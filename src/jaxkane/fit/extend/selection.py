@@ -190,7 +190,7 @@ def forward_selection(
     elif folds is not None or exchange:
         raise ValueError(
             "forward_selection: cross-validation (`folds`, `exchange`) needs at least two trials, got one. Cut the "
-            "trial with `Trial.between`, or leave out `folds` and `exchange`."
+            "trial with `Trial.between`, or omit `folds` and `exchange`."
         )
     with tqdm(disable=not progress, desc="forward selection", unit=" step") as bar:
         search = Search(fit, terms, exchange, depth, refits, level, ranges, groups, bar)

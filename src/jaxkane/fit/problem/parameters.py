@@ -131,7 +131,7 @@ class Parameters(eqx.Module):
             if not has_value.all():
                 raise ValueError(
                     f"{trials[int(np.argmin(has_value))].name} belongs to none of the groups of "
-                    f"{', '.join(self.all_entries[i].name for i in same)}. Leave the trial out, or give the parameter "
+                    f"{', '.join(self.all_entries[i].name for i in same)}. Omit the trial, or give the parameter "
                     "a distribution (prior='normal'), whose mean applies to other groups."
                 )
         return own

@@ -135,7 +135,7 @@ def design(
     for name in ("noise", "errors"):
         if options.get(name) is not None:
             raise ValueError(
-                f"design: `{name}` is not supported, because a design assumes white normal errors. Leave it out."
+                f"design: `{name}` is not supported, because a design assumes white normal errors. Omit it."
             )
     problem = Problem.of(system, plan.trial(coefficients), free, **options)
     names, about = problem.parameters.names, as_names(about or ())

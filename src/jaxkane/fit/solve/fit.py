@@ -271,7 +271,7 @@ def _refuse_start_of_another(problem: Problem, start: Any) -> None:
     if shapes != own:
         raise ValueError(
             "`start` belongs to another problem: its parameters, unknowns of trials and initial values of windows "
-            f"have the shapes {shapes}, but this problem has {own}. If a fit left trials out, use `fit.problem`."
+            f"have the shapes {shapes}, but this problem has {own}. If a fit omitted trials, use `fit.problem`."
         )
 
 

@@ -50,7 +50,7 @@ class Unsimulated(ValueError):
         k, words = next(iter(self.reasons.items()))
         super().__init__(
             f"{problem.trials[k].name}: with the initial guess {words}, in {int(bad.sum())} of {len(bad)} windows. "
-            "Choose shorter windows or other initial guesses, or leave this part of the trial out."
+            "Choose shorter windows or other initial guesses, or omit this part of the trial."
         )
 
 
