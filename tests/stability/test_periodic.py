@@ -356,6 +356,41 @@ def test_the_gait_of_the_compass_and_its_period_doubling():
     np.testing.assert_allclose(doubling.orbit.multipliers, expected, rtol=1e-8)
 
 
+def gait_of_two_steps(slope):
+    guess = jk.State([-0.241, 0.398, 0.0], [1.166, 0.114])
+    return periodic(CompassGait(slope=slope), guess, section="heel_strike", returns=2, period=1.5)
+
+
+@pytest.mark.slow
+def test_a_gait_of_two_steps_beyond_the_period_doubling():
+    slope = np.deg2rad(4.5)
+    orbit = gait_of_two_steps(slope)
+    walk = jk.simulate(orbit.system, orbit.state, jnp.linspace(0.0, 1.6, 3), rtol=1e-12, atol=1e-12)
+    assert int(walk.jumps.count) == 2
+    after, start = walk.jumps.after, orbit.state
+    np.testing.assert_allclose([*after.q[1, :2], *after.u[1]], [*start.q[:2], *start.u], rtol=1e-9)
+    np.testing.assert_allclose(walk.jumps.t[1], orbit.period, rtol=1e-10)
+    assert np.abs(after.q[0, :2] - start.q[:2]).min() > 0.01
+    assert int(orbit.ride.jumps.count) == 1  # the ride ends before the second jump
+    np.testing.assert_allclose(orbit.ride["swing"][-1], orbit["stance"], rtol=1e-7)  # 1e-9 of a period before it
+    low, high = (gait_of_two_steps(slope + h).period for h in (-1e-4, 1e-4))
+    slope_of_period = jax.jit(jax.grad(lambda slope: gait_of_two_steps(slope).period))(slope)
+    np.testing.assert_allclose(slope_of_period, (high - low) / 2e-4, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_two_steps_of_a_gait_have_the_squares_of_its_multipliers():
+    guess = jk.State([-0.22, 0.32, 0.0], [1.09, 0.38])
+    one, two = (periodic(CompassGait(), guess, section="heel_strike", returns=k) for k in (1, 2))
+    np.testing.assert_allclose(two.period, 2.0 * one.period, rtol=1e-11)
+    np.testing.assert_allclose(np.sort_complex(two.multipliers), np.sort_complex(one.multipliers**2), atol=1e-10)
+
+
+def test_returns_to_a_section_without_a_jump():
+    orbit = periodic(WithSections(1.0), NEAR, section="top", returns=2)
+    np.testing.assert_allclose(orbit.period, 2.0 * MU_1[1], rtol=1e-11)
+
+
 # -- bad input
 
 
@@ -371,6 +406,7 @@ def test_the_gait_of_the_compass_and_its_period_doubling():
         ({"autonomous": False, "period": 6.6, "section": "top"}, "Omit `section`"),
         ({"hold": ("z",)}, "unknown: z; there are x, v"),
         ({"segments": 0}, "`segments` must be a positive whole number"),
+        ({"returns": 1.0}, "`returns` must be a positive whole number, got 1.0"),
     ],
 )
 def test_bad_options(options, message):
@@ -388,6 +424,8 @@ def test_guesses_without_an_orbit():
         periodic(WithSections(), jk.State([0.5], [0.0]), section="top", period=1.0)
     with pytest.raises(ValueError, match="crosses the section 'top' against the direction"):
         periodic(WithSections(), jk.State([-2.0], [0.0]), section="top", period=6.66)
+    with pytest.raises(ValueError, match="`returns` = 2 with `segments` = 3"):
+        periodic(RimlessWheel(), jk.State([-0.32, 0.0], [1.1]), section="step", returns=2, segments=3)
     with pytest.raises(ValueError, match="the section 'step' is not crossed within"):
         periodic(RimlessWheel(), jk.State([-0.32, 0.0], [0.1]), section="step")
 
