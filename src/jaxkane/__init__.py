@@ -38,8 +38,11 @@ from ._kane.api import mass_matrix as mass_matrix
 from ._kane.api import partial_velocities as partial_velocities
 from ._kane.consistent_state import assemble as assemble
 from ._kane.constraint_residuals import best_dependent_speeds as best_dependent_speeds
+from ._kane.contact import Contact as Contact
+from ._kane.contact import DryFriction as DryFriction
 from ._kane.impact import Impact as Impact
 from ._kane.impact import impact as impact
+from ._kane.multipliers import with_multipliers as with_multipliers
 from ._scalarjit.cache_key import forget as forget
 from ._scalarjit.compat import switch_off_wrong_fusions as _switch_off_wrong_fusions
 from ._scalarjit.components import Scalar as Scalar

@@ -405,7 +405,9 @@ def test_the_energy_balance_over_jumps():
 
 
 def test_where_jumps_cannot_be_represented(tmp_path):
-    with pytest.raises(ValueError, match=r"events of Ball change its state: floor\. A Kalman filter cannot"):
+    with pytest.raises(
+        ValueError, match=r"events or contacts of Ball change its state: floor\. A Kalman filter cannot"
+    ):
         jk.estimate.Filter(Ball(), {"h": 0.01})
     with pytest.warns(UserWarning, match="do not contain them"):
         jk.export.c(Ball(), tmp_path / "ball.c", ["rates"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -11,16 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._kane.constraint_residuals import configuration_residual, relative_condition
+from .._kane.contact import forces_in_contact, layout_of
 from .._kane.kanes_method import accelerations_and_mass_matrix
 from .._kane.reactions import Reactions
-from .._kane.right_hand_side import rates
+from .._kane.right_hand_side import rates, vector_field
 from .._kane.scaling import SMALLEST_SIZE, relative, term_sizes
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import ZERO3, Triple, add3, as_vector, cross, dot, matvec, stack
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Point, Vector
 from .._system.motion import Force, Motion, ReflectedInertia, kinetic_energy_of
-from .._system.system import System
+from .._system.system import State, System, packed, unpacked
 from .trajectory import Trajectory, reached_times
 
 
@@ -88,6 +90,34 @@ def _powers_along(system, t, q, u, values, input_rates):
         return jax.jvp(powers, (t, q, u, values), (jnp.ones_like(t), dot.q, dot.u, {**input_rates, **of_states}))
 
     return jax.vmap(powers_and_rates)(t, q, u, values, input_rates)
+
+
+@jit
+def _powers_in_contact_along(system, t, q, u, values, input_rates, contacts):
+    """As `_powers_along`, with the power of the contact forces. `contacts` (n_t, m): the contact states."""
+
+    def powers(contacts, t, q, u, values):
+        u_dot, of_contacts = _contact_power(system, t, q, u, values, contacts)
+        quantities = _quantities(system, t, q, u, values, u_dot)
+        return jnp.concatenate([quantities["power"], jnp.stack([quantities["prescribed"], of_contacts])])
+
+    def powers_and_rates(t, q, u, values, input_rates, contacts):
+        x = jnp.stack([values[name] for name in system.states]) if system.states else None
+        inputs = {name: values[name] for name in input_rates}
+        dot = unpacked(system, vector_field(system, t, packed(State(q, u, x, contacts)), inputs))
+        of_states = dict(zip(system.states, () if dot.x is None else dot.x, strict=True))
+        directions = jnp.ones_like(t), dot.q, dot.u, {**input_rates, **of_states}
+        return jax.jvp(functools.partial(powers, contacts), (t, q, u, values), directions)
+
+    return jax.vmap(powers_and_rates)(t, q, u, values, input_rates, contacts)
+
+
+@ScalarFunction
+def _contact_power(system, t, q, u, values, contacts):
+    """Accelerations (n,) and the power of the contact forces on the mechanism [W]."""
+    _, u, (forces, u_dot), terms = forces_in_contact(system, layout_of(system), t, q, u, contacts, values)
+    # Without the velocity of a surface, which is v - C u
+    return u_dot, forces.reshape(-1) @ (terms.C @ u)
 
 
 def _in_N(vector: Vector) -> Triple:
@@ -311,6 +341,7 @@ def _condition_of_masses(M: np.ndarray) -> np.ndarray:
     return np.linalg.cond(M / (sizes[:, :, None] * sizes[:, None, :]))
 
 
+CONTACTS = "contact states"
 LOOK, BAD = "look", "bad"
 
 
@@ -323,7 +354,7 @@ class Audit(eqx.Module):
     - `t` (n_t,) [s]: times.
     - `kinetic_energy` (n_t,) [J].
     - `work` (n_t,) [J]: work of all loads and of prescribed motions since `t[0]`.
-    - `lost` (n_t,) [J]: kinetic energy lost in jumps since `t[0]` (events with `then`).
+    - `lost` (n_t,) [J]: kinetic energy lost in jumps since `t[0]` (impacts, and events with `then`).
     - `energy_error` (n_t,) [J]: change of the kinetic energy minus work plus losses.
     - `work_error` [J]: the estimated quadrature error of the work. Work of forces that are constant in N on mass
         centres (weights) is exact. All other power is integrated between the times, by polynomials through eight of
@@ -450,7 +481,7 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
         return jax.tree.map(lambda x: np.asarray(x, float)[:-1], _quantities_along(system, *args))
 
     lost = np.zeros_like(ts)
-    if trajectory.jumps is not None and int(trajectory.jumps.count):
+    if trajectory.jumps is not None and (int(trajectory.jumps.count) or trajectory.contact_names):
         work, work_error, lost = _work_with_jumps(system, trajectory, reached)
     else:
         work, work_error = _work(
@@ -491,7 +522,7 @@ def _work_with_jumps(
     t = np.asarray(trajectory.t, float)[reached]
     times, eps = np.asarray(jumps.t, float)[:m], float(np.finfo(jumps.t.dtype).eps)
     near = 64 * eps * (t[-1] - t[0])
-    is_own = np.abs(t[:, None] - times).min(axis=1) > near  # a sample at a jump is that after it
+    is_own = np.abs(t[:, None] - times).min(axis=1, initial=np.inf) > near  # a sample at a jump is that after it
     known = trajectory.discontinuities
     sides = known.inputs if known is not None and known.inputs else (trajectory.inputs, trajectory.inputs)
 
@@ -501,6 +532,8 @@ def _work_with_jumps(
         of_states = {name: state.x[:, i] for i, name in enumerate(system.states)}
         samples = {"q": trajectory.q, "u": trajectory.u, **trajectory.values, **sides[side]}
         at_jumps = {"q": state.q, "u": state.u, **inputs, **of_states}
+        if trajectory.contact_memory is not None:
+            samples[CONTACTS], at_jumps[CONTACTS] = trajectory.contact_memory, state.contacts
         parts = {name: (np.asarray(x)[reached][is_own], at_jumps[name][:m]) for name, x in samples.items()}
         return {name: np.concatenate(pair) for name, pair in parts.items()}
 
@@ -516,7 +549,12 @@ def _work_with_jumps(
     q, u = values.pop("q"), values.pop("u")
     input_rates = {name: pieces.rate(values[name]) for name in trajectory.inputs}
     origin = np.asarray(trajectory.t)[reached][0]
-    powers = _powers_along(system, (origin + pieces.t).astype(q.dtype), q, u, values, input_rates)
+    arguments = system, (origin + pieces.t).astype(q.dtype), q, u
+    if trajectory.contact_names:
+        contacts = values.pop(CONTACTS)
+        powers = _powers_in_contact_along(*arguments, values, input_rates, contacts)
+    else:
+        powers = _powers_along(*arguments, values, input_rates)
     power, rate = (np.asarray(x, float).sum(axis=1) for x in powers)
     fine, coarse = (pieces.integral(clock, power, 4, rate, spared) for spared in (0, 1))
     places = np.searchsorted(clock, t - t[0] - near)

@@ -12,9 +12,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from .._kane.contact import NO_CONTACTS, ContactLayout, layout_of
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
@@ -164,6 +166,9 @@ class Events(NamedTuple):
     - `conditions`: for each event its place among those with `when`, or None.
     - `read_rates`: whether any event uses speeds or first-order states, whose rates the solver must evaluate.
     - `read_time`: whether any event uses the time.
+    - `contacts`: for each event that belongs to a contact its place and 0 for the normal, 1 for the tangential
+      direction; None for the events of the system.
+    - `layout`: the contacts.
     """
 
     names: tuple[str, ...]
@@ -172,6 +177,23 @@ class Events(NamedTuple):
     conditions: tuple[int | None, ...]
     read_rates: bool
     read_time: bool
+    contacts: tuple[tuple[int, int] | None, ...] = ()
+    layout: ContactLayout = NO_CONTACTS
+
+    def with_contacts(self, layout: ContactLayout) -> Events:
+        """The same with two events for each contact, in alphabetical order.
+
+        **Raises:** `ValueError` if a contact has the name of an event.
+        """
+        if not layout.names:
+            return self._replace(layout=layout)
+        if both := set(self.names) & set(layout.names):
+            raise ValueError(f"The name {both.pop()!r} is used twice, for an event and for a contact. Rename one.")
+        own = [*zip(*self[:4], [None] * len(self.names), strict=True)]
+        of_contacts = [(name, -1, 1, None, (i, side)) for i, name in enumerate(layout.names) for side in (0, 1)]
+        columns = zip(*sorted([*own, *of_contacts], key=lambda event: event[0]), strict=True)
+        names, directions, stages, conditions, contacts = (tuple(column) for column in columns)
+        return Events(names, directions, stages, conditions, True, self.read_time | layout.reads_time, contacts, layout)
 
     @property
     def continue_(self) -> bool:
@@ -180,6 +202,11 @@ class Events(NamedTuple):
 
 
 def events_of(system: System, t: Array, state: State) -> Events:
+    """The events of a system and of its contacts."""
+    return own_events_of(system, t, state).with_contacts(layout_of(system))
+
+
+def own_events_of(system: System, t: Array, state: State) -> Events:
     """The events of a system. They are traced once to detect their directions and what they use."""
     dtype = state.q.dtype
     u_all = jnp.zeros(len(system.speeds) + len(system.dependent_speeds), dtype)
@@ -268,12 +295,15 @@ class EventValues(NamedTuple):
     - `bound`: det C_dep, whose sign must not change. If it is zero, the independent speeds do not determine the
       dependent speeds.
     - `conditions` (m,): the quantities `when` of the events that have one.
+    - `noise` (n,): rounding errors of the functions of contacts, zero for events of the system; None without contacts.
+      At the start of a step it is None.
     """
 
     values: Array
     rates: Array
     bound: Array
     conditions: Array
+    noise: Array | None = None
 
     def packed(self) -> Array:
         return jnp.concatenate([self.bound[None], self.values, self.rates, self.conditions])
@@ -292,6 +322,12 @@ class EventValues(NamedTuple):
         rates = jnp.abs(self.rates) if before is None else jnp.maximum(jnp.abs(self.rates), jnp.abs(before))
         vanishes = jnp.abs(self.values) <= rates * rounding
         values = jnp.where(vanishes, jnp.zeros_like(self.values), self.values)
+        if any(contact is not None for contact in events.contacts):
+            # The states of the contacts were just found, so none of their functions vanishes here.
+            of_contacts = np.array([contact is not None for contact in events.contacts])
+            own = jnp.where(of_contacts & vanishes, jnp.maximum(self.rates, 0.0), self.rates)
+            values = jnp.where(of_contacts, jnp.maximum(values, jnp.finfo(values.dtype).tiny), values)
+            return self._replace(values=values, rates=own).passed(events, vanishes)
         return self._replace(values=values).passed(events, vanishes)
 
     def passed(self, events: Events, near: Any) -> EventValues:
@@ -382,7 +418,11 @@ def first_event(events: Events, rounding: Array, start: EventValues, end: EventV
     slopes = [jnp.where(jnp.abs(rates) < jnp.inf, h * rates, chord) for rates in (start.rates, end.rates)]
     x = first_crossing(start.values, slopes[0], end.values, slopes[1], direction)
     coming = (jnp.sign(end.values) * jnp.sign(end.rates) < 0) & (direction * end.rates >= 0)
-    coming &= jnp.abs(end.values) <= jnp.abs(end.rates) * rounding
+    is_small = jnp.abs(end.values) <= jnp.abs(end.rates) * rounding
+    if end.noise is not None:
+        # A gap of two large coordinates does not change in steps that are too short for their digits.
+        is_small |= jnp.abs(end.values) <= end.noise
+    coming &= is_small
     x = jnp.where(coming, jnp.minimum(x, 1.0), x)
     event, place = jnp.full_like(h, -1.0), jnp.full_like(h, jnp.inf)
     for i in reversed(range(len(events.directions))):
@@ -417,11 +457,21 @@ def next_point(system: System, origin, point: EventPoint, y_dot, read_rates, rea
     `origin`: the start of the simulation [s]. `read_rates`: y_dot, None if no event uses speeds.
     """
     quantities = event_values(system, origin + point.t, point.y, read_rates)
+    return moved_to_event(quantities, point, y_dot, reach, which, happened)
+
+
+def moved_to_event(
+    quantities: EventValues, point: EventPoint, y_dot: Array, reach: Array, which: Array, happened: Array
+) -> EventPoint:
+    """`next_point`, with the event functions at the point."""
     g, g_dot = quantities.values[0], quantities.rates[0]
     for i in range(1, len(quantities.values)):
         g, g_dot = (jnp.where(which == i, x[i], x0) for x, x0 in ((quantities.values, g), (quantities.rates, g_dot)))
     g_dot = jax.lax.stop_gradient(g_dot)
-    is_small = jnp.abs(g) <= jnp.abs(g_dot) * reach
+    limit = jnp.abs(g_dot) * reach
+    if quantities.noise is not None:
+        limit += 2 * sum(jnp.where(which == i, x, 0.0) for i, x in enumerate(quantities.noise))
+    is_small = jnp.abs(g) <= limit
     moves = happened & is_small & (g_dot != 0)
     step = jnp.where(moves, -g / jnp.where(moves, g_dot, jnp.ones_like(g_dot)), jnp.zeros_like(g))
     return EventPoint(point.t + step, point.y + step * y_dot, step, point.smooth & is_small)

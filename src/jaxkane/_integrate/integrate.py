@@ -16,8 +16,10 @@ from jaxtyping import Array
 from .._kane.api import _kinetic_energy
 from .._kane.checks import bodies_are_possible
 from .._kane.constraint_residuals import configuration_is_met, correction, has_configuration_constraints, projected
+from .._kane.contact import ContactMemory, layout_of
 from .._kane.kanes_method import KaneEquations
-from .._kane.right_hand_side import outputs_at, rates_are_native, values_of, vector_field
+from .._kane.right_hand_side import outputs_at, outputs_in_contact, rates_are_native, values_of, vector_field
+from .._kane.unilateral import OPEN, SLIDES, STICKS
 from .._scalarjit.cache_key import captured_tracers, captures_any, jit
 from .._scalarjit.components import as_vector
 from .._scalarjit.jaxpr import LARGEST_SUM
@@ -33,8 +35,9 @@ from .._scalarjit.nan import (
 from .._scalarjit.scalar_function import Packed, ScalarFunction, tree_of
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
+from .contact_jumps import REST, Change, ContactEvent, changed_contacts, contact_event_values, gaps_at_start
 from .discontinuities import Discontinuities, all_end_steps, discontinuities_of, rounding
-from .events import EventPoint, Events, EventValues, event_values, events_of, next_point
+from .events import EventPoint, Events, EventValues, event_values, events_of, moved_to_event, next_point
 from .inputs import (
     InputState,
     RateArguments,
@@ -92,6 +95,16 @@ def solve(
     if settings.check_bodies:
         others_are_valid &= bodies_are_possible(system, origin, state.q)
     # Values that are not finite must not reach the solver: the gradients of parameters that members share would be NaN.
+    touches = None
+    if (layout := layout_of(system)).names and state.contacts is None:
+        memory = jnp.zeros(layout.memory_size, state.q.dtype)
+        state = State(state.q, state.u, state.x, memory)
+        touches, is_apart = gaps_at_start(system, origin, state)
+        others_are_valid &= is_apart
+    if layout.names and jnp.ndim(settings.atol):
+        # Contact states have no error.
+        padded = jnp.concatenate([settings.atol, jnp.ones(layout.memory_size, settings.atol.dtype)])
+        settings = dataclasses.replace(settings, atol=padded)
     valid, start, system = initial_check(system, packed(state), origin, others_are_valid)
     if fixed and discontinuities is not None:
         # Fixed steps do not end there. JAX would compute a derivative of 0 for these times, which is wrong.
@@ -123,8 +136,13 @@ def solve(
         events=events_of(system, origin, state),
         settings=settings,
     )
+    determined = None
+    if touches is not None:
+        problem, determined = problem.with_found_contacts(touches)
     steps = problem.steps()
     end = problem.end(steps)
+    if determined is not None:
+        end = end._replace(status=jnp.where(determined, end.status, float(Status.UNDETERMINED_CONTACT)))
     end = problem.located(end, steps.rates, steps.state.reach) if problem.events.names else end
     return _trajectory(problem, steps, end, follows_from)
 
@@ -191,7 +209,8 @@ class Problem(NamedTuple):
         how = rates if settings.is_forward else trial_rates, solver, controller, self.start, self.args, self.taus
         limits = settings.adjoint, settings.max_steps, self.valid
         if is_supported(solver, controller, settings.adjoint, settings.progress):
-            jumps = Jumps(self.jump, settings.max_jumps) if self.events.continue_ else None
+            n_impulses = len(self.events.layout.names) * (1 + self.events.layout.d)
+            jumps = Jumps(self.jump, settings.max_jumps, n_impulses) if self.events.continue_ else None
             return fast_loop(*how, *limits, jumps)
         if self.events.continue_:
             raise ValueError(
@@ -205,7 +224,7 @@ class Problem(NamedTuple):
         system, settings, events = self.system, self.settings, self.events
 
         def quantities(t: Array, y: Array, args: RateArguments) -> EventValues:
-            return event_values(args.system, args.clock(t), y, rates(t, y, args) if events.read_rates else None)
+            return self.event_values(t, y, args, rates(t, y, args) if events.read_rates else None)
 
         def as_number(x: Any) -> Array:
             return jnp.asarray(x, self.taus.dtype)
@@ -253,21 +272,102 @@ class Problem(NamedTuple):
 
         def stepped(point: EventPoint) -> EventPoint:
             read = y_dot if self.events.read_rates else None
+            if self.events.layout.names:
+                quantities = self.event_values(point.t, point.y, args, y_dot)
+                return moved_to_event(quantities, point, y_dot, reach, event, happened)
             return next_point(args.system, args.origin, point, y_dot, read, reach, event, happened)
 
         near = stepped(EventPoint(t, y, jnp.zeros_like(t), jnp.array(True)))
         bend = near.step * (rates(t + 0.5 * near.step, y + 0.5 * near.step * y_dot, args) - y_dot)
         return stepped(near._replace(y=near.y + bend))
 
+    def event_values(self, t: Array, y: Array, args: RateArguments, y_dot: Array | None) -> EventValues:
+        """The event functions of the system and of its contacts, `t` after the start."""
+        events, system = self.events, tree_of(args.system)
+        own = event_values(args.system, args.clock(t), y, y_dot)
+        if not events.layout.names:
+            return own
+
+        def of_contacts(t: Array, y: Array) -> tuple[Array, Array]:
+            return contact_event_values(args.system, args.clock(t), y, args.inputs(system, t, unpacked(system, y)))
+
+        (values, noise), (rates, _) = jax.jvp(of_contacts, (t, y), (jnp.ones_like(t), y_dot))
+        # The own events and the contacts, each in alphabetical order
+        order: list[int] = []
+        for contact in events.contacts:
+            own_place = len(order) - sum(x >= len(own.values) for x in order)
+            order.append(own_place if contact is None else len(own.values) + 2 * contact[0] + contact[1])
+        pairs = (own.values, values), (own.rates, rates), (jnp.zeros_like(own.values), noise)
+        values, rates, noise = (jnp.stack([jnp.concatenate(pair)[i] for i in order]) for pair in pairs)
+        return own._replace(values=values, rates=rates, noise=noise)
+
     def jump(self, t: Array, y: Array, event: Array, reach: Array) -> Jump:
         """The jump of an event, from a time and a packed state near it."""
         point = self.event_point(t, y, None, event, reach, jnp.array(True))
-        after = state_after(self.args.system, self.args.clock(point.t), point.y, event, stages_of(self.events))
+        after, none = point.y, float(Status.COMPLETED)
+        if any((which := stages_of(self.events)).stages):
+            after = state_after(self.args.system, self.args.clock(point.t), point.y, event, which)
         is_possible = jnp.all(jnp.isfinite(after))
         if self.constrained:
             q = unpacked(self.system, jnp.where(is_possible, after, point.y)).q
             is_possible &= configuration_is_met(self.system, self.args.clock(point.t), q)
-        return Jump(point.t, point.y, after, point.smooth.astype(y.dtype), constant(is_possible))
+        smooth = point.smooth
+        if self.discontinuities is not None:
+            # An event function that jumps across zero with an input vanishes nowhere: its time is that of the input.
+            apart = jnp.abs(constant(point.t) - constant(self.discontinuities.times))
+            smooth |= jnp.any(apart <= 2 * reach)
+        jump = Jump(point.t, point.y, after, smooth.astype(y.dtype), y[:0], jnp.zeros_like(event))
+        if self.events.layout.names:
+            jump = self.contact_jump(jump._replace(after=jnp.where(is_possible, after, point.y)), event, reach)
+        status = jnp.where(is_possible, jump.status, float(Status.IMPOSSIBLE_JUMP))
+        return jump._replace(status=constant(jnp.where(jump.status == none, status, jump.status)))
+
+    def contact_jump(self, jump: Jump, event: Array, reach: Array) -> Jump:
+        """The same with the impact and the new states of the contacts."""
+        events, args, system = self.events, dataclasses.replace(self.args, within=None), self.system
+        memory = unpacked(system, jump.after).contacts
+        assert memory is not None
+        states = ContactMemory.unpacked(events.layout, memory).states
+
+        def belongs(side: int) -> Array:
+            places = [events.contacts.index((i, side)) for i in range(len(events.layout.names))]
+            return event == jnp.asarray(places, event.dtype)
+
+        normal, tangential = belongs(0), belongs(1)
+        what = ContactEvent(
+            touches=normal & (states == OPEN),
+            opens=normal & (states != OPEN),
+            slips=tangential & (states == STICKS),
+            stops=tangential & (states == SLIDES),
+            is_own=jnp.any(normal | tangential),
+            is_start=jnp.array(False),
+        )
+        change = self._changed_contacts(jump.t, jump.after, what, reach)
+        # The rest of infinitely many bounces: time passes, and the tangential motion continues.
+        after = change.y + change.delay * self.rates()(jump.t, change.y, args)
+        is_finite = jnp.all(jnp.isfinite(after))
+        status = jnp.where(change.is_determined & is_finite, jump.status, float(Status.UNDETERMINED_CONTACT))
+        return jump._replace(t=jump.t + change.delay, after=after, impulses=change.impulses.reshape(-1), status=status)
+
+    def _changed_contacts(self, t: Array, y: Array, what: ContactEvent, reach: Array) -> Change:
+        args, system, settings = dataclasses.replace(self.args, within=None), self.system, self.settings
+        inputs = args.inputs(tree_of(args.system), t, unpacked(system, y))
+        tolerances = jnp.asarray(settings.rtol, y.dtype), jnp.max(jnp.asarray(settings.atol, y.dtype))
+        rest = REST * self.taus[-1]
+        return changed_contacts(
+            tree_of(args.system), self.events.layout, args.clock(t), y, inputs, what, reach, rest, tolerances
+        )
+
+    def with_found_contacts(self, touches: Array) -> tuple[Problem, Array]:
+        """The same with the contact states at the start, and whether the contact laws have a solution there.
+
+        A contact that touches and closes at the start remains open: its impact is the first jump.
+        """
+        reach = jnp.zeros_like(self.taus[0])
+        change = self._changed_contacts(reach, self.start, ContactEvent.of_start(touches), reach)
+        is_found = self.valid & change.is_determined & jnp.all(jnp.isfinite(change.y))
+        problem = self._replace(start=jnp.where(is_found, change.y, self.start), valid=is_found)
+        return problem, is_found | ~self.valid
 
 
 @ScalarFunction.compile_cheaply
@@ -459,6 +559,7 @@ def _trajectory(problem: Problem, steps: Steps, end: End, follows_from: list[Arr
         motion = nan_derivative_where(taus >= rough, motion, follows_from)
         motion = nan_beyond_second_derivative(record.count > 0, motion, follows_from)
         end = end._replace(smooth=end.smooth & (rough == jnp.inf))
+    layout = problem.events.layout
     # States that were not reached are replaced by the first: masking the outputs would leave NaN in derivatives.
     motion = jnp.where(reached[:, None], motion, problem.start[None])
     if problem.settings.project and problem.constrained:
@@ -476,7 +577,14 @@ def _trajectory(problem: Problem, steps: Steps, end: End, follows_from: list[Arr
     if found is not None:
         sides = (-blur, blur) if found.jumps else ()
         discontinuities = InputDiscontinuities(found.times, tuple(all_inputs(taus + x, states) for x in sides))
-    outputs = jax.vmap(lambda t, y, w: outputs_at(system, t, y.q, y.u, values_of(system, y.x, w)))(ts, states, inputs)
+    if layout.names or layout.n_residuals:
+        of_contacts = jax.vmap(lambda t, y, w: outputs_in_contact(system, t, y, w))
+        speeds, outputs = of_contacts(ts, motion, inputs)
+        n_q = len(system.coordinates)
+        motion = jnp.concatenate([motion[:, :n_q], speeds, motion[:, n_q + len(system.speeds) :]], axis=1)
+    else:
+        of_state = jax.vmap(lambda t, y, w: outputs_at(system, t, y.q, y.u, values_of(system, y.x, w)))
+        outputs = of_state(ts, states, inputs)
     motion, u_dep, inputs, outputs = nan_where(~reached, (motion, u_dep, inputs, outputs), follows_from)
     t_end, y_end = nan_derivative_where(~end.smooth, (end.t, end.y), follows_from)
     if problem.events.names:
@@ -489,6 +597,8 @@ def _trajectory(problem: Problem, steps: Steps, end: End, follows_from: list[Arr
         u=states.u,
         u_dep=u_dep,
         x=states.u[:, :0] if states.x is None else states.x,
+        contact_memory=states.contacts,
+        contact_names=layout.names,
         inputs=inputs,
         outputs=outputs,
         status=end.status.astype(jnp.int32),
@@ -515,7 +625,9 @@ def _jump_table(problem: Problem, record: JumpRecord, follows_from: list[Array])
         return jax.vmap(lambda t, q, u: _kinetic_energy(system, t, q, u, {}))(times, q, u)
 
     lost = energy(before) - energy(after)
-    impulses = jax.vmap(lambda t, y, event: impulses_at(system, t, y, event, which))(times, before, record.events)
+    impulses = record.impulses
+    if not problem.events.layout.names:
+        impulses = jax.vmap(lambda t, y, event: impulses_at(system, t, y, event, which))(times, before, record.events)
     sides = [
         jax.vmap(lambda tau, y: args.inputs(system, tau, unpacked(system, y), all_of_them=True))(record.t, y)
         for y in (before, after)

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._common.lookup import refuse_unknown
+from .._kane.contact import has_contacts
 from .._kane.impact import Impact, after_impact
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.components import Component, as_vector, component
@@ -103,26 +104,29 @@ def _after_stages(system: System, t: Component, y: Array, event: int, which: Any
 
 
 def names_of_jumps(system: System) -> tuple[str, ...]:
-    """The names of the events that change the state."""
-    if type(system).events is System.events:
+    """The names of the events that change the state, and of the contacts."""
+    if type(system).events is System.events and not has_contacts(system):
         return ()
     zeros = [jnp.zeros(len(names)) for names in (system.coordinates, system.speeds)]
     events = events_of(system, jnp.zeros(()), State(*zeros))
-    return tuple(name for name, stages in zip(events.names, events.stages, strict=True) if stages)
+    names = (name for name, stages in zip(events.names, events.stages, strict=True) if stages)
+    return tuple(dict.fromkeys(names))
 
 
 def refuse_jumps(system: System, label: str, why: str) -> None:
     """**Raises:** `ValueError` if events of the system change its state. `why`: what to do instead."""
     if names := names_of_jumps(system):
-        raise ValueError(f"{label}: events of {type(system).__name__} change its state: {', '.join(names)}. {why}")
+        raise ValueError(
+            f"{label}: events or contacts of {type(system).__name__} change its state: {', '.join(names)}. {why}"
+        )
 
 
 def warn_of_jumps(system: System, label: str) -> None:
     """Warn that an exported right-hand side does not contain the jumps of a system."""
     if names := names_of_jumps(system):
         warnings.warn(
-            f"{label}: events of {type(system).__name__} change its state: {', '.join(names)}. The exported functions "
-            "are valid between the jumps and do not contain them.",
+            f"{label}: events or contacts of {type(system).__name__} change its state: {', '.join(names)}. The "
+            "exported functions are valid between the jumps, with open contacts, and do not contain them.",
             stacklevel=3,
         )
 
@@ -135,7 +139,9 @@ class StagesOf(eqx.Module):
 
 
 def stages_of(events: Events) -> StagesOf:
-    return StagesOf(events.names, events.stages)
+    contacts = events.contacts or (None,) * len(events.names)
+    stages = [0 if contact else n for n, contact in zip(events.stages, contacts, strict=True)]
+    return StagesOf(events.names, tuple(stages))
 
 
 def _after_stage(system: System, t: Component, y: Array, name: str, stage: int) -> tuple[Array, Sequence[Array]]:
@@ -178,7 +184,7 @@ def _after_stage(system: System, t: Component, y: Array, name: str, stage: int) 
             new.append(component(then[key]) if key in then else y[i])
         except TypeError as error:
             raise TypeError(f"{label}: the new value of {key!r} must be one number, got {then[key]!r}.") from error
-    return as_vector(new, y), ()
+    return jnp.concatenate([as_vector(new, y), y[len(names) :]]), ()
 
 
 @jax.custom_jvp

@@ -34,7 +34,8 @@ class JumpRecord(NamedTuple):
     """The jumps of a simulation, at most m; entries from `count` on are unused.
 
     Fields: their times `t` (m,) since the start [s], their `events` (m,) as floats, the packed states `before` and
-    `after` them (m, n), whether all of this is a `smooth` (m,) function of the arguments, and their number `count`.
+    `after` them (m, n), whether all of this is a `smooth` (m,) function of the arguments, the `impulses` (m, r) of
+    contacts, and their number `count`.
     """
 
     t: Array
@@ -42,16 +43,17 @@ class JumpRecord(NamedTuple):
     before: Array
     after: Array
     smooth: Array
+    impulses: Array
     count: Array
 
     @classmethod
-    def empty(cls, m: int, y: Array) -> JumpRecord:
+    def empty(cls, m: int, y: Array, r: int) -> JumpRecord:
         times, states = jnp.zeros(m, y.dtype), jnp.zeros((m, *y.shape), y.dtype)
-        return cls(times, times, states, states, times, jnp.zeros((), int))
+        return cls(times, times, states, states, times, jnp.zeros((m, r), y.dtype), jnp.zeros((), int))
 
     @property
     def buffers(self) -> list[Array]:
-        return [self.t, self.events, self.before, self.after, self.smooth]
+        return [self.t, self.events, self.before, self.after, self.smooth, self.impulses]
 
     def with_(self, *values: Array) -> JumpRecord:
         """The record with one more jump: the values of its fields."""
@@ -61,22 +63,24 @@ class JumpRecord(NamedTuple):
 
 
 class Jump(NamedTuple):
-    """A jump of the state: its time `t` [s], the packed states `before` and `after` it, whether it is `smooth`, and
-    whether it `is_possible`."""
+    """A jump of the state: its time `t` [s], the packed states `before` and `after` it, whether it is `smooth`, the
+    `impulses` (r,) of contacts, and its `status`: 0 if it is possible."""
 
     t: Array
     before: Array
     after: Array
     smooth: Array
-    is_possible: Array
+    impulses: Array
+    status: Array
 
 
 class Jumps(NamedTuple):
-    """How the loop treats jumps: `jump` (t, y, event, reach) -> `Jump`, from a time near the event; and the largest
-    number of jumps `most`."""
+    """How the loop treats jumps: `jump` (t, y, event, reach) -> `Jump`, from a time near the event; the largest number
+    of jumps `most`; and the number of impulses of contacts."""
 
     jump: Callable[[Array, Array, Array, Array], Jump]
     most: int
+    n_impulses: int = 0
 
 
 class Steps(NamedTuple):
@@ -178,7 +182,7 @@ def fast_loop(
     carry = Carry(
         start, end, y0, jnp.zeros_like(y0) if needs_rates else None, solver.init(term, start, end, y0, args), state,
         jnp.array(False) if restart else None, may_begin, jnp.zeros(2, int), jnp.zeros((len(ts), *y0.shape), y0.dtype),
-        jnp.zeros((), int), None if jumps is None else JumpRecord.empty(jumps.most, y0),
+        jnp.zeros((), int), None if jumps is None else JumpRecord.empty(jumps.most, y0, jumps.n_impulses),
     )  # fmt: skip
     n_events = len(controller.events.names)
 
@@ -213,18 +217,19 @@ def fast_loop(
                 now, start = ControllerState.unpacked(a.controller_state[0], n_events), jnp.where(keep, c.t1, c.t0)
                 jump, fits = jumps.jump(start, a.y, now.jump, now.reach), a.jumps.count < jumps.most
                 # A state that is not finite must not reach the solver.
-                jump = jump._replace(after=jnp.where(fits & jump.is_possible, jump.after, jump.before))
+                is_possible = jump.status == float(Status.COMPLETED)
+                jump = jump._replace(after=jnp.where(fits & is_possible, jump.after, jump.before))
                 end, changed = controller.after_jump(a.controller_state, jump.t, jump.after, args)
                 restarted = solver.init(term, jump.t, end, jump.after, args)
                 after = ControllerState.unpacked(changed[0], n_events)
-                status = jnp.where(jump.is_possible, after.status, float(Status.IMPOSSIBLE_JUMP))
+                status = jnp.where(is_possible, after.status, jump.status)
                 status = jnp.where(fits, status, float(Status.MAX_JUMPS))
                 changed = (changed[0].at[0].set(status), changed[1])
                 # The step may have ended at the duration, within the resolution after the jump.
                 is_last = jump.t >= almost(controller.duration)
                 goes_on = (status == float(Status.COMPLETED)) & ~is_last
                 begin = jnp.where(is_last, controller.duration, jump.t)
-                record = a.jumps.with_(jump.t, now.jump, jump.before, jump.after, jump.smooth)
+                record = a.jumps.with_(jump.t, now.jump, jump.before, jump.after, jump.smooth, jump.impulses)
                 rates_after = None if a.rates is None else jnp.zeros_like(a.rates)
                 return AtJump(
                     jnp.zeros_like(a.is_due), begin, end, jump.after, rates_after, restarted, changed, goes_on, record

@@ -39,6 +39,11 @@ def along(f: Callable[..., Any], system: System, t: Any, q: Any, u: Any, inputs:
             "A Trajectory already contains coordinates, speeds and inputs. Pass only the system and the trajectory."
         )
     refuse_other_system(type(system).__name__, system, t)
+    if t.contact_names and f not in (_positions, _velocities, _orientations):
+        raise ValueError(
+            f"{type(system).__name__} has contacts ({', '.join(t.contact_names)}), and this function does not contain "
+            "their forces. Define what you need in `outputs`: its accelerations contain the contact forces."
+        )
     if t.t.shape[-1] == 0:
         raise ValueError(f"{type(system).__name__}: the trajectory contains no times.")
     return _over_times(system, f, t)

@@ -17,6 +17,7 @@ from jaxtyping import Array
 from .._kane.arguments import by_names, check_is_system, is_concrete, refuse_incomplete
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import check_state
+from .._kane.contact import check_contacts, has_contacts, layout_of
 from .._kane.diagnosis import diagnosis
 from .._kane.right_hand_side import reads_time, values_of
 from .._scalarjit.cache_key import captured_tracers
@@ -103,6 +104,8 @@ def simulate(
     origin, taus = clock_of(ts, dtype)
     check_state(system, origin, state.q)
     check_system(system, origin, state.q)
+    if has_contacts(system) and state.contacts is None:
+        check_contacts(system, origin, state.q)
     settings = settings_for(
         dtype,
         rtol=rtol,
@@ -235,6 +238,11 @@ def checked_state(system: System, state: Any) -> State:
                 f"{name}: state.{label} must have the shape ({len(names)},) for {', '.join(names)}; got {value.shape}."
                 + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
             )
+    if state.contacts is not None and state.contacts.shape != (size := (layout_of(system).memory_size,)):
+        raise ValueError(
+            f"{name}: state.contacts must have the shape {size}, got {state.contacts.shape}. Omit it, or pass a state "
+            "of a trajectory of this system."
+        )
     return state
 
 
@@ -258,7 +266,11 @@ def as_state(system: System, state: State) -> State:
         if not hasattr(values, "shape"):
             raise TypeError(f"{title}: state.{label} must be an array of numbers, or a dict by name; got {values!r}.")
         arrays.append(values)
-    return State(*_of_one_type(arrays))
+    if state.contacts is not None:
+        arrays.append(state.contacts)
+    arrays = _of_one_type(arrays)
+    contacts = None if state.contacts is None else arrays.pop()
+    return State(arrays[0], arrays[1], arrays[2] if system.states else None, contacts)
 
 
 def _of_one_type(arrays: list[Any]) -> list[Any]:

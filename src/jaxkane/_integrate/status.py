@@ -30,7 +30,9 @@ class Status(enum.IntEnum):
     """A jump left its own event on zero and crossing again, so it would be repeated without end."""
     IMPOSSIBLE_JUMP = 9
     """The state after a jump is not finite, or it violates a configuration constraint."""
-    EVENT = 10
+    UNDETERMINED_CONTACT = 10
+    """The laws of contact and friction have no solution, e.g. for the rod of Painleve."""
+    EVENT = 11
 
 
 def reason(code: int, events: tuple[str, ...]) -> str:
@@ -41,10 +43,12 @@ def reason(code: int, events: tuple[str, ...]) -> str:
 
 REASONS = frozenset(reason(code, ()) for code in Status if code < Status.EVENT)
 _ADVICE: dict[int, str] = {
-    Status.SINGULAR_SPEEDS: "Choose other dependent speeds: see jaxkane.best_dependent_speeds(system, t, q).",
+    Status.SINGULAR_SPEEDS: "Simulate jaxkane.with_multipliers(system), or choose other dependent speeds: "
+    "see jaxkane.best_dependent_speeds(system, t, q).",
     Status.STEP_TOO_SMALL: "A value grows without bound or is discontinuous. Plot the last samples before `t_end`.",
     Status.MAX_JUMPS: "Increase max_jumps. If jumps accumulate at one time, end the simulation there by another event.",
     Status.IMPOSSIBLE_JUMP: "Check `then` of the event at `t_end`. New coordinates must satisfy the constraints.",
+    Status.UNDETERMINED_CONTACT: "Rigid contacts with this friction have no solution. Reduce the friction.",
     Status.REPEATED_JUMP: "Let `then` move the event function away from zero, or change the direction of its rate.",
     Status.MAX_STEPS: "Increase max_steps (an input sample needs a step), or check for stiff or discontinuous loads.",
 }

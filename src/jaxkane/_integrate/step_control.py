@@ -219,6 +219,7 @@ def _first(control: StepSizeController, values: EventValues | None, stop: Array 
     end = jnp.minimum(control.first, control.longest) if control.step is None else control.step
     end = end if stop is None else _clipped(jnp.zeros_like(end), end, stop)
     status, past, never, zero = (jnp.full_like(end, x) for x in (Status.COMPLETED, -jnp.inf, jnp.inf, 0.0))
+    values = values and values._replace(noise=None)
     start = values and values.at_start(control.events, 1e6 * jnp.finfo(end.dtype).eps * control.first)
     state = ControllerState(status, past, never, zero, end, zero - 1, zero - 1, start)
     return jnp.minimum(end, control.duration), state.packed()
@@ -235,7 +236,7 @@ def _after_jump(
     end = jnp.where(end > almost(duration), duration, end)
     resolution = _resolution(t, state.length, duration)
     # A ball that stays on the floor has no rate after the impact, only before it.
-    before = None if state.start is None else state.start.rates
+    before, values = None if state.start is None else state.start.rates, values._replace(noise=None)
     state = state._replace(
         rejected_end=jnp.full_like(t, -jnp.inf),
         jump=jnp.full_like(t, -1.0),
@@ -370,7 +371,13 @@ def _at_events(
     over = kept & (jnp.sign(start.bound) * jnp.sign(end.bound) < 0)
     at_bound = (over & (h <= duration / 1000)) | (kept & ~over & (t1 >= before.over_bound))
     at_start = crossed & (x == 0) & ~over & ~at_bound
-    at_end = crossed & ((1 - x) * h <= resolution) & ~over & (x != 0) & ~at_bound
+    is_near = (1 - x) * h <= resolution
+    if end.noise is not None:
+        sizes = zip(end.values, end.noise, strict=True)
+        for i, (value, noise) in enumerate(sizes):
+            is_near |= (event == i) & (jnp.abs(value) <= noise)
+        end = end._replace(noise=None)
+    at_end = crossed & is_near & ~over & (x != 0) & ~at_bound
     is_passed = jnp.zeros_like(kept)
     for i, place in enumerate(events.conditions):
         if place is not None:

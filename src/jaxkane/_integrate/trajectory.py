@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -51,7 +52,8 @@ class Trajectory(eqx.Module):
     - `adjoint`: how the simulation is differentiated.
     - `units`: pairs of a name and its unit, as the system declares them.
     - `discontinuities`: where inputs are discontinuous, and their values on both sides, for `audit`; else None.
-    - `jumps`: the jumps of the state, a `JumpTable`; None if no event of the system has `then`.
+    - `jumps`: the jumps of the state, a `JumpTable`; None if the system has neither contacts nor events with `then`.
+    - `contact_memory` (n_t, m): `State.contacts` at the times; None if the system has no contacts.
     """
 
     t: Float[Array, "*batch n_t"]
@@ -71,6 +73,18 @@ class Trajectory(eqx.Module):
     end: State | None = None
     discontinuities: InputDiscontinuities | None = None
     jumps: JumpTable | None = None
+    contact_memory: Float[Array, "*batch n_t m"] | None = None
+    contact_names: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def contacts(self) -> dict[str, Int[Array, "*batch n_t"]]:
+        """The states of the contacts by name: 0 open, 1 slides, 2 sticks; -1 after the end of the simulation."""
+        if self.contact_memory is None:
+            return {}
+        width = self.contact_memory.shape[-1] // len(self.contact_names)
+        states = self.contact_memory[..., ::width]
+        codes = jnp.where(jnp.isnan(states), -1.0, states).astype(jnp.int32)
+        return {name: codes[..., i] for i, name in enumerate(self.contact_names)}
 
     def __getitem__(self, name: str) -> Float[Array, "*batch n_t"]:
         groups = zip(self.names, (self.q, self.u, self.u_dep, self.x), strict=True)
@@ -95,7 +109,8 @@ class Trajectory(eqx.Module):
 
     def state(self, i: int = -1) -> State:
         """The state at the i-th time, e.g. to continue the simulation."""
-        return State(self.q[..., i, :], self.u[..., i, :], self.x[..., i, :] if self.names[3] else None)
+        contacts = None if self.contact_memory is None else self.contact_memory[..., i, :]
+        return State(self.q[..., i, :], self.u[..., i, :], self.x[..., i, :] if self.names[3] else None, contacts)
 
     def __repr__(self) -> str:
         if isinstance(self.status, Tracer) or np.ndim(self.status) > 0:

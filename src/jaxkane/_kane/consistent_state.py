@@ -32,7 +32,9 @@ from .constraint_residuals import (
     scales_by_unit,
     violations,
 )
+from .contact import REDUNDANT, ContactRows, has_multipliers, layout_of, speeds_in_contact
 from .description import at_random_point, structure_of
+from .kanes_method import KaneEquations
 from .scaling import SMALLEST_SIZE
 
 
@@ -71,6 +73,47 @@ class AssemblyProblem(NamedTuple):
         # solve for the other three: omitted ones are zero.
         still = {names[i] for four in quaternions if names[four[3]] in named for i in four}
         return cls(tuple(c for c in left_out if c not in still), named, guess, lenient=True)
+
+    def for_contacts(self, system: System, q: Numbers, free: Sequence[str] | None) -> AssemblyProblem:
+        """The same for touching contacts: omitted coordinates are solved for, too."""
+        if free is not None:
+            return self
+        names = system.coordinates
+        moved = names if not isinstance(q, Mapping) else [c for c in names if c in self.moved or c not in q]
+        return self._replace(moved=tuple(moved), lenient=True)
+
+
+def with_touching(system: System, touching: Sequence[str]) -> System:
+    """A system whose configuration constraints contain the gaps of contacts.
+
+    **Raises:** `ValueError` for unknown names and for bearings, which have no gap.
+    """
+    layout = layout_of(system)
+    can_touch = [name for name, is_bearing in zip(layout.names, layout.is_bearing, strict=True) if not is_bearing]
+    refuse_unknown(touching, can_touch, f"{type(system).__name__} has no contact", "it has")
+    places = [layout.names.index(name) for name in touching]
+
+    def configuration_constraints(self: System, t: Component, q: Numbers) -> Sequence[Any]:
+        kane = KaneEquations(system_of(self), t, q, (0.0,) * len(system.speeds))
+        gaps = ContactRows(kane, layout).gaps(kane.t, kane.q, kane.u_all)
+        return [*type(system).configuration_constraints(self, t, q), *(gaps[i] for i in places)]
+
+    own = type(system)
+
+    def system_of(self: System) -> System:
+        return _with_class(self, own)
+
+    name = f"{own.__name__} with {', '.join(touching)} touching"
+    changed: Any = type(own)(own.__name__, (own,), {"configuration_constraints": configuration_constraints})  # type: ignore[misc]
+    changed.__qualname__ = name
+    return _with_class(system, changed)
+
+
+def _with_class(system: System, kind: type) -> System:
+    new = object.__new__(kind)
+    for key, value in vars(system).items():
+        object.__setattr__(new, key, value)
+    return new
 
 
 _EULER_PARAMETERS = Cache()  # indices of Euler parameters by structure
@@ -291,6 +334,7 @@ def assemble(
     *,
     t: Component = 0.0,
     free: Sequence[str] | None = None,
+    touching: Sequence[str] = (),
 ) -> State:
     """Compute a state that satisfies the constraints.
 
@@ -314,6 +358,9 @@ def assemble(
         the system, the unknowns are the omitted coordinates of a dict, or all coordinates of an array. With more
         unknowns than constraints, the solution is the nearest to the initial guess along the gradients of the
         constraints.
+    - `touching`: names of contacts whose gaps vanish. The coordinates that are solved for are then the dependent
+        coordinates and all omitted ones, or all coordinates of an array. The speeds are changed as little as possible
+        (in the metric of the mass matrix), so that these contacts neither approach nor separate.
 
     **Returns:** a `State`. It can be differentiated (twice, in both modes) with respect to all numbers, by the implicit
     function theorem.
@@ -324,7 +371,9 @@ def assemble(
     check_is_system(system)
     name = type(system).__name__
     check_time(name, t)
-    problem = AssemblyProblem.of(system, q, free)
+    problem, touching = AssemblyProblem.of(system, q, free), as_names(touching)
+    if touching:
+        problem = problem.for_contacts(system, q, free)
     q0 = as_array(problem.guess | dict(q) if isinstance(q, Mapping) else q, system.coordinates, f"{name}: q")
     u_dep: dict[str, Any] = {}
     if isinstance(u, Mapping):
@@ -340,7 +389,9 @@ def assemble(
         bad = [n for n, y in zip(names, np.concatenate(parts), strict=True) if not np.isfinite(y)]
         if bad:
             raise ValueError(f"{name}: {', '.join(bad)} is not finite.")
-    q0 = _solve_configuration(system, q0, t, problem)
+    q0 = _solve_configuration(with_touching(system, touching) if touching else system, q0, t, problem)
+    if touching or has_multipliers(system):
+        u0 = speeds_in_contact(system, jnp.asarray(t, q0.dtype), q0, u0, touching)
     if is_concrete(system, q0, u0, t):
         check_system(system, t, q0)
         if u_dep:
@@ -353,6 +404,8 @@ def _solve_configuration(system: System, q0, t, problem: AssemblyProblem):
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
     if n_h == 0:
         return q0
+    if has_multipliers(system):
+        return _nearest_configuration(system, q0, t, problem.moved)
     if len(problem.moved) < n_h:  # e.g. a plane loop that is closed by a Vector, whose third component is always zero
         problem = problem._replace(lenient=True)
     places = tuple(system.coordinates.index(c) for c in problem.moved)
@@ -360,6 +413,29 @@ def _solve_configuration(system: System, q0, t, problem: AssemblyProblem):
     if is_concrete(system, q0, t) and not bool(result.converged):
         raise NoConfiguration(_why_not(system, q0, problem, result))
     return result.q
+
+
+def _nearest_configuration(system: System, q0, t, moved: Sequence[str]):
+    """A configuration of a system whose constraints may be redundant, by the Gauss-Newton method.
+
+    **Raises:** `NoConfiguration` if the constraints are not met. If arguments are traced, the result is NaN.
+    """
+    places = jnp.array([system.coordinates.index(c) for c in moved or system.coordinates])
+
+    def step(_: Any, q: Numbers) -> Numbers:
+        J = jax.jacfwd(lambda q: configuration_residual(system, t, q))(q)[:, places]
+        change = jnp.linalg.lstsq(jax.lax.stop_gradient(J), configuration_residual(system, t, q), rcond=REDUNDANT)[0]
+        return q.at[places].add(-change)
+
+    # The last two steps have the derivatives of the implicit function theorem up to the second order.
+    q = step(1, step(0, jax.lax.stop_gradient(jax.lax.fori_loop(0, _MAX_STEPS, step, jax.lax.stop_gradient(q0)))))
+    is_met = jnp.all(violations(system, t, q)[0] <= configuration_tolerance(q.dtype))
+    if is_concrete(system, q0, t) and not bool(is_met):
+        raise NoConfiguration(
+            f"{type(system).__name__}: no {', '.join(moved or system.coordinates)} satisfies the configuration "
+            "constraints from this initial guess. Start from another guess."
+        )
+    return jnp.where(is_met, q, jnp.nan)
 
 
 def _why_not(system: System, q0, problem: AssemblyProblem, result: NewtonResult) -> str:

@@ -21,6 +21,7 @@ from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
 from .._system.system import NamedVector, State, System, has_outputs, packed, unpacked
 from .arguments import Inputs, Row, as_row, inputs_of
+from .contact import forces_in_contact, has_multipliers, layout_of
 from .description import jvp
 from .kanes_method import KaneEquations, motion_rates
 from .reactions import Reactions
@@ -187,6 +188,32 @@ def outputs_at(system: System, t: Array, q: Array, u: Array, inputs: Mapping[str
     return _outputs_at(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
+def outputs_in_contact(
+    system: System, t: Array, y: Array, inputs: Mapping[str, Array]
+) -> tuple[Array, dict[str, Array]]:
+    """The projected speeds (n,), and outputs by name with the contact forces, at a state with contact states."""
+    state = unpacked(system, y)
+    values = dict(values_of(system, state.x, inputs))
+    u, u_dot, forces = _contact_forces(system, t, y, values)
+    outputs = _outputs_at(system, t, state.q, u, values, u_dot) if has_outputs(system) else {}
+    return u, outputs | forces
+
+
+@ScalarFunction
+def _contact_forces(system, t, y, values):
+    state, layout = unpacked(system, y), layout_of(system)
+    _, u, (forces, u_dot), _ = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
+    named = {}
+    for i, (name, has_friction, is_bearing) in enumerate(zip(*layout[:3], strict=True)):
+        if not is_bearing:
+            named[f"{name}.normal"] = forces[i, 0]
+        if has_friction and (not layout.in_space or is_bearing or layout.planes[i] is not None):
+            named[f"{name}.friction"] = forces[i, 1]
+        elif has_friction:
+            named |= {f"{name}.friction_{k}": forces[i, k] for k in (1, 2)}
+    return u, u_dot, named
+
+
 @ScalarFunction
 def _outputs_at(system, t, q, u, inputs, u_dot):
     kane = KaneEquations(system, t, q, u, inputs)
@@ -289,12 +316,28 @@ def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dic
 def _vector_field(system, t, y, inputs):
     state = unpacked(system, y)
     values = values_of(system, state.x, inputs)
+    if state.contacts is not None or has_multipliers(system):
+        return _rates_in_contact(system, t, y, values)
     q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
     x_dot = None
     if system.states:
         kane = KaneEquations(system, t, state.q, state.u, values)
         x_dot = as_vector(evaluate_with_accelerations(kane, as_row(u_dot, system.speeds, "u_dot"), _state_rates), y)
     return packed(State(q_dot, u_dot, x_dot))
+
+
+def _rates_in_contact(system: System, t: Component, y: Array, values: dict[str, Any]) -> Array:
+    """The packed rates of a state with contact states, whose rates are zero."""
+    state, layout = unpacked(system, y), layout_of(system)
+    memory = state.contacts
+    kane, _, forces, _ = forces_in_contact(system, layout, t, state.q, state.u, memory, values)
+    x_dot = None
+    if system.states:
+        u_dot = as_row(forces.u_dot, system.speeds, "u_dot")
+        x_dot = as_vector(evaluate_with_accelerations(kane, u_dot, _state_rates), y)
+    return packed(
+        State(as_vector(kane.q_dot, y), forces.u_dot, x_dot, None if memory is None else jnp.zeros_like(memory))
+    )
 
 
 @ScalarFunction

@@ -64,8 +64,12 @@ def contact_impact(
     friction: Float[Array, " c"],
     closed: Bool[Array, " c"],
     has_friction: Sequence[bool] | None = None,
+    slip: Slip | None = None,
 ) -> ContactImpact:
     """The impulses of an impact with up to four unilateral contacts.
+
+    With accelerations instead of velocities and forces instead of impulses, these are the contact forces of a motion
+    without an impact. Then the direction of the friction of contacts that already slip is known: `slip`.
 
     **Arguments:**
 
@@ -76,6 +80,7 @@ def contact_impact(
     - `friction` (c,): coefficients of friction.
     - `closed` (c,): whether a contact takes part. The others transmit no impulse.
     - `has_friction`: for each contact, whether its tangential rows exist. By default, all exist. Other rows are zero.
+    - `slip`: what is known about the slip. By default nothing.
 
     **Raises:** `ValueError` for more than four contacts.
     """
@@ -87,10 +92,16 @@ def contact_impact(
     rows = tuple(d if each else 0 for each in has_friction or (True,) * c)
     states, signs = _combinations(rows)
     each = _Combination(jnp.asarray(states), jnp.asarray(signs, G.dtype))
-    problem = _Problem(G, v, restitution, friction)
+    slip = Slip.unknown(friction, d) if slip is None else slip
+    problem = _Problem(G, v, restitution, friction, slip)
     fixed = jax.tree.map(jax.lax.stop_gradient, problem)
     found = jax.vmap(fixed.solved)(each)
     takes_part = jnp.all(closed[None] | (each.states == OPEN), axis=1)
+    takes_part &= jnp.all(slip.may_stick[None] | (each.states != STICKS), axis=1)
+    if d:
+        # A contact that already slips has one sliding combination.
+        is_repeated = (each.signs < 0) if d == 1 else jnp.zeros_like(each.states, bool)
+        takes_part &= ~jnp.any(slip.is_known[None] & (is_repeated | (each.states == STICKS)), axis=1)
     is_admissible = takes_part & jax.vmap(fixed.is_admissible, (0, 0, None))(each, found, closed)
     k = jnp.argmax(is_admissible)  # the first one
     chosen, first = jax.tree.map(lambda x: x[k], (each, found))
@@ -131,6 +142,26 @@ def contact_impact_at(
     result = contact_impact(G, v, e, friction, closed, has_friction)
     w = A.T @ result.impulses.reshape(-1)
     return u + (coordinates.X @ w)[: len(u)], coordinates.energy_lost(w), result
+
+
+class Slip(NamedTuple):
+    """What is known about the slip of c contacts.
+
+    - `is_known` (c,): whether a contact already slips, so that it slides in this direction or opens.
+    - `directions` (c, d): unit vectors of this slip.
+    - `static` (c,): the coefficients of static friction. A sticking contact has |L_T| <= static L_N.
+    - `may_stick` (c,): whether a contact may stick.
+    """
+
+    is_known: Array
+    directions: Array
+    static: Array
+    may_stick: Array
+
+    @classmethod
+    def unknown(cls, friction: Array, d: int) -> Slip:
+        no = jnp.zeros(friction.shape, bool)
+        return cls(no, jnp.zeros((len(friction), d), friction.dtype), friction, ~no)
 
 
 class _Combination(NamedTuple):
@@ -183,6 +214,7 @@ class _Problem(eqx.Module):
     v: Array
     restitution: Array
     friction: Array
+    slip: Slip
 
     @property
     def in_space(self) -> bool:
@@ -194,6 +226,8 @@ class _Problem(eqx.Module):
         if self.in_space:
             start = self._solution(combination, angles, friction=jnp.zeros_like(self.friction)).velocities
             angles = _angle(start[:, 1], start[:, 2])
+            known = _angle(self.slip.directions[:, 0], self.slip.directions[:, 1])
+            angles = jnp.where(self.slip.is_known, known, angles)
             for _ in range(1 if len(angles) == 1 else 2):
                 angles = jax.lax.fori_loop(0, len(angles), lambda i, x: self._best_angle(combination, x, i), angles)
             angles = jax.lax.fori_loop(0, _NEWTON_STEPS, lambda _, x: self._newton_step(combination, x), angles)
@@ -215,18 +249,22 @@ class _Problem(eqx.Module):
         # The deviation changes its sign between this angle and the next one, which both have admissible impulses.
         is_before = (L[:, 0] >= 0) & (cosine >= 0)
         is_before = is_before & jnp.roll(is_before, -1) & (sine * jnp.roll(sine, -1) <= 0)
-        return each[jnp.argmax(cosine + jnp.where(L[:, 0] >= 0, 2.0, 0.0) + jnp.where(is_before, 4.0, 0.0))]
+        best = each[jnp.argmax(cosine + jnp.where(L[:, 0] >= 0, 2.0, 0.0) + jnp.where(is_before, 4.0, 0.0))]
+        return jnp.where(self.slip.is_known[i], angles, best)
 
     def differentiable(self, combination: _Combination, known: _Solution) -> _Solution:
         """The same with derivatives up to the third order, from two Newton steps at the known solution."""
         angles = known.angles
+        if self.in_space:
+            own = _angle(self.slip.directions[:, 0], self.slip.directions[:, 1])
+            angles = jnp.where(self.slip.is_known, own, angles)
         for _ in range(2 if self.in_space else 0):
             angles = self._newton_step(combination, angles)
         return self._solution(combination, angles, inverse=known.inverse)
 
     def _newton_step(self, combination: _Combination, angles: Array) -> Array:
         """One step towards angles at which the slip has the assumed direction, n x v_T+ = 0."""
-        slides = combination.states == SLIDES
+        slides = (combination.states == SLIDES) & ~self.slip.is_known
 
         def deviation(angles: Array) -> Array:
             v = self._solution(combination, angles).velocities
@@ -250,7 +288,12 @@ class _Problem(eqx.Module):
         c, rows = self.v.shape
         friction = self.friction if friction is None else friction
         slides, sticks = (combination.states == x for x in (SLIDES, STICKS))
-        slips = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1) if self.in_space else combination.signs[:, None]
+        if self.in_space:
+            slips = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
+        elif rows == 2:
+            slips = jnp.where(self.slip.is_known[:, None], self.slip.directions, combination.signs[:, None])
+        else:
+            slips = jnp.zeros((c, 0), self.v.dtype)
         active = jnp.concatenate([(slides | sticks)[:, None], jnp.repeat(sticks[:, None], rows - 1, axis=1)], axis=1)
         target = jnp.concatenate([-(1.0 + self.restitution)[:, None] * self.v[:, :1], -self.v[:, 1:]], axis=1)
         # W = 1, and L_T = -mu n L_N while sliding
@@ -291,13 +334,13 @@ class _Problem(eqx.Module):
         if d:
             force, slip = (jnp.sqrt(jnp.sum(x[:, 1:] ** 2, axis=1)) for x in (L, v))
             slack, limit = (jnp.max(x, axis=1) for x in (rounding, inconsistent))
-            is_held = (slip <= limit) & ((force - self.friction * L[:, 0]) * inertia <= slack)
+            is_held = (slip <= limit) & ((force - self.slip.static * L[:, 0]) * inertia <= slack)
             if d == 1:
                 is_opposite = combination.signs * v[:, 1] >= -rounding[:, 1]
             else:
                 # L_T . v_T = -|L_T| |v_T|
                 is_opposite = jnp.sum(L[:, 1:] * v[:, 1:], axis=1) + force * slip <= force * limit
-            conditions += [~sticks | is_held, ~slides | is_opposite]
+            conditions += [~sticks | is_held, ~slides | is_opposite | self.slip.is_known]
         return jnp.all(jnp.stack(conditions)) & jnp.all(jnp.isfinite(v))
 
 

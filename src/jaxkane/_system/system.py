@@ -126,7 +126,7 @@ for _name in ("eq", "ne", "lt", "le", "gt", "ge"):
     setattr(NamedVector, f"__{_name}__", _elementwise(f"__{_name}__"))
 
 
-METHODS = ("motion", "q_dot", "loads", "configuration_constraints", "implied_constraints", "events")
+METHODS = ("motion", "q_dot", "loads", "configuration_constraints", "implied_constraints", "events", "contacts")
 METHODS += ("state_rates", "outputs")
 NAMES = ("coordinates", "speeds", "dependent_speeds", "auxiliary_speeds", "dependent_coordinates", "inputs", "states")
 
@@ -250,26 +250,42 @@ class State(eqx.Module):
     - `q`: coordinates (n_q,) [rad, m].
     - `u`: independent speeds (n_u,) [rad/s, m/s].
     - `x`: first-order states (n_x,), or None if there are none.
+    - `contacts`: the contact states, or None. A simulation that starts without them finds them from the gaps and the
+        velocities. They contain, contact by contact in alphabetical order, 0 (open), 1 (slides) or 2 (sticks) and the
+        direction of the slip.
     """
 
     q: Float[Array, "*batch n_q"] = eqx.field(converter=to_float)
     u: Float[Array, "*batch n_u"] = eqx.field(converter=to_float)
     x: Float[Array, "*batch n_x"] | None = eqx.field(converter=lambda x: x if x is None else to_float(x), default=None)
+    contacts: Float[Array, "*batch m"] | None = eqx.field(
+        converter=lambda x: x if x is None else to_float(x), default=None
+    )
 
     def __repr__(self) -> str:
         return module_text(self, ndim=1)
 
 
 def packed(state: State) -> Float[Array, "*batch n"]:
-    """q, u and, if present, x in one array."""
-    return jnp.concatenate([part for part in (state.q, state.u, state.x) if part is not None], axis=-1)
+    """q, u and, if present, x and contacts in one array."""
+    parts = (state.q, state.u, state.x, state.contacts)
+    return jnp.concatenate([part for part in parts if part is not None], axis=-1)
+
+
+def packed_motion(state: State) -> Float[Array, "*batch n"]:
+    """`packed` without the contact states, which follow from the motion."""
+    return packed(State(state.q, state.u, state.x))
 
 
 def unpacked(system: System, y: Float[Array, "*batch n"]) -> State:
     """The inverse of `packed`."""
     n_q = len(system.coordinates)
-    q, u, x = jnp.split(y, [n_q, n_q + len(system.speeds)], axis=-1)
-    return State(q, u, x if system.states else None)
+    n_y = n_q + len(system.speeds)
+    q, u, x = jnp.split(y, [n_q, n_y], axis=-1)
+    contacts = None
+    if type(system).contacts is not System.contacts and y.shape[-1] > n_y + len(system.states):
+        x, contacts = jnp.split(x, [len(system.states)], axis=-1)
+    return State(q, u, x if system.states else None, contacts)
 
 
 class System(eqx.Module, metaclass=SystemMeta):
@@ -394,6 +410,16 @@ class System(eqx.Module, metaclass=SystemMeta):
         contains the first-order states. The status of the simulation is the name of the event. `jaxkane.rising` and
         `jaxkane.falling` select the direction of the crossing. If a quantity is zero at the start, the simulation ends
         at once only if the quantity then changes in the selected direction.
+        """
+        return {}
+
+    def contacts(self, t: Component, q: Numbers, u: Numbers, motion: Motion) -> Mapping[str, Any]:
+        """Return contacts by name: `jaxkane.Contact` and `jaxkane.DryFriction`.
+
+            def contacts(self, t, q, u, motion):
+                return {"floor": jk.Contact(motion["foot"], motion.N.y, friction=self.friction)}
+
+        The simulation finds touch-down, impact, rest, slip, stick and lift-off. At most four contacts are possible.
         """
         return {}
 

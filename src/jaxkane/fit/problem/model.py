@@ -21,7 +21,7 @@ from ..._integrate.trajectory import Trajectory
 from ..._kane.consistent_state import assemble
 from ..._scalarjit.cache_key import jit
 from ..._scalarjit.compat import on_device
-from ..._system.system import State, System, packed, unpacked
+from ..._system.system import State, System, packed, packed_motion, unpacked
 from ...estimate._process_noise import Noise
 from .errors import Errors
 from .parameters import LOW_PASSES, Entry, Parameters
@@ -359,7 +359,7 @@ class Model(eqx.Module):
         simulated = self.simulated(ride, n.with_local(calibration, b, z))
         # `where`, because the product of a weight of zero and a simulated value of NaN is NaN.
         difference = jnp.where(window.weight > 0, (simulated - window.measured) * window.weight, 0.0)
-        end = packed(ride.state())
+        end = packed_motion(ride.state())
         following = self.known(window.next_start, calibration)
         jump = jnp.where(window.linked > 0, (end - following)[self.unknown_places] / n.defect_std, 0.0)
         priors, cost = self.priors(window, z, b, x), None

@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from ..._common.lookup import as_names, refuse_unknown
 from ..._scalarjit.compat import filter_jit_uncached
-from ..._system.system import System, packed
+from ..._system.system import System, packed_motion
 from ..problem.declarations import Items
 from ..problem.model import Model, Unknowns
 from ..problem.problem import Problem
@@ -291,7 +291,7 @@ def _one_motion(model: Model, windows: Windows, point: Unknowns) -> Windows:
 
     def step(start: Array, window: Windows) -> tuple[Array, Array]:
         ride = model.simulate(window, start, point.window_starts[0], point.trial_unknowns[0], point.parameters)
-        return packed(ride.state()), start
+        return packed_motion(ride.state()), start
 
     end, starts = jax.lax.scan(step, model.consistent(first, point.window_starts[0], point.parameters), windows)
     return eqx.tree_at(lambda w: (w.start, w.next_start), windows, (starts, jnp.append(starts[1:], end[None], axis=0)))

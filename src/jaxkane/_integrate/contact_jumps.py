@@ -1,0 +1,263 @@
+"""Changes of the contact states: touch-down, impact, rest, slip, stick and lift-off.
+
+All of them happen at jumps. A jump has two stages:
+
+1. If contacts close, one impact with all of them and with the contacts that are closed already (`unilateral`).
+2. The contacts that neither approach nor separate get the state that their accelerations allow: the same conditions,
+   with accelerations and forces instead of velocities and impulses.
+
+A contact rests if the rest of its bounces takes a negligible time (see `REST`). This time is added, so that the end of
+infinitely many bounces has a derivative.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._kane.contact import (
+    ContactLayout,
+    ContactMemory,
+    ContactTerms,
+    event_functions,
+    event_sizes,
+    forces_in_contact,
+    gap_sizes,
+    layout_of,
+    projected_speeds,
+    terms_at,
+    without_gaps,
+)
+from .._kane.right_hand_side import values_of, vector_field
+from .._kane.unilateral import OPEN, SLIDES, STICKS, Slip, contact_impact
+from .._scalarjit.nan import constant
+from .._scalarjit.scalar_function import ScalarFunction
+from .._system.system import State, System, packed, unpacked
+
+REST = 1e-9
+"""A contact rests if the rest of its bounces, 2 v / (a (1 - e)), takes less than this share of the duration."""
+
+
+class ContactEvent(NamedTuple):
+    """What happens to c contacts at an event. Fields (c,) are booleans.
+
+    - `touches`: open contacts whose gap vanishes. `opens`: closed contacts whose force vanishes.
+    - `slips`: sticking contacts whose friction reaches its limit.
+    - `stops`: sliding contacts whose slip along its direction vanishes.
+    - `is_own`: whether a contact causes this event. An event of the system may have changed the speeds.
+    - `is_start`: whether this is the start of the simulation, where no impact occurs.
+    """
+
+    touches: Array
+    opens: Array
+    slips: Array
+    stops: Array
+    is_own: Array
+    is_start: Array
+
+    @classmethod
+    def of_start(cls, touches: Array) -> ContactEvent:
+        no = jnp.zeros_like(touches)
+        return cls(touches, no, no, no, jnp.array(False), jnp.array(True))
+
+
+def gaps_at_start(system: System, t: Array, state: State) -> tuple[Array, Array]:
+    """Which contacts touch (c,), and whether none penetrates by more than a rounding error."""
+    gaps, sizes = gap_sizes(*constant((system, t, state.q, state.u)))
+    tolerance = float(jnp.finfo(gaps.dtype).eps) ** 0.6 * sizes
+    return jnp.abs(gaps) <= tolerance, jnp.all(gaps >= -tolerance)
+
+
+def rates_from_motion(system: System, t: Array, y: Array, inputs: dict[str, Array]) -> Array:
+    """The packed rates without those of the contact states, at a packed state without contact states."""
+    layout = layout_of(system)
+    state = unpacked(system, jnp.concatenate([y, jnp.zeros(layout.memory_size, y.dtype)]))
+    zero = jnp.zeros_like(t)
+    event = ContactEvent.of_start(gaps_at_start(system, t, state)[0])
+    found = changed_contacts(system, layout, t, packed(state), inputs, event, zero, zero, (zero, zero))
+    return vector_field(system, t, found.y, inputs)[: y.size]
+
+
+class Change(NamedTuple):
+    """The result of `changed_contacts`.
+
+    - `y`: the packed state afterwards.
+    - `delay` [s]: the rest of the bounces of a contact that rests now.
+    - `impulses` (c, r): of the impact, zero without one [N s].
+    - `is_determined`: whether the contact laws have a solution.
+    """
+
+    y: Array
+    delay: Array
+    impulses: Array
+    is_determined: Array
+
+
+def changed_contacts(
+    system: System,
+    layout: ContactLayout,
+    t: Array,
+    y: Array,
+    inputs: dict[str, Array],
+    event: ContactEvent,
+    reach: Array,
+    rest: Array,
+    tolerances: tuple[Any, Any],
+) -> Change:
+    """The contact states after an event, with the impact if contacts close.
+
+    **Arguments:**
+
+    - `t`, `y`, `inputs`: time [s], packed state and inputs at the event.
+    - `event`: what happens.
+    - `reach`: the time within which events are simultaneous [s].
+    - `rest`: a contact rests if the rest of its bounces takes less than this time [s].
+    - `tolerances`: relative and absolute, of a step.
+    """
+    state = unpacked(system, y)
+    assert state.contacts is not None
+    memory = ContactMemory.unpacked(layout, state.contacts)
+    values, bearing = values_of(system, state.x, inputs), jnp.asarray(layout.is_bearing)
+    before: ContactTerms = terms_at(system, t, state.q, state.u, values)
+    # Closed contacts have no velocity: the error of the solver must not become an impact.
+    u = jnp.where(event.is_own, projected_speeds(layout, before, memory, state.u), state.u)
+    before = before._replace(v=before.v + (before.C @ (u - state.u)).reshape(before.v.shape))
+    closed = (memory.states >= SLIDES) & ~bearing
+    v_N = before.v[:, 0]
+    # -- The impact, if contacts close.
+    # Events are simultaneous within their rounding errors, which are large for a gap of large coordinates.
+    errors = 256 * float(jnp.finfo(y.dtype).eps) * constant(gap_sizes(system, t, state.q, state.u)[1])
+    near = (memory.states == OPEN) & ~bearing & (jnp.abs(before.gaps) <= jnp.abs(v_N) * reach + errors)
+    closes = v_N < -_negligible(before)[:, 0]
+    takes_part = (closed | event.touches | near) & ~bearing & ~(event.is_start & closes)
+    strikes = takes_part & closes & ~(closed & event.is_own)
+    bounces = _rest_of_bounces(before, strikes)
+    # A bounce that is lower than the rounding error of the gap cannot be simulated.
+    is_low = 0.5 * (before.laws.restitution * v_N) ** 2 <= -before.a[:, 0] * (errors / 16)
+    rests, is_impact = strikes & (bounces < jnp.inf) & ((bounces < rest) | is_low), jnp.any(strikes)
+    e = jnp.where(strikes & ~rests, before.laws.restitution, 0.0)
+    has_friction = [has and not b for has, b in zip(layout.has_friction, layout.is_bearing, strict=True)]
+    friction = jnp.where(bearing, 0.0, before.laws.friction)
+    hit = contact_impact(before.delassus, before.v, e, friction, takes_part, has_friction)
+    impulses = jnp.where(is_impact & hit.determined, hit.impulses, 0.0)
+    u = u + before.X @ (before.B.T @ impulses.reshape(-1))
+    # -- The contact states that the accelerations allow.
+    after: ContactTerms = terms_at(system, t, state.q, u, values)
+    negligible = jnp.maximum(_negligible(before), _negligible(after))
+    is_apart = after.v[:, 0] > negligible[:, 0] + jnp.where(is_impact, 1e-10 * jnp.abs(v_N), 0.0)
+    is_apart &= is_impact | ~event.is_own
+    candidates = takes_part & ~is_apart & ~event.opens & ~(is_impact & (hit.states == OPEN) & strikes & (e > 0))
+    sticks = jnp.where(is_impact & ~bearing, hit.states == STICKS, jnp.zeros_like(closed))
+    new, is_determined = _states_by_accelerations(
+        layout, after, memory, candidates, sticks, event, negligible, tolerances
+    )
+    u = projected_speeds(layout, after, new, u)
+    n_q, n_u = len(system.coordinates), len(system.speeds)
+    # Gaps of closed contacts drift by the error of the solver.
+    q = without_gaps(after, takes_part & (event.touches | near | closed) & ~event.is_start, state.q)
+    y = jnp.concatenate([q, u, y[n_q + n_u : y.size - layout.memory_size], new.packed()])
+    delay = jnp.max(jnp.where(rests & (new.states != OPEN), bounces, 0.0), initial=0.0)
+    return Change(y, delay, impulses, is_determined & (~is_impact | hit.determined))
+
+
+def _negligible(terms: ContactTerms) -> Array:
+    """Velocities (c, r) that are rounding errors. All velocities of a contact have the size of the largest."""
+    size = jnp.max(terms.size, axis=1, keepdims=True)
+    return 1e3 * float(jnp.finfo(terms.v.dtype).eps) * jnp.broadcast_to(size, terms.size.shape)
+
+
+def _rest_of_bounces(terms: ContactTerms, strikes: Array) -> Array:
+    """The time (c,) that all bounces after this impact take, 2 v / (a (1 - e)); infinity if there is no end [s]."""
+    fall, e = -terms.a[:, 0], terms.laws.restitution
+    ends = strikes & (fall > 0) & (e < 1)
+    return jnp.where(ends, -2.0 * e * terms.v[:, 0] / jnp.where(ends, fall * (1.0 - e), 1.0), jnp.inf)
+
+
+def _states_by_accelerations(
+    layout: ContactLayout,
+    terms: ContactTerms,
+    memory: ContactMemory,
+    candidates: Array,
+    sticks: Array,
+    event: ContactEvent,
+    negligible: Array,
+    tolerances: tuple[Any, Any],
+) -> tuple[ContactMemory, Array]:
+    """The contact states between jumps, and whether the contact laws have a solution.
+
+    **Arguments:**
+
+    - `terms`: after the impact. `memory`: before it.
+    - `candidates` (c,): contacts that neither approach nor separate. `sticks` (c,): those that stick after the impact.
+    - `event`, `tolerances`: see `changed_contacts`. `negligible` (c, r): velocities that are rounding errors.
+    """
+    bearing, G, a, kinetic, d = jnp.asarray(layout.is_bearing), terms.delassus, terms.a, terms.laws.friction, layout.d
+    candidates, known, directions = candidates | bearing, None, memory.directions
+    is_still = slip = jnp.zeros(0)
+    if d:
+        # A bearing is a contact with a normal force of its own: G_NN = 1 and a_N = -(the largest friction).
+        corner = np.zeros((1 + d, 1 + d))
+        corner[0, 0] = 1.0
+        own = jnp.where(bearing, 1.0, 0.0).astype(G.dtype)
+        G = G + (jnp.diag(own)[:, None, :, None] * jnp.asarray(corner, G.dtype)[None, :, None, :])
+        a = a.at[:, 0].set(jnp.where(bearing, -terms.laws.static, a[:, 0]))
+        ratio = kinetic / jnp.where(terms.laws.static > 0, terms.laws.static, 1.0)
+        kinetic, static = (jnp.where(bearing, x, y) for x, y in ((ratio, kinetic), (1.0, terms.laws.static)))
+        v = terms.v[:, 1:]
+        speed = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(v) ** 2, axis=1))
+        stops = event.stops
+        if d == 2:
+            # In space, the slip need not vanish where its component along its first direction does.
+            rtol, atol = tolerances
+            errors = atol * jnp.sum(jnp.abs(terms.C), axis=1).reshape(terms.v.shape) + rtol * terms.size
+            stops &= speed <= 100 * jnp.sum(errors[:, 1:], axis=1)
+        is_still = stops | sticks | (speed <= jnp.max(negligible[:, 1:], axis=1))
+        slip = v / jnp.where(is_still, 1.0, jnp.where(speed > 0, speed, 1.0))[:, None]
+        slip = jnp.sign(jax.lax.stop_gradient(slip)) if d == 1 else slip
+        known = Slip(~is_still, slip, static, ~event.slips)
+    found = contact_impact(G, a, jnp.zeros_like(kinetic), kinetic, candidates, layout.has_friction, known)
+    states = jnp.where(candidates, found.states, OPEN).astype(a.dtype)
+    if d:
+        # A slip that begins is opposite to the friction.
+        slides = (states == SLIDES)[:, None]
+        push = jnp.where(slides, -found.impulses[:, 1:], 0.0)
+        strength2 = jnp.sum(push**2, axis=1)
+        strength = jnp.sqrt(jnp.where(strength2 > 0, strength2, 1.0))[:, None]
+        onset = jnp.where(slides, found.velocities[:, 1:], 0.0)
+        onset = jnp.where((strength2 > 0)[:, None], push / strength, _unit_rows(onset))
+        start = jnp.where(slides, jnp.where(is_still[:, None], onset, slip), 0.0)
+        if d == 1:
+            directions = jnp.sign(jax.lax.stop_gradient(start))
+        else:
+            signs = jnp.sign(start[:, :1]) * np.array([1.0, 0.0, 0.0])
+            directions = jnp.where(bearing[:, None], signs, jnp.sum(start[:, :, None] * terms.tangents, axis=1))
+    return ContactMemory(states, directions), found.determined
+
+
+def _unit_rows(x: Array) -> Array:
+    squares = jnp.sum(x**2, axis=1)
+    return x / jnp.sqrt(jnp.where(squares > 0, squares, 1.0))[:, None]
+
+
+@ScalarFunction
+def contact_event_values(system: System, t: Array, y: Array, inputs: dict[str, Array]) -> tuple[Array, Array]:
+    """The event functions of all contacts (2 c,), normal and tangential ones, and their rounding errors."""
+    layout, state = layout_of(system), unpacked(system, y)
+    values = values_of(system, state.x, inputs)
+    assert state.contacts is not None
+    _, _, forces, terms = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
+    memory = ContactMemory.unpacked(layout, state.contacts)
+    functions = event_functions(layout, terms, memory, forces.forces)
+    sizes = event_sizes(layout, terms, memory, forces.forces, gap_sizes.__wrapped__(system, t, state.q, state.u)[1])
+    normal, tangential = jax.lax.stop_gradient(sizes)
+    eps, tiny = float(jnp.finfo(y.dtype).eps), float(jnp.finfo(y.dtype).tiny)
+    # A contact without a force, as of two balls side by side, does not open. So the force must be negative.
+    rests = (memory.states >= SLIDES) & ~jnp.asarray(layout.is_bearing)
+    margins = jnp.where(rests, normal, 0.0), jnp.where(memory.states == STICKS, tangential, 0.0)
+    functions = [f + (64 * eps * margin + 1e3 * tiny) for f, margin in zip(functions, margins, strict=True)]
+    noise = 4 * eps * jnp.stack([normal, tangential], axis=1).reshape(-1)
+    return jnp.stack(functions, axis=1).reshape(-1), noise

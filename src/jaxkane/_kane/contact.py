@@ -1,0 +1,748 @@
+"""Unilateral contacts and dry friction: their description, and Kane's equations with contact forces.
+
+Every contact has a gap, a normal velocity v_N (positive if the bodies separate) and, with friction, the slip v_T. Its
+contact state is open, slides or sticks, and changes only at jumps (see `contact_changes`). Between two jumps the closed
+contacts are constraints with multipliers:
+
+    M u_dot = f + C^T F,   v = C u + c0
+    v_N_dot = 0,  F_T = -mu F_N v_T / |v_T|         while a contact slides
+    v_N_dot = 0,  v_T_dot = 0                       while it sticks
+    F = 0                                           while it is open
+
+The multipliers of contacts that are open are masked by numbers, so one program serves all contact states. With
+M = X^-T X^-1 and F = W z:
+
+    (C X)(C X)^T W z = -(C M^-1 f + v_dot at u_dot = 0)
+
+Rows that depend linearly on previous ones are omitted. Then the accelerations are unique, and the forces are those of
+the smallest norm. The right-hand side uses speeds that are projected onto the closed contacts, in the metric of M.
+Otherwise the slip of a sticking contact would drift by the error of the solver, and the gap by its integral.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._scalarjit.cache import Cache
+from .._scalarjit.compat import depends_on
+from .._scalarjit.components import (
+    Component,
+    add,
+    as_vector,
+    component,
+    cross,
+    is_exact,
+    is_written_out,
+    is_zero,
+    stack,
+)
+from .._scalarjit.scalar_function import ScalarFunction
+from .._system.kinematics import Frame, Point, Vector
+from .._system.motion import Motion
+from .._system.system import System
+from .arguments import Row, is_concrete, is_one_number
+from .description import dtype_of, jvp, structure_of
+from .impact import RowBasis, checked_restitution, inverse_root, least_norm
+from .kanes_method import KaneEquations, unit
+from .scaling import term_sizes
+from .unilateral import MOST_CONTACTS, OPEN, SLIDES, STICKS
+
+
+@dataclasses.dataclass(frozen=True, init=False)
+class Contact:
+    """For `System.contacts`: a contact that pushes but does not pull.
+
+        def contacts(self, t, q, u, motion):
+            return {
+                "heel": jk.Contact(motion["heel"], motion.N.y, friction=self.friction),
+                "stop": jk.Contact(gap=self.limit - q["knee"], restitution=0.2),
+            }
+
+    **Arguments:**
+
+    - `point`: a Point of the body that touches.
+    - `normal`: the direction in which the surface pushes this point, a Vector. Its length does not matter.
+    - `gap`: the distance, zero at the contact and positive before it. By default, the distance of the point from the
+        plane through the surface point (the origin O without one), along the normal. With a gap and no point, the
+        contact has no friction. For example, the gap of a stop is an angle.
+    - `restitution`: Newton's coefficient e of restitution, from 0 to 1: v_N+ = -e v_N-.
+    - `friction`: the coefficient mu of kinetic friction. An impact has Coulomb friction with the impulses of the whole
+        impact (Moreau).
+    - `static`: the coefficient of static friction. By default, that of kinetic friction.
+    - `surface`: a Point of the surface, if the surface moves. Its velocity is subtracted.
+
+    **Raises:** `TypeError` and `ValueError` for arguments of a wrong type or outside their range.
+    """
+
+    point: Point | None
+    normal: Vector | None
+    gap: Any
+    restitution: Any
+    friction: Any
+    static: Any
+    surface: Point | None
+
+    def __init__(
+        self,
+        point: Point | None = None,
+        normal: Vector | None = None,
+        gap: Any = None,
+        restitution: Any = 0.0,
+        friction: Any = 0.0,
+        static: Any = None,
+        surface: Point | None = None,
+    ):
+        for name, value, kind in (("point", point, Point), ("normal", normal, Vector), ("surface", surface, Point)):
+            if value is not None and not isinstance(value, kind):
+                raise TypeError(f"Contact: `{name}` must be a {kind.__name__}, got {value!r}.")
+        if (point is None) != (normal is None) or (point is None and gap is None):
+            raise ValueError("Contact: pass a point and a normal, or a gap, or all three.")
+        if point is None and surface is not None:
+            raise ValueError("Contact: `surface` needs a point and a normal.")
+        if not is_one_number(restitution):
+            raise TypeError(f"Contact: the restitution must be one number, got {restitution!r}.")
+        checked_restitution(restitution)
+        for name, value in (("gap", gap), ("friction", friction), ("static", static)):
+            if value is not None and not is_one_number(value):
+                raise TypeError(f"Contact: `{name}` must be one number, got {value!r}.")
+        friction, static = _checked_friction("Contact", "friction", friction, static)
+        if point is None and not (is_exact(friction) and is_zero(friction)):
+            raise ValueError(
+                "Contact: a contact with friction needs a point and a normal, because a gap does not determine the "
+                "slip. For friction along a coordinate use jaxkane.DryFriction."
+            )
+        values = (point, normal, gap, restitution, friction, static, surface)
+        for field, value in zip(dataclasses.fields(self), values, strict=True):
+            object.__setattr__(self, field.name, value)
+
+
+@dataclasses.dataclass(frozen=True, init=False)
+class DryFriction:
+    """For `System.contacts`: dry friction of a bearing, a slide or a belt, whose normal force is known.
+
+        def contacts(self, t, q, u, motion):
+            return {"belt": jk.DryFriction(u["x_dot"] - self.speed, self.kinetic, static=self.static)}
+
+    **Arguments:**
+
+    - `slip`: the slip velocity [m/s or rad/s], affine in the speeds.
+    - `kinetic`: the friction force while it slips [N or N m].
+    - `static`: the largest friction force while it sticks [N or N m]. By default, the kinetic one.
+
+    **Raises:** `TypeError` and `ValueError` for arguments of a wrong type or outside their range.
+    """
+
+    slip: Any
+    kinetic: Any
+    static: Any
+
+    def __init__(self, slip: Any, kinetic: Any, static: Any = None):
+        for name, value in (("slip", slip), ("kinetic", kinetic), ("static", static)):
+            if not (value is None and name == "static") and not is_one_number(value):
+                raise TypeError(f"DryFriction: `{name}` must be one number, got {value!r}.")
+        kinetic, static = _checked_friction("DryFriction", "kinetic", kinetic, static)
+        for name, value in (("slip", slip), ("kinetic", kinetic), ("static", static)):
+            object.__setattr__(self, name, value)
+
+
+def _checked_friction(label: str, name: str, kinetic: Any, static: Any) -> tuple[Any, Any]:
+    if is_concrete(kinetic) and not float(kinetic) >= 0:
+        raise ValueError(f"{label}: `{name}` is {float(kinetic)}. It must not be negative.")
+    if static is None:
+        return kinetic, kinetic
+    if is_concrete(kinetic, static) and not float(static) >= float(kinetic):
+        raise ValueError(
+            f"{label}: the static friction {float(static)} is smaller than the kinetic friction {float(kinetic)}."
+        )
+    return kinetic, static
+
+
+class ContactLayout(NamedTuple):
+    """The contacts of a system, without numbers.
+
+    - `names` (c,): in alphabetical order.
+    - `has_friction` (c,): whether each contact has tangential rows.
+    - `is_bearing` (c,): whether it is a `DryFriction`.
+    - `in_space`: whether the slip has two components.
+    - `planes` (c,): the axis of N along which no point of the contact moves, or None.
+    - `has_point` (c,): whether a contact has a point.
+    - `reads_time`: whether any contact uses the time.
+    - `n_residuals`: the number of velocity residuals with multipliers (see `with_multipliers`).
+    """
+
+    names: tuple[str, ...]
+    has_friction: tuple[bool, ...]
+    is_bearing: tuple[bool, ...]
+    in_space: bool
+    planes: tuple[int | None, ...]
+    has_point: tuple[bool, ...]
+    reads_time: bool = False
+    n_residuals: int = 0
+
+    @property
+    def d(self) -> int:
+        """The number of tangential rows of each contact."""
+        return (2 if self.in_space else 1) if any(self.has_friction) else 0
+
+    @property
+    def memory_width(self) -> int:
+        """The number of floats of a contact state: the state itself and the direction of the slip."""
+        return 1 + (3 if self.d == 2 else self.d)
+
+    @property
+    def memory_size(self) -> int:
+        return len(self.names) * self.memory_width
+
+
+REDUNDANT = 1e-6
+"""A velocity residual with a multiplier is redundant if its part that does not depend on the others is relatively
+smaller. Lengths in files are often rounded to six digits."""
+
+NO_CONTACTS = ContactLayout((), (), (), False, (), ())
+
+
+def has_contacts(system: System) -> bool:
+    return type(system).contacts is not System.contacts
+
+
+def has_multipliers(system: System) -> bool:
+    """Whether the constraints of a system have multipliers instead of dependent speeds."""
+    return hasattr(system, "multiplier_residuals")
+
+
+def layout_of(system: System) -> ContactLayout:
+    """The contacts of a system, which are traced for this.
+
+    **Raises:** `TypeError` or `ValueError` for contacts that are not a dict of contacts by name; `ValueError` for more
+    than four contacts, and for a system with too many speeds.
+    """
+    if not has_contacts(system) and not has_multipliers(system):
+        return NO_CONTACTS
+    found: list[ContactLayout] = []
+
+    def trace(t: Array, q: Array, u: Array) -> Any:
+        kane = KaneEquations(system, t, q, u)
+        found.append(_traced_layout(kane))
+        rows = ContactRows(kane, found[-1])
+        laws = [_laws(x) for x in _contacts(kane, kane.t, kane.q, kane.u_all)[1].values()]
+        return rows.velocities(kane.t, kane.q, kane.u_all), rows.gaps(kane.t, kane.q, kane.u_all), laws
+
+    if not is_written_out(len(system.speeds)):
+        raise ValueError(
+            f"{type(system).__name__}: contacts need a system with at most 12 speeds, and this one has "
+            f"{len(system.speeds)}. Use MuJoCo for large systems with contacts."
+        )
+    dtype = dtype_of(system)
+    q, u = (jnp.zeros(len(names), dtype) for names in (system.coordinates, system.speeds))
+    program = jax.make_jaxpr(trace)(jnp.zeros((), dtype), q, u)
+    return found[0]._replace(reads_time=bool(any(depends_on(program, [0]))))
+
+
+def _contacts(kane: KaneEquations, t: Component, q: Row, u: Row) -> tuple[Motion, dict[str, Any]]:
+    motion = kane.motion(t, q, u)
+    contacts = kane.system.contacts(t, q, u, motion)
+    label = f"{kane.name}.contacts"
+    if not isinstance(contacts, Mapping):
+        raise TypeError(f"{label} must return a dict of contacts by name, got {contacts!r}.")
+    for name, contact in contacts.items():
+        if not isinstance(name, str) or not name:
+            raise TypeError(f"{label}: the name of a contact must be a string, got {name!r}.")
+        if not isinstance(contact, (Contact, DryFriction)):
+            raise TypeError(f"{label}: {name!r} must be a jaxkane.Contact or jaxkane.DryFriction, got {contact!r}.")
+    return motion, {name: contacts[name] for name in sorted(contacts)}
+
+
+def _traced_layout(kane: KaneEquations) -> ContactLayout:
+    motion, contacts = _contacts(kane, kane.t, kane.q, kane.u_all)
+    if len(contacts) > MOST_CONTACTS:
+        raise ValueError(
+            f"{kane.name} has {len(contacts)} contacts: {', '.join(contacts)}. At most {MOST_CONTACTS} are possible. "
+            "Use MuJoCo for systems with many contacts."
+        )
+    bearings = [isinstance(x, DryFriction) for x in contacts.values()]
+    frictions = [b or not _is_zero(x.friction) for b, x in zip(bearings, contacts.values(), strict=True)]
+    planes = [_plane(x, motion.N) if isinstance(x, Contact) and x.point is not None else 2 for x in contacts.values()]
+    in_space = any(f and p is None for f, p in zip(frictions, planes, strict=True))
+    points = [isinstance(x, Contact) and x.point is not None for x in contacts.values()]
+    n_residuals = len(ContactRows(kane, NO_CONTACTS).residuals(kane.t, kane.q, kane.u_all))
+    layout = tuple(contacts), tuple(frictions), tuple(bearings), in_space, tuple(planes), tuple(points)
+    return ContactLayout(*layout, n_residuals=n_residuals)
+
+
+def _is_zero(x: Any) -> bool:
+    return is_exact(component(x)) and is_zero(component(x))
+
+
+def _relative_velocity(contact: Contact) -> Vector:
+    v = contact.point.velocity  # pyright: ignore[reportOptionalMemberAccess]
+    return v if contact.surface is None else v - contact.surface.velocity
+
+
+def _unit_normal(contact: Contact, N: Frame) -> tuple[Component, ...]:
+    n = contact.normal.components_in(N)  # pyright: ignore[reportOptionalMemberAccess]
+    if all(is_exact(x) for x in n) and sum(float(x) ** 2 for x in n) == 1.0:
+        return n
+    return contact.normal.normalize().components_in(N)  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def _plane(contact: Contact, N: Frame) -> int | None:
+    """An axis of N along which the contact neither moves nor pushes, or None."""
+    v, n = _relative_velocity(contact).components_in(N), _unit_normal(contact, N)
+    still = [i for i in range(3) if is_exact(v[i]) and is_zero(v[i]) and is_exact(n[i]) and is_zero(n[i])]
+    return still[-1] if still else None
+
+
+def _tangents(normal: Row, plane: int | None, in_space: bool) -> list[Row]:
+    """Unit vectors of the slip, with components in N."""
+    a, b, c = normal
+    if plane is not None:
+        # n x the axis, with the sign for which a floor has the slip along x (or y).
+        along: Row = [(0.0, c, _minus(b)), (c, 0.0, _minus(a)), (b, _minus(a), 0.0)][plane]
+        return [along, (0.0, 0.0, 0.0)] if in_space else [along]
+    is_flat = is_exact(a) and is_exact(b) and is_exact(c)
+    if is_flat and abs(float(c)) > 0.9:
+        first: Any = (c, 0.0, _minus(a))
+    elif is_flat:
+        first = (b, _minus(a), 0.0)
+    else:
+        steep = jnp.abs(jnp.asarray(c)) > 0.6
+        first = tuple(jnp.where(steep, x, y) for x, y in zip((c, 0.0 * c, _minus(a)), (b, _minus(a), 0.0 * c)))
+    size = jnp.sqrt(sum(jnp.asarray(x) ** 2 for x in first))
+    first = first if is_flat and float(np.asarray(_number(size))) == 1.0 else tuple(x / size for x in first)
+    return [first, cross(normal, first)]  # pyright: ignore[reportArgumentType]
+
+
+def _number(x: Any) -> float:
+    return float(x) if is_concrete(x) else float("nan")
+
+
+def _minus(x: Component) -> Component:
+    return -x
+
+
+class Laws(NamedTuple):
+    """Numbers of the contacts: restitution, kinetic and static friction (c,), each zero where it does not apply."""
+
+    restitution: Array
+    friction: Array
+    static: Array
+
+
+class ContactTerms(NamedTuple):
+    """Kane's equations of a system with c contacts of r = 1 + d rows each, at one state.
+
+    - `gaps` (c,): of bearings infinite. `v` (c, r): velocities of the rows. `size` (c, r): sizes of their terms.
+    - `C` (c r, n): derivatives of these velocities by the independent speeds. `b` (c r,): v_dot at u_dot = 0.
+    - `X` (n, n): with X^T M X = 1. `w` (n,): X^T f.
+    - `laws`: restitution and friction.
+    - `tangents` (c, d, 3): directions of the slip in N.
+    - `gap_rates` (c,): rates of the gaps.
+    - `Q` (n_q, n): derivatives of the rates of the coordinates by the independent speeds.
+
+    With residuals that have multipliers, X X^T is the inverse of M on the speeds that they permit. Then `a0` (n,) are
+    the accelerations that the residuals require, and `shift` (n,) is the change of the speeds to the nearest ones that
+    they permit.
+    """
+
+    gaps: Array
+    v: Array
+    size: Array
+    C: Array
+    b: Array
+    X: Array
+    w: Array
+    laws: Laws
+    tangents: Array
+    gap_rates: Array
+    Q: Array
+    a0: Array
+    shift: Array
+
+    @property
+    def B(self) -> Array:
+        """C X (c r, n)."""
+        return self.C @ self.X
+
+    @property
+    def a(self) -> Array:
+        """v_dot (c, r) if all contacts were open."""
+        return (self.B @ self.w + self.b).reshape(self.v.shape)
+
+    @property
+    def delassus(self) -> Array:
+        """G (c, r, c, r) = C M^-1 C^T."""
+        return (self.B @ self.B.T).reshape(self.v.shape * 2)
+
+
+class ContactRows:
+    """The velocities of the contacts as functions of time, coordinates and all speeds."""
+
+    def __init__(self, kane: KaneEquations, layout: ContactLayout):
+        self.kane, self.layout = kane, layout
+
+    def gaps(self, t: Component, q: Row, u: Row) -> list[Component]:
+        motion, contacts = _contacts(self.kane, t, q, u)
+        return [self._gap(x, motion.N) for x in contacts.values()]
+
+    def _gap(self, contact: Any, N: Frame) -> Component:
+        if isinstance(contact, DryFriction):
+            return 1.0
+        if contact.gap is not None:
+            return component(contact.gap)
+        position = contact.point.position
+        position = position if contact.surface is None else position - contact.surface.position
+        return position.dot(N.vector(*_unit_normal(contact, N)))
+
+    def gap_rates(self, t: Component, q: Row, u: Row) -> list[Component]:
+        """Rates of the gaps along the motion with these speeds."""
+        direction = (1.0, *self.kane.rates(t, q, u))
+        return jvp(lambda t, *q: self.gaps(t, q, u), (t, *q), direction)[1]
+
+    def velocities(self, t: Component, q: Row, u: Row) -> list[list[Component]]:
+        """The velocities (c, r): the normal one, and the tangential ones."""
+        motion, contacts = _contacts(self.kane, t, q, u)
+        needs_gap = any(isinstance(x, Contact) and x.point is None for x in contacts.values())
+        rates = self.gap_rates(t, q, u) if needs_gap else [0.0] * len(contacts)
+        d, rows = self.layout.d, []
+        for i, contact in enumerate(contacts.values()):
+            if isinstance(contact, DryFriction):
+                rows.append([0.0, component(contact.slip), *[0.0] * (d - 1)])
+            elif contact.point is None:
+                rows.append([rates[i], *[0.0] * d])
+            else:
+                v, n = _relative_velocity(contact), _unit_normal(contact, motion.N)
+                tangents = self.tangents_of(n, i)
+                rows.append([v.dot(motion.N.vector(*e)) for e in (n, *tangents)])
+        return rows
+
+    def residuals(self, t: Component, q: Row, u: Row) -> Row:
+        """Velocity residuals that have multipliers."""
+        system: Any = self.kane.system
+        return system.multiplier_residuals(t, q, u) if has_multipliers(system) else ()
+
+    def tangents_of(self, normal: Row, i: int) -> list[Row]:
+        d = self.layout.d
+        if not self.layout.has_friction[i]:
+            return [(0.0, 0.0, 0.0)] * d
+        return _tangents(normal, self.layout.planes[i], d == 2)
+
+
+def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True) -> ContactTerms:
+    rows, c, r = ContactRows(kane, layout), len(layout.names), 1 + layout.d
+    t, q, u = kane.t, kane.q, kane.u_all
+    like = jnp.zeros((), kane.dtype)
+
+    def flat(values: Sequence[Sequence[Component]]) -> Array:
+        return as_vector([x for row in values for x in row], like)
+
+    def velocities(u: Row) -> list[Component]:
+        return [x for row in rows.velocities(t, q, u) for x in row]
+
+    v = flat(rows.velocities(t, q, u))
+    columns = [kane.along_speeds(velocities, kane.with_dependent(unit(kane.n, i))) for i in range(kane.n)]
+    C = stack(columns).astype(kane.dtype).T if c else jnp.zeros((0, kane.n), kane.dtype)
+    partials = kane.partial_velocities()
+    X = stack(inverse_root(kane.mass_matrix(partials))).astype(kane.dtype)
+    a0 = shift = jnp.zeros(kane.n, kane.dtype)
+    moving = (1.0, *kane.q_dot, *(0.0,) * kane.n, *kane.bias())
+    n_q = len(q)
+    if layout.n_residuals:
+        rates = [kane.along_speeds(lambda u: rows.residuals(t, q, u), unit(kane.n, i)) for i in range(kane.n)]
+        basis = RowBasis.of(stack(rates).astype(kane.dtype).T @ X, REDUNDANT)
+        residuals = as_vector(rows.residuals(t, q, u), like)
+        drift = jvp(lambda t, *z: rows.residuals(t, z[:n_q], z[n_q:]), (t, *q, *u), moving)[1]
+        a0 = X @ (basis.solve(-as_vector(drift, like))[0] @ basis.Q)
+        shift = X @ (basis.solve(-residuals)[0] @ basis.Q)
+        X = X - (X @ basis.Q.T) @ basis.Q
+    u_array = as_vector(kane.u, like)
+    size = jnp.abs(v) + jnp.abs(C) @ jnp.abs(u_array)
+    motion, contacts = _contacts(kane, t, q, u)
+    laws = [_laws(x) for x in contacts.values()]
+    laws = Laws(*(as_vector([law[i] for law in laws], like) for i in range(3)))
+    tangents = [
+        rows.tangents_of(_unit_normal(x, motion.N), i) if isinstance(x, Contact) and x.point is not None else
+        [(0.0, 0.0, 0.0)] * layout.d
+        for i, x in enumerate(contacts.values())
+    ]  # fmt: skip
+    T = as_vector([y for each in tangents for row in each for y in row], like).reshape(c, layout.d, 3)
+    gaps = as_vector(rows.gaps(t, q, u), like)
+    if with_forces:
+        f = as_vector([add(x, y) for x, y in zip(kane.active_forces(partials), kane.inertia_forces(partials))], like)
+
+        def along(t: Component, *z: Component) -> list[Component]:
+            return [x for row in rows.velocities(t, z[:n_q], z[n_q:]) for x in row]
+
+        b = as_vector(jvp(along, (t, *q, *u), moving)[1], like) + C @ a0
+        w = X.T @ f
+        gap_rates = as_vector(rows.gap_rates(t, q, u), like)
+    else:
+        b, w, gap_rates = jnp.zeros_like(v), jnp.zeros(kane.n, kane.dtype), jnp.zeros_like(gaps)
+    along_q = [
+        kane.along_speeds(lambda u: kane.rates(t, q, u), kane.with_dependent(unit(kane.n, i))) for i in range(kane.n)
+    ]
+    Q = stack(along_q).astype(kane.dtype).T
+    return ContactTerms(gaps, v.reshape(c, r), size.reshape(c, r), C, b, X, w, laws, T, gap_rates, Q, a0, shift)
+
+
+def _laws(contact: Any) -> tuple[Component, Component, Component]:
+    if isinstance(contact, DryFriction):
+        return 0.0, component(contact.kinetic), component(contact.static)
+    return component(contact.restitution), component(contact.friction), component(contact.static)
+
+
+def speeds_in_contact(system: System, t: Component, q: Array, u: Array, touching: Sequence[str]) -> Array:
+    """The nearest speeds (n,), in the metric of M, for which the `touching` contacts neither approach nor separate."""
+    layout = layout_of(system)
+    memory = ContactMemory.unpacked(layout, jnp.zeros(layout.memory_size, q.dtype))
+    states = jnp.asarray([SLIDES if name in touching else OPEN for name in layout.names], q.dtype)
+    memory = memory._replace(states=states)
+    return projected_speeds(layout, terms_at(system, t, q, u, {}), memory, u)
+
+
+@ScalarFunction
+def _gap_rates_and_velocities(system: System, t: Component, q: Array, u: Array) -> tuple[Array, Array]:
+    kane, layout = KaneEquations(system, t, q, u), layout_of(system)
+    rows = ContactRows(kane, layout)
+    rates = rows.gap_rates(kane.t, kane.q, kane.u_all)
+    return as_vector(rates, q), as_vector([row[0] for row in rows.velocities(kane.t, kane.q, kane.u_all)], q)
+
+
+_CHECKED = Cache()  # structures
+
+
+def check_contacts(system: System, t: Component, q: Array) -> None:
+    """Raise `ValueError` if the rate of a gap is not the normal velocity of its point, or if bodies penetrate.
+
+    The rates are compared once for each structure, at speeds of size 1.
+    """
+    layout = layout_of(system)
+    if not layout.names or not is_concrete(system, t, q):
+        return
+    t, u = np.asarray(t, q.dtype), np.random.default_rng(0).uniform(0.5, 1.5, len(system.speeds)).astype(q.dtype)
+    label = f"{type(system).__name__}.contacts"
+
+    def compare() -> bool:
+        rates, velocities = _gap_rates_and_velocities.numpy(system, t, np.asarray(q), u)
+        size = np.abs(rates) + np.abs(velocities) + np.finfo(q.dtype).tiny
+        for name, i in ((name, i) for i, name in enumerate(layout.names) if layout.has_point[i]):
+            if abs(rates[i] - velocities[i]) > 1e3 * float(np.finfo(q.dtype).eps) ** 0.75 * size[i]:
+                raise ValueError(
+                    f"{label}: the gap of {name!r} changes by {rates[i]:.6g}, but the velocity of its point along the "
+                    f"normal is {velocities[i]:.6g} (at speeds of size 1). Pass the point of the body that touches, "
+                    "with the velocity of its material, and the gap of this point."
+                )
+        return True
+
+    _CHECKED.get(structure_of(system), compare)
+    gaps, sizes = gap_sizes.numpy(system, t, np.asarray(q), np.zeros_like(u))
+    for name, gap, size in zip(layout.names, gaps, sizes, strict=True):
+        if gap < -(float(np.finfo(q.dtype).eps) ** 0.6) * size:
+            raise ValueError(
+                f"{label}: the gap of {name!r} is {gap:.6g} at the start. It must not be negative. Find touching "
+                f"coordinates with jaxkane.assemble(system, q, touching=({name!r},))."
+            )
+
+
+class ContactMemory(NamedTuple):
+    """The contact states: `states` (c,) as floats, and `directions` (c, k) of the slip at its start.
+
+    In a plane, a direction is a sign, k = 1. In space it is a unit vector in N, k = 3. Without friction, k = 0.
+    """
+
+    states: Array
+    directions: Array
+
+    @classmethod
+    def unpacked(cls, layout: ContactLayout, memory: Array) -> ContactMemory:
+        table = memory.reshape(len(layout.names), layout.memory_width)
+        return cls(table[:, 0], table[:, 1:])
+
+    def packed(self) -> Array:
+        return jnp.concatenate([self.states[:, None], self.directions], axis=1).reshape(-1)
+
+
+def slip_directions(layout: ContactLayout, terms: ContactTerms, memory: ContactMemory) -> Array:
+    """Directions (c, d) of the slip in the tangents, opposite to the friction.
+
+    In space it is the direction of the velocity. It continues beyond a zero of the velocity along a line, so that a
+    step over this zero is smooth. At the start of the slip it is the remembered direction.
+    """
+    if layout.d < 2:
+        return memory.directions
+    start = jnp.sum(terms.tangents * memory.directions[:, None, :], axis=2)
+    v = terms.v[:, 1:]
+    speed2 = jnp.sum(v**2, axis=1)
+    is_fast = speed2 > (1e3 * float(jnp.finfo(v.dtype).eps) * jnp.sum(terms.size[:, 1:], axis=1)) ** 2
+    speed = jnp.sqrt(jnp.where(is_fast, speed2, 1.0))
+    way = jnp.where(jnp.sum(v * start, axis=1) < 0, -1.0, 1.0)
+    return jnp.where(is_fast[:, None], (way / speed)[:, None] * v, start)
+
+
+class ContactForces(NamedTuple):
+    """Contact forces and accelerations.
+
+    - `forces` (c, r) [N]: normal and tangential. - `u_dot` (n,): accelerations of the independent speeds.
+    """
+
+    forces: Array
+    u_dot: Array
+
+
+def solve_forces(layout: ContactLayout, terms: ContactTerms, memory: ContactMemory) -> ContactForces:
+    """The contact forces and the accelerations for given contact states."""
+    c, r = terms.v.shape
+    if not c:
+        return ContactForces(jnp.zeros_like(terms.v), terms.a0 + terms.X @ terms.w)
+    is_bearing = jnp.asarray(layout.is_bearing)
+    closed = (memory.states >= SLIDES) & ~is_bearing
+    slides = memory.states == SLIDES
+    active = _active_rows(layout, memory)
+    dirs, B, w = slip_directions(layout, terms, memory), terms.B, terms.w
+    if layout.d:
+        # A bearing that slides has a known force.
+        known = jnp.where(is_bearing & slides, -terms.laws.friction, 0.0)[:, None] * dirs
+        known = jnp.concatenate([jnp.zeros((c, 1), w.dtype), known], axis=1).reshape(-1)
+        w = w + B.T @ known
+        ratios = jnp.where(closed & slides, -terms.laws.friction, 0.0)[:, None] * dirs
+        ratios = jnp.concatenate([jnp.zeros((c, 1), w.dtype), ratios], axis=1)
+    else:
+        known, ratios = jnp.zeros(c * r, w.dtype), jnp.zeros((c, r), w.dtype)
+    # F = W z:  the friction of a contact that slides is proportional to its normal force
+    blocks = np.eye(r, dtype=w.dtype)[None] + ratios[:, :, None] * np.eye(r, dtype=w.dtype)[None, :1]
+    W = (np.eye(c, dtype=w.dtype)[:, None, :, None] * blocks[:, :, None, :]).reshape(c * r, c * r)
+    mask = active.reshape(-1)
+    A = jnp.where(mask[:, None] & mask[None], (B @ B.T) @ W, 0.0)
+    z = least_norm(A, jnp.where(mask, -(B @ w + terms.b), 0.0))[0]
+    forces = jnp.asarray(W) @ z
+    u_dot = terms.a0 + terms.X @ (w + B.T @ forces)
+    return ContactForces((forces + known).reshape(c, r), u_dot)
+
+
+def _active_rows(layout: ContactLayout, memory: ContactMemory) -> Array:
+    """Which rows (c, r) are constraints."""
+    is_bearing = jnp.asarray(layout.is_bearing)
+    normal = (memory.states >= SLIDES) & ~is_bearing
+    tangential = (memory.states == STICKS)[:, None] & jnp.asarray(_tangential_rows(layout))
+    return jnp.concatenate([normal[:, None], tangential], axis=1)
+
+
+def _tangential_rows(layout: ContactLayout) -> np.ndarray:
+    """Which tangential rows (c, d) exist."""
+    rows = np.zeros((len(layout.names), layout.d), bool)
+    for i, (has, plane, bearing) in enumerate(zip(layout.has_friction, layout.planes, layout.is_bearing, strict=True)):
+        rows[i, : (1 if bearing or plane is not None else layout.d) if has else 0] = True
+    return rows
+
+
+def projected_speeds(layout: ContactLayout, terms: ContactTerms, memory: ContactMemory, u: Array) -> Array:
+    """The nearest speeds (n,), in the metric of M, for which closed contacts do not move."""
+    if not layout.names:
+        return u + terms.shift
+    mask = _active_rows(layout, memory).reshape(-1)
+    B = jnp.where(mask[:, None], terms.B, 0.0)
+    v = terms.v.reshape(-1) + terms.C @ terms.shift
+    return u + terms.shift + terms.X @ least_norm(B, jnp.where(mask, -v, 0.0))[0]
+
+
+def without_gaps(terms: ContactTerms, closed: Array, q: Array) -> Array:
+    """The nearest coordinates (n_q,) at which the gaps of `closed` contacts (c,) vanish, to the first order.
+
+    The displacement is that of virtual speeds, so it satisfies the velocity constraints.
+    """
+    rows = jnp.where(closed[:, None], terms.B.reshape(*terms.v.shape, -1)[:, 0], 0.0)
+    return q + terms.Q @ (terms.X @ least_norm(rows, jnp.where(closed, -terms.gaps, 0.0))[0])
+
+
+def _projected(
+    system: System, layout: ContactLayout, t: Component, q: Array, u: Array, memory: ContactMemory, values: Any
+) -> tuple[KaneEquations, Array]:
+    """Kane's equations at the projected speeds, and these speeds."""
+    free = KaneEquations(system, t, q, u, values)
+    u = projected_speeds(layout, _terms(free, layout, with_forces=False), memory, u)
+    return KaneEquations(system, t, q, u, values), u
+
+
+def forces_in_contact(
+    system: System, layout: ContactLayout, t: Component, q: Array, u: Array, memory: Array | None, values: Any
+) -> tuple[KaneEquations, Array, ContactForces, ContactTerms]:
+    """Kane's equations at the projected speeds, these speeds, the contact forces and accelerations, and the terms."""
+    states = ContactMemory.unpacked(layout, jnp.zeros(layout.memory_size, q.dtype) if memory is None else memory)
+    kane, u = _projected(system, layout, t, q, u, states, values)
+    terms = _terms(kane, layout)
+    return kane, u, solve_forces(layout, terms, states), terms
+
+
+@ScalarFunction
+def terms_at(system: System, t: Component, q: Array, u: Array, values: Any) -> ContactTerms:
+    """The terms of all contacts at speeds that are not projected."""
+    return _terms(KaneEquations(system, t, q, u, values), layout_of(system))
+
+
+@ScalarFunction.compile_cheaply
+def gap_sizes(system: System, t: Component, q: Array, u: Array) -> tuple[Array, Array]:
+    """The gaps (c,) of all contacts and the sizes of their terms. Of a bearing 1."""
+    layout = layout_of(system)
+
+    def gaps(system: System, t: Component, q: Array, u: Array) -> Array:
+        kane = KaneEquations(system, t, q, u)
+        return as_vector(ContactRows(kane, layout).gaps(kane.t, kane.q, kane.u_all), q)
+
+    return gaps(system, t, q, u), term_sizes(gaps, system, t, q, u)
+
+
+def event_functions(
+    layout: ContactLayout, terms: ContactTerms, memory: ContactMemory, forces: Array
+) -> tuple[Array, Array]:
+    """Two functions of each contact (c,) that fall through zero when its state changes.
+
+    - The gap of an open contact, the normal force of a closed one.
+    - While a contact slides, the slip along its direction at the start. While it sticks, the distance of the friction
+      from its limit.
+    """
+    closed, one = memory.states >= SLIDES, jnp.ones_like(terms.gaps)
+    is_bearing = jnp.asarray(layout.is_bearing)
+    normal = jnp.where(is_bearing, one, jnp.where(closed, forces[:, 0], terms.gaps))
+    if not layout.d:
+        return normal, one
+    start = memory.directions
+    if layout.d == 2:
+        start = jnp.sum(terms.tangents * memory.directions[:, None, :], axis=2)
+        bearing = jnp.asarray([[1.0, 0.0] if x else [0.0, 0.0] for x in layout.is_bearing], start.dtype)
+        start = jnp.where(is_bearing[:, None], bearing * memory.directions[:, :1], start)
+    slip = jnp.sum(terms.v[:, 1:] * start, axis=1)
+    friction = _norm(forces[:, 1:])
+    bound = jnp.where(is_bearing, terms.laws.static, terms.laws.static * forces[:, 0])
+    has = jnp.asarray(layout.has_friction)
+    tangential = jnp.where(memory.states == STICKS, bound - friction, jnp.where(closed, slip, one))
+    return normal, jnp.where(has, tangential, one)
+
+
+def _norm(x: Array) -> Array:
+    """The length of each row, whose derivative at zero is zero."""
+    if x.shape[1] == 1:
+        return jnp.abs(x[:, 0])
+    squares = jnp.sum(x**2, axis=1)
+    return jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1.0)), 0.0)
+
+
+def event_sizes(
+    layout: ContactLayout, terms: ContactTerms, memory: ContactMemory, forces: Array, gap_sizes: Array
+) -> tuple[Array, Array]:
+    """The sizes of the terms of both `event_functions` of each contact (c,)."""
+    c, r = terms.v.shape
+    closed, d = memory.states >= SLIDES, layout.d
+    needed = (jnp.abs(terms.B) @ jnp.abs(terms.w) + jnp.abs(terms.b)).reshape(c, r)
+    stiffness = jnp.sum(terms.B.reshape(c, r, -1) ** 2, axis=2)
+    sizes = needed / jnp.where(stiffness > 0, stiffness, 1.0) + jnp.abs(forces)
+    normal = jnp.where(jnp.asarray(layout.is_bearing), 0.0, jnp.where(closed, sizes[:, 0], gap_sizes))
+    if not d:
+        return normal, jnp.zeros_like(normal)
+    tangential = jnp.where(memory.states == STICKS, jnp.sum(sizes[:, 1:], axis=1), jnp.sum(terms.size[:, 1:], axis=1))
+    return normal, jnp.where(closed & jnp.asarray(layout.has_friction), tangential, 0.0)
