@@ -235,60 +235,6 @@ def case(name):
     return system, 0.7, np.array(q), np.array(u), np.linspace(-0.4, 0.9, len(system.inputs))
 
 
-class RimlessWheel(jk.System):
-    """Spokes 2 half apart on a slope: the wheel turns about one foot, then about the next."""
-
-    half: Scalar = parameter(0.4, unit="rad")
-    slope: Scalar = parameter(0.08, unit="rad")
-    coordinates, speeds = ("angle",), ("rate",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        spoke = N.rotate(3, -q["angle"], -u["rate"])
-        return jk.Motion([jk.Body(1.0, 0.0, O.fixed(1.0 * spoke.y))])
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -9.81 * motion.N.y)
-
-    def events(self, t, q, u):
-        next_foot = {"angle": q["angle"] - 2.0 * self.half, "rate": u["rate"] * jnp.cos(2.0 * self.half)}
-        return {"step": jk.falling(self.slope + self.half - q["angle"], then=next_foot)}
-
-
-class CompassGait(jk.System):
-    """Two legs; angles from the vertical, positive downhill. The stance foot is O."""
-
-    hip: Scalar = parameter(10.0, unit="kg")
-    leg: Scalar = parameter(5.0, unit="kg")
-    slope: Scalar = parameter(np.deg2rad(3.0), unit="rad")
-    coordinates, speeds = ("stance", "swing"), ("stance_rate", "swing_rate")
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        A = N.rotate(3, -q["stance"], -u["stance_rate"], "A")
-        B = N.rotate(3, -q["swing"], -u["swing_rate"], "B")
-        foot = O.fixed(0.0 * A.y)
-        hip = foot.fixed(1.0 * A.y)
-        masses = (self.leg, foot.fixed(0.5 * A.y)), (self.hip, hip), (self.leg, hip.fixed(-0.5 * B.y))
-        bodies = [jk.Body(m, 0.0, P, name=n) for (m, P), n in zip(masses, ("stance", "hip", "swing"), strict=True)]
-        return jk.Motion(bodies, points={"foot": foot, "toe": hip.fixed(-1.0 * B.y)}, frames={"N": N})
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -9.81 * motion.N.y)
-
-    def exchange(self, t, q, u):
-        new = {"stance": q["swing"], "swing": q["stance"]}
-        return {**new, "stance_rate": u["swing_rate"], "swing_rate": u["stance_rate"]}
-
-    def events(self, t, q, u):
-        N, _ = jk.inertial()
-        toe = self.motion(t, q, u)["toe"].velocity
-        lands = jk.Impact(toe.dot(N.x), toe.dot(N.y), release=("foot",))
-        height = 2.0 * self.slope - q["stance"] - q["swing"]
-        ahead = q["stance"] - q["swing"]
-        return {"heel_strike": jk.falling(height, when=ahead, then=(lands, self.exchange))}
-
-
 class BouncingBall(jk.System):
     """A ball in air over a floor."""
 

@@ -100,7 +100,8 @@ def with_multipliers(system: System) -> System:
         return system
     if system.auxiliary_speeds:
         raise ValueError(f"with_multipliers({name}): auxiliary speeds are not supported. Remove them.")
-    return _class_of(type(system), has_outputs(system), has_contacts(system))(system)
+    kind: Any = type(system)
+    return _class_of(kind, has_outputs(system), has_contacts(system))(system)
 
 
 @functools.lru_cache(maxsize=1000)
