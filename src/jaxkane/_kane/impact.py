@@ -504,10 +504,9 @@ class RowBasis(NamedTuple):
     is_new: Array
 
     @classmethod
-    def of(cls, A: Array, threshold: float | None = None) -> RowBasis:
-        """`threshold`: the largest part of a row, relative to the row, that is regarded as dependent."""
-        m = len(A)
-        threshold = float(jnp.finfo(A.dtype).eps) ** 0.75 if threshold is None else threshold
+    def of(cls, A: Array, redundant: float = 0.0) -> RowBasis:
+        """`redundant`: the largest part of a row, relative to the row, that is regarded as dependent."""
+        m, threshold = len(A), max(redundant, float(jnp.finfo(A.dtype).eps) ** 0.75)
         Q, T, is_new = jnp.zeros((0, A.shape[1]), A.dtype), [], []
         for i in range(m):
             rest, row = A[i], jnp.zeros(i, A.dtype)
