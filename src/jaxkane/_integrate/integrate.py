@@ -214,9 +214,9 @@ class Problem(NamedTuple):
             return fast_loop(*how, *limits, jumps)
         if self.events.continue_:
             raise ValueError(
-                f"{type(self.system).__name__} has contacts, or an event that changes the state (`then`). This needs the "
-                "solver loop of jaxkane. Omit `controller` and `progress`, use adjoint='reverse', 'forward' or 'both', and a solver "
-                "that is not implicit-explicit."
+                f"{type(self.system).__name__} has contacts, or an event that changes the state (`then`). This needs "
+                "the solver loop of jaxkane. Omit `controller` and `progress`, use adjoint='reverse', 'forward' or "
+                "'both', and a solver that is not implicit-explicit."
             )
         return diffrax_loop(*how, *limits, settings.progress)
 
@@ -353,7 +353,7 @@ class Problem(NamedTuple):
         args, system, settings = dataclasses.replace(self.args, within=None), self.system, self.settings
         inputs = args.inputs(tree_of(args.system), t, unpacked(system, y))
         tolerances = jnp.asarray(settings.rtol, y.dtype), jnp.max(jnp.asarray(settings.atol, y.dtype))
-        rest = REST * self.taus[-1]
+        rest = max(REST, 256 * float(jnp.finfo(y.dtype).eps)) * self.taus[-1]
         return changed_contacts(
             tree_of(args.system), self.events.layout, args.clock(t), y, inputs, what, reach, rest, tolerances
         )
