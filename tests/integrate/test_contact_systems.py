@@ -2,6 +2,7 @@
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -45,6 +46,22 @@ def test_a_rocking_block_changes_its_corner():
     left = np.searchsorted(jumps_of(ride), ride.t) % 2 == 0
     np.testing.assert_array_equal(ride.contacts["left"], np.where(left, STICKS, OPEN))
     np.testing.assert_array_equal(ride.contacts["right"], np.where(left, OPEN, STICKS))
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_rocking_block():
+    # Quadrature: of the time of the sixth impact by the half width, the half height and the angle at the start.
+    def sixth(p):
+        b, h, angle = p
+        x, y = -h * jnp.sin(angle) + b * jnp.cos(angle), b * jnp.sin(angle) + h * jnp.cos(angle)
+        start = jk.State(jnp.stack([x, y, angle]), jnp.zeros(3))
+        block = TwoCornerBlock(2 * b, 2 * h, 2.0)
+        return jk.simulate(block, start, jnp.linspace(0, 3, 21), adjoint="forward", **TIGHT).jumps.t[5]
+
+    p = jnp.array([0.2, 0.6, 0.25])
+    np.testing.assert_allclose(sixth(p), 2.8724483216639736, atol=1e-10)
+    expected = [-19.85579741496443, 9.012306073041456, 6.863674401308323]
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(sixth))(p), expected, rtol=1e-8)
 
 
 def test_both_corners_of_a_wide_block_stick():
