@@ -85,15 +85,6 @@ def _folder_of_programs(config):
     return folder
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
-    """Mark the tests of `long_tests.txt`, each of which takes 17 seconds or more."""
-    names = set((pathlib.Path(__file__).parent / "long_tests.txt").read_text(encoding="utf-8").splitlines())
-    for item in items:
-        if item.nodeid in names:
-            item.add_marker(pytest.mark.long)
-
-
 def pytest_collection_finish():
     """What has been imported stays."""
     gc.collect()
@@ -184,7 +175,11 @@ def _kernels_of(item):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Tests of a file that are compiled in one way follow each other."""
+    """Tests of a file that are compiled in one way follow each other; those of `long_tests.txt` are marked."""
+    names = set((pathlib.Path(__file__).parent / "long_tests.txt").read_text(encoding="utf-8").splitlines())
+    for item in items:
+        if item.nodeid in names:
+            item.add_marker(pytest.mark.long)
     files = {}
     items.sort(key=lambda item: (files.setdefault(item.path, len(files)), Compilation.of(item)))
 
