@@ -150,6 +150,9 @@ def changed_contacts(
     negligible = jnp.maximum(_negligible(before), _negligible(after))
     is_apart = after.v[:, 0] > negligible[:, 0] + jnp.where(is_impact, 1e-10 * jnp.abs(v_N), 0.0)
     is_apart &= is_impact | ~event.is_own
+    # A block that rocks on its corners in turn: each corner opens for a shorter time than the one before.
+    fall, rise = -after.a[:, 0], after.v[:, 0]
+    is_apart &= ~((fall > 0) & ((2.0 * rise < rest * fall) | (0.5 * rise**2 <= fall * (errors / 16))))
     candidates = takes_part & ~is_apart & ~event.opens & ~(is_impact & (hit.states == OPEN) & strikes & (e > 0))
     sticks = jnp.where(is_impact & ~bearing, hit.states == STICKS, jnp.zeros_like(closed))
     new, is_determined = _states_by_accelerations(
