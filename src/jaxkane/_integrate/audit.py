@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -95,7 +96,7 @@ def _powers_along(system, t, q, u, values, input_rates):
 def _powers_in_contact_along(system, t, q, u, values, input_rates, contacts):
     """As `_powers_along`, with the power of the contact forces. `contacts` (n_t, m): the contact states."""
 
-    def powers(t, q, u, values, contacts):
+    def powers(contacts, t, q, u, values):
         u_dot, of_contacts = _contact_power(system, t, q, u, values, contacts)
         quantities = _quantities(system, t, q, u, values, u_dot)
         return jnp.concatenate([quantities["power"], jnp.stack([quantities["prescribed"], of_contacts])])
@@ -106,7 +107,7 @@ def _powers_in_contact_along(system, t, q, u, values, input_rates, contacts):
         dot = unpacked(system, vector_field(system, t, packed(State(q, u, x, contacts)), inputs))
         of_states = dict(zip(system.states, () if dot.x is None else dot.x, strict=True))
         directions = jnp.ones_like(t), dot.q, dot.u, {**input_rates, **of_states}
-        return jax.jvp(lambda *args: powers(*args, contacts), (t, q, u, values), directions)
+        return jax.jvp(functools.partial(powers, contacts), (t, q, u, values), directions)
 
     return jax.vmap(powers_and_rates)(t, q, u, values, input_rates, contacts)
 
@@ -531,7 +532,7 @@ def _work_with_jumps(
         of_states = {name: state.x[:, i] for i, name in enumerate(system.states)}
         samples = {"q": trajectory.q, "u": trajectory.u, **trajectory.values, **sides[side]}
         at_jumps = {"q": state.q, "u": state.u, **inputs, **of_states}
-        if trajectory.contact_names:
+        if trajectory.contact_memory is not None:
             samples[CONTACTS], at_jumps[CONTACTS] = trajectory.contact_memory, state.contacts
         parts = {name: (np.asarray(x)[reached][is_own], at_jumps[name][:m]) for name, x in samples.items()}
         return {name: np.concatenate(pair) for name, pair in parts.items()}

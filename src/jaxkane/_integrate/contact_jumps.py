@@ -32,11 +32,11 @@ from .._kane.contact import (
     terms_at,
     without_gaps,
 )
-from .._kane.right_hand_side import values_of
+from .._kane.right_hand_side import values_of, vector_field
 from .._kane.unilateral import OPEN, SLIDES, STICKS, Slip, contact_impact
 from .._scalarjit.nan import constant
 from .._scalarjit.scalar_function import ScalarFunction
-from .._system.system import System, unpacked
+from .._system.system import State, System, packed, unpacked
 
 REST = 1e-9
 """A contact rests if the rest of its bounces, 2 v / (a (1 - e)), takes less than this share of the duration."""
@@ -63,6 +63,23 @@ class ContactEvent(NamedTuple):
     def of_start(cls, touches: Array) -> ContactEvent:
         no = jnp.zeros_like(touches)
         return cls(touches, no, no, no, jnp.array(False), jnp.array(True))
+
+
+def gaps_at_start(system: System, t: Array, state: State) -> tuple[Array, Array]:
+    """Which contacts touch (c,), and whether none penetrates by more than a rounding error."""
+    gaps, sizes = gap_sizes(*constant((system, t, state.q, state.u)))
+    tolerance = float(jnp.finfo(gaps.dtype).eps) ** 0.6 * sizes
+    return jnp.abs(gaps) <= tolerance, jnp.all(gaps >= -tolerance)
+
+
+def rates_from_motion(system: System, t: Array, y: Array, inputs: dict[str, Array]) -> Array:
+    """The packed rates without those of the contact states, at a packed state without contact states."""
+    layout = layout_of(system)
+    state = unpacked(system, jnp.concatenate([y, jnp.zeros(layout.memory_size, y.dtype)]))
+    zero = jnp.zeros_like(t)
+    event = ContactEvent.of_start(gaps_at_start(system, t, state)[0])
+    found = changed_contacts(system, layout, t, packed(state), inputs, event, zero, zero, (zero, zero))
+    return vector_field(system, t, found.y, inputs)[: y.size]
 
 
 class Change(NamedTuple):
@@ -148,8 +165,9 @@ def changed_contacts(
 
 
 def _negligible(terms: ContactTerms) -> Array:
-    """Velocities (c, r) that are rounding errors."""
-    return 1e3 * float(jnp.finfo(terms.v.dtype).eps) * terms.size
+    """Velocities (c, r) that are rounding errors. All velocities of a contact have the size of the largest."""
+    size = jnp.max(terms.size, axis=1, keepdims=True)
+    return 1e3 * float(jnp.finfo(terms.v.dtype).eps) * jnp.broadcast_to(size, terms.size.shape)
 
 
 def _rest_of_bounces(terms: ContactTerms, strikes: Array) -> Array:

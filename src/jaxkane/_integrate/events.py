@@ -202,6 +202,11 @@ class Events(NamedTuple):
 
 
 def events_of(system: System, t: Array, state: State) -> Events:
+    """The events of a system and of its contacts."""
+    return own_events_of(system, t, state).with_contacts(layout_of(system))
+
+
+def own_events_of(system: System, t: Array, state: State) -> Events:
     """The events of a system. They are traced once to detect their directions and what they use."""
     dtype = state.q.dtype
     u_all = jnp.zeros(len(system.speeds) + len(system.dependent_speeds), dtype)
@@ -221,7 +226,7 @@ def events_of(system: System, t: Array, state: State) -> Events:
         tuple(conditional.index(name) if name in conditional else None for name in found),
         any(depends_on(program, [2, 3])),
         any(depends_on(program, [0])),
-    ).with_contacts(layout_of(system))
+    )
 
 
 def crossings(system: System, t: Component, q: Any, u_all: Any, x: Any, dtype: DTypeLike) -> dict[str, Crossing]:
@@ -463,7 +468,10 @@ def moved_to_event(
     for i in range(1, len(quantities.values)):
         g, g_dot = (jnp.where(which == i, x[i], x0) for x, x0 in ((quantities.values, g), (quantities.rates, g_dot)))
     g_dot = jax.lax.stop_gradient(g_dot)
-    is_small = jnp.abs(g) <= jnp.abs(g_dot) * reach
+    limit = jnp.abs(g_dot) * reach
+    if quantities.noise is not None:
+        limit += 2 * sum(jnp.where(which == i, x, 0.0) for i, x in enumerate(quantities.noise))
+    is_small = jnp.abs(g) <= limit
     moves = happened & is_small & (g_dot != 0)
     step = jnp.where(moves, -g / jnp.where(moves, g_dot, jnp.ones_like(g_dot)), jnp.zeros_like(g))
     return EventPoint(point.t + step, point.y + step * y_dot, step, point.smooth & is_small)

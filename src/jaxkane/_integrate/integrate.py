@@ -16,7 +16,7 @@ from jaxtyping import Array
 from .._kane.api import _kinetic_energy
 from .._kane.checks import bodies_are_possible
 from .._kane.constraint_residuals import configuration_is_met, correction, has_configuration_constraints, projected
-from .._kane.contact import ContactMemory, gap_sizes, layout_of
+from .._kane.contact import ContactMemory, layout_of
 from .._kane.kanes_method import KaneEquations
 from .._kane.right_hand_side import outputs_at, outputs_in_contact, rates_are_native, values_of, vector_field
 from .._kane.unilateral import OPEN, SLIDES, STICKS
@@ -35,7 +35,7 @@ from .._scalarjit.nan import (
 from .._scalarjit.scalar_function import Packed, ScalarFunction, tree_of
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
-from .contact_jumps import REST, Change, ContactEvent, changed_contacts, contact_event_values
+from .contact_jumps import REST, Change, ContactEvent, changed_contacts, contact_event_values, gaps_at_start
 from .discontinuities import Discontinuities, all_end_steps, discontinuities_of, rounding
 from .events import EventPoint, Events, EventValues, event_values, events_of, moved_to_event, next_point
 from .inputs import (
@@ -159,13 +159,6 @@ class End(NamedTuple):
     y: Array
     smooth: Array
     by_event: Array
-
-
-def gaps_at_start(system: System, t: Array, state: State) -> tuple[Array, Array]:
-    """Which contacts touch (c,), and whether none penetrates by more than a rounding error."""
-    gaps, sizes = gap_sizes(*constant((system, t, state.q, state.u)))
-    tolerance = float(jnp.finfo(gaps.dtype).eps) ** 0.6 * sizes
-    return jnp.abs(gaps) <= tolerance, jnp.all(gaps >= -tolerance)
 
 
 class Problem(NamedTuple):
@@ -312,20 +305,22 @@ class Problem(NamedTuple):
         """The jump of an event, from a time and a packed state near it."""
         point = self.event_point(t, y, None, event, reach, jnp.array(True))
         after, none = point.y, float(Status.COMPLETED)
-        if any(n for n, contact in zip(self.events.stages, self._contacts_of_events(), strict=True) if not contact):
-            after = state_after(self.args.system, self.args.clock(point.t), point.y, event, stages_of(self.events))
+        if any((which := stages_of(self.events)).stages):
+            after = state_after(self.args.system, self.args.clock(point.t), point.y, event, which)
         is_possible = jnp.all(jnp.isfinite(after))
         if self.constrained:
             q = unpacked(self.system, jnp.where(is_possible, after, point.y)).q
             is_possible &= configuration_is_met(self.system, self.args.clock(point.t), q)
-        jump = Jump(point.t, point.y, after, point.smooth.astype(y.dtype), y[:0], jnp.zeros_like(event))
+        smooth = point.smooth
+        if self.discontinuities is not None:
+            # An event function that jumps across zero with an input vanishes nowhere: its time is that of the input.
+            apart = jnp.abs(constant(point.t) - constant(self.discontinuities.times))
+            smooth |= jnp.any(apart <= 2 * reach)
+        jump = Jump(point.t, point.y, after, smooth.astype(y.dtype), y[:0], jnp.zeros_like(event))
         if self.events.layout.names:
             jump = self.contact_jump(jump._replace(after=jnp.where(is_possible, after, point.y)), event, reach)
         status = jnp.where(is_possible, jump.status, float(Status.IMPOSSIBLE_JUMP))
         return jump._replace(status=constant(jnp.where(jump.status == none, status, jump.status)))
-
-    def _contacts_of_events(self) -> tuple[Any, ...]:
-        return self.events.contacts or (None,) * len(self.events.names)
 
     def contact_jump(self, jump: Jump, event: Array, reach: Array) -> Jump:
         """The same with the impact and the new states of the contacts."""

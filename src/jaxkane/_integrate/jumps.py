@@ -139,7 +139,9 @@ class StagesOf(eqx.Module):
 
 
 def stages_of(events: Events) -> StagesOf:
-    return StagesOf(events.names, events.stages)
+    contacts = events.contacts or (None,) * len(events.names)
+    stages = [0 if contact else n for n, contact in zip(events.stages, contacts, strict=True)]
+    return StagesOf(events.names, tuple(stages))
 
 
 def _after_stage(system: System, t: Component, y: Array, name: str, stage: int) -> tuple[Array, Sequence[Array]]:

@@ -23,7 +23,6 @@ from .._system.system import State, System
 from .api import constraint_jacobian, dependent_speeds
 from .arguments import as_array, check_is_system, check_time, is_concrete
 from .checks import check_system
-from .contact import ContactRows, layout_of, speeds_in_contact
 from .constraint_residuals import (
     configuration_residual,
     configuration_tolerance,
@@ -33,6 +32,7 @@ from .constraint_residuals import (
     scales_by_unit,
     violations,
 )
+from .contact import ContactRows, layout_of, speeds_in_contact
 from .description import at_random_point, structure_of
 from .kanes_method import KaneEquations
 from .scaling import SMALLEST_SIZE

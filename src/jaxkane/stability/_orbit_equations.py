@@ -14,15 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._integrate.events import event_values, events_of
+from .._integrate.contact_jumps import rates_from_motion
+from .._integrate.events import event_values, own_events_of
 from .._integrate.inputs import as_signals, inputs_at
 from .._integrate.jumps import stages_of, state_after
 from .._integrate.simulate import simulate
 from .._integrate.status import Status
 from .._integrate.trajectory import Trajectory
 from .._kane.constraint_residuals import configuration_residual, coordinate_units, projected
+from .._kane.contact import has_contacts
 from .._kane.right_hand_side import vector_field
-from .._system.system import System, packed, unpacked
+from .._system.system import System, packed_motion, unpacked
 
 
 class OrbitArguments(NamedTuple):
@@ -142,11 +144,11 @@ class OrbitEquations(eqx.Module):
         """The packed state after the next jump at the section, and the time until then. NaN if it takes longer."""
         ride = self.simulate(args, y, jnp.stack([t, t + longest]))
         assert ride.end is not None
-        events = events_of(args.system, t, unpacked(args.system, y))
+        events = own_events_of(args.system, t, unpacked(args.system, y))
         place = events.names.index(self.section)
         # A simulation that ends elsewhere must not be passed to the jump: its derivatives could be NaN.
-        ok = ride.status == Status.EVENT + place
-        before, t_end = jnp.where(ok, packed(ride.end), y), jnp.where(ok, ride.t_end, t)
+        ok = ride.status == Status.EVENT + ride.events.index(self.section)
+        before, t_end = jnp.where(ok, packed_motion(ride.end), y), jnp.where(ok, ride.t_end, t)
         after = state_after(args.system, t_end, before, jnp.asarray(place, y.dtype), stages_of(events))
         return jnp.where(ok, after, jnp.nan), jnp.where(ok, t_end - t, jnp.nan)
 
@@ -154,7 +156,7 @@ class OrbitEquations(eqx.Module):
         """The packed state after a duration, from a packed state at time t."""
         ride = self.simulate(args, y, jnp.stack([t, t + duration]))
         assert ride.end is not None
-        return jnp.where(ride.ok, packed(ride.end), jnp.nan)
+        return jnp.where(ride.ok, packed_motion(ride.end), jnp.nan)
 
     def simulate(self, args: OrbitArguments, y: Array, ts: Array, adjoint: Any = "forward") -> Trajectory:
         """A simulation that does not end at the section, or ends there before its jump."""
@@ -325,12 +327,14 @@ def packed_rates(args: OrbitArguments, t: Array, y: Array) -> Array:
     """The rates of a packed state with the inputs of an orbit."""
     state = unpacked(args.system, y)
     signals = as_signals(args.inputs, args.system.inputs, jnp.stack([t, t + 1.0]), type(args.system).__name__)
-    return vector_field(args.system, t, y, inputs_at(args.system, signals, t, state))
+    inputs = inputs_at(args.system, signals, t, state)
+    rates = rates_from_motion if has_contacts(args.system) else vector_field
+    return rates(args.system, t, y, inputs)
 
 
 def section_value(system: System, section: str, t: Array, y: Array) -> Array:
     """The event function of the section at a packed state."""
-    names = events_of(system, t, unpacked(system, y)).names
+    names = own_events_of(system, t, unpacked(system, y)).names
     return event_values(system, t, y, jnp.zeros_like(y)).values[names.index(section)]
 
 

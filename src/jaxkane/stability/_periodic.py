@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float
 
 from .._common.lookup import as_names, by_name, hint, refuse_unknown
-from .._integrate.events import event_values, events_of
+from .._integrate.events import event_values, own_events_of
 from .._integrate.inputs import as_signals, inputs_at
 from .._integrate.jumps import stages_of, state_after
 from .._integrate.simulate import checked_state, refuse_not_finite
@@ -290,7 +290,7 @@ def _check_options(name: str, system: System, section, period, autonomous, y) ->
 def _check_section(name: str, system: System, section: Any, y: Array) -> None:
     if section is None:
         return
-    events = events_of(system, jnp.zeros((), y.dtype), unpacked(system, y))
+    events = own_events_of(system, jnp.zeros((), y.dtype), unpacked(system, y))
     if section not in events.names:
         raise ValueError(f"{name}: there is no event {section!r}; {hint(str(section), events.names, 'the events are')}")
     if not events.directions[events.names.index(section)]:
@@ -302,7 +302,7 @@ def _check_section(name: str, system: System, section: Any, y: Array) -> None:
 
 def _changes_state(system: System, section: str | None, y: Array) -> bool:
     """Whether the event of a section changes the state."""
-    events = events_of(system, jnp.zeros((), y.dtype), unpacked(system, y))
+    events = own_events_of(system, jnp.zeros((), y.dtype), unpacked(system, y))
     return section in events.names and events.stages[events.names.index(section)] > 0
 
 
@@ -313,7 +313,7 @@ def _drifting(system: System, inputs: Any, y: Array) -> set[str]:
     used: list[Any] = []
     t = jnp.zeros((), y.dtype)
     cyclic = np.array([key in drifting for key in system.coordinates] + [False] * (y.size - len(system.coordinates)))
-    events = events_of(system, t, state)
+    events = own_events_of(system, t, state)
     if events.names:
 
         def event_functions(y):
@@ -397,7 +397,7 @@ def _first_return(name: str, equations: OrbitEquations, args: OrbitArguments, y:
         )
     duration, direction = 1e-3, 1.0
     if equations.section:
-        events = events_of(args.system, args.t, unpacked(args.system, y))
+        events = own_events_of(args.system, args.t, unpacked(args.system, y))
         direction = float(events.directions[events.names.index(equations.section)])
     for _ in range(_DOUBLINGS):
         ride, ys, g = _sampled(equations, args, y, jnp.asarray(duration, y.dtype))
@@ -502,7 +502,7 @@ def _crosses(equations: OrbitEquations, z: Array, args: OrbitArguments) -> Array
     if not equations.section or equations.jumps:
         return jnp.array(True)
     system, y = args.system, equations.states(z, args)[0]
-    events = events_of(system, args.t, unpacked(system, y))
+    events = own_events_of(system, args.t, unpacked(system, y))
     place = events.names.index(equations.section)
     rates = event_values(system, args.t, y, packed_rates(args, args.t, y)).rates
     return events.directions[place] * rates[place] > 0

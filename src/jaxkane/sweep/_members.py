@@ -281,7 +281,10 @@ def _start(system: System, state: Any, row: Row, t: Component) -> State:
     groups = (system.coordinates, system.speeds, system.states)
     q, u, x = (row.of(names, but=read) for names in groups)
     parts = zip((state.q, state.u, state.x), (q, u, x), groups, strict=True)
-    state = State(*(_with_columns(values, columns, names) for values, columns, names in parts))
+    # The contact states belong to coordinates, speeds and parameters.
+    contacts = None if q or u or parameters else state.contacts
+    q0, u0, x0 = (_with_columns(values, columns, names) for values, columns, names in parts)
+    state = State(q0, u0, x0, contacts)
     if system.dependent_coordinates and (q or parameters):  # they depend on the others
         state = assemble(system, state.q, state.u, state.x, t=t)
     return state

@@ -39,7 +39,7 @@ class Sweep(eqx.Module):
     Attributes:
 
     - `trajectory`: all trajectories as one `Trajectory` with leading axes, e.g. for `constraint_forces`. `t`, `q`, `u`,
-        `u_dep`, `x`, `inputs`, `outputs`, `names`, `jumps` are its attributes. None if `reduce` was passed.
+        `u_dep`, `x`, `inputs`, `outputs`, `names`, `jumps`, `contacts` are its attributes. None if `reduce` was passed.
     - `values`: the results of `reduce`, with leading axes; None without `reduce`.
     - `status`: the status code of each member; `ok` and `reason` as of a `Trajectory`.
     - `t_end`: the time [s] at which each member ended.
@@ -65,6 +65,7 @@ class Sweep(eqx.Module):
     outputs = _of_trajectory("outputs")
     names = _of_trajectory("names")
     jumps = _of_trajectory("jumps")
+    contacts = _of_trajectory("contacts")
 
     @classmethod
     def of(cls, result: ChunkResult, table: Table, ts: Numbers, reduced: bool) -> Sweep:
