@@ -42,6 +42,7 @@ from ._kane.contact import Contact as Contact
 from ._kane.contact import DryFriction as DryFriction
 from ._kane.impact import Impact as Impact
 from ._kane.impact import impact as impact
+from ._kane.multipliers import with_multipliers as with_multipliers
 from ._scalarjit.cache_key import forget as forget
 from ._scalarjit.compat import switch_off_wrong_fusions as _switch_off_wrong_fusions
 from ._scalarjit.components import Scalar as Scalar

@@ -186,7 +186,7 @@ class Events(NamedTuple):
         **Raises:** `ValueError` if a contact has the name of an event.
         """
         if not layout.names:
-            return self
+            return self._replace(layout=layout)
         if both := set(self.names) & set(layout.names):
             raise ValueError(f"The name {both.pop()!r} is used twice, for an event and for a contact. Rename one.")
         own = [*zip(*self[:4], [None] * len(self.names), strict=True)]

@@ -577,7 +577,7 @@ def _trajectory(problem: Problem, steps: Steps, end: End, follows_from: list[Arr
     if found is not None:
         sides = (-blur, blur) if found.jumps else ()
         discontinuities = InputDiscontinuities(found.times, tuple(all_inputs(taus + x, states) for x in sides))
-    if layout.names:
+    if layout.names or layout.n_residuals:
         of_contacts = jax.vmap(lambda t, y, w: outputs_in_contact(system, t, y, w))
         speeds, outputs = of_contacts(ts, motion, inputs)
         n_q = len(system.coordinates)

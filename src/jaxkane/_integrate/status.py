@@ -43,7 +43,8 @@ def reason(code: int, events: tuple[str, ...]) -> str:
 
 REASONS = frozenset(reason(code, ()) for code in Status if code < Status.EVENT)
 _ADVICE: dict[int, str] = {
-    Status.SINGULAR_SPEEDS: "Choose other dependent speeds: see jaxkane.best_dependent_speeds(system, t, q).",
+    Status.SINGULAR_SPEEDS: "Simulate jaxkane.with_multipliers(system), or choose other dependent speeds: "
+    "see jaxkane.best_dependent_speeds(system, t, q).",
     Status.STEP_TOO_SMALL: "A value grows without bound or is discontinuous. Plot the last samples before `t_end`.",
     Status.MAX_JUMPS: "Increase max_jumps. If jumps accumulate at one time, end the simulation there by another event.",
     Status.IMPOSSIBLE_JUMP: "Check `then` of the event at `t_end`. New coordinates must satisfy the constraints.",

@@ -32,7 +32,7 @@ from .constraint_residuals import (
     scales_by_unit,
     violations,
 )
-from .contact import ContactRows, layout_of, speeds_in_contact
+from .contact import REDUNDANT, ContactRows, has_multipliers, layout_of, speeds_in_contact
 from .description import at_random_point, structure_of
 from .kanes_method import KaneEquations
 from .scaling import SMALLEST_SIZE
@@ -390,7 +390,7 @@ def assemble(
         if bad:
             raise ValueError(f"{name}: {', '.join(bad)} is not finite.")
     q0 = _solve_configuration(with_touching(system, touching) if touching else system, q0, t, problem)
-    if touching:
+    if touching or has_multipliers(system):
         u0 = speeds_in_contact(system, jnp.asarray(t, q0.dtype), q0, u0, touching)
     if is_concrete(system, q0, u0, t):
         check_system(system, t, q0)
@@ -404,6 +404,8 @@ def _solve_configuration(system: System, q0, t, problem: AssemblyProblem):
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
     if n_h == 0:
         return q0
+    if has_multipliers(system):
+        return _nearest_configuration(system, q0, t, problem.moved)
     if len(problem.moved) < n_h:  # e.g. a plane loop that is closed by a Vector, whose third component is always zero
         problem = problem._replace(lenient=True)
     places = tuple(system.coordinates.index(c) for c in problem.moved)
@@ -411,6 +413,29 @@ def _solve_configuration(system: System, q0, t, problem: AssemblyProblem):
     if is_concrete(system, q0, t) and not bool(result.converged):
         raise NoConfiguration(_why_not(system, q0, problem, result))
     return result.q
+
+
+def _nearest_configuration(system: System, q0, t, moved: Sequence[str]):
+    """A configuration of a system whose constraints may be redundant, by the Gauss-Newton method.
+
+    **Raises:** `NoConfiguration` if the constraints are not met. If arguments are traced, the result is NaN.
+    """
+    places = jnp.array([system.coordinates.index(c) for c in moved or system.coordinates])
+
+    def step(_: Any, q: Numbers) -> Numbers:
+        J = jax.jacfwd(lambda q: configuration_residual(system, t, q))(q)[:, places]
+        change = jnp.linalg.lstsq(jax.lax.stop_gradient(J), configuration_residual(system, t, q), rcond=REDUNDANT)[0]
+        return q.at[places].add(-change)
+
+    # The last two steps have the derivatives of the implicit function theorem up to the second order.
+    q = step(1, step(0, jax.lax.stop_gradient(jax.lax.fori_loop(0, _MAX_STEPS, step, jax.lax.stop_gradient(q0)))))
+    is_met = jnp.all(violations(system, t, q)[0] <= configuration_tolerance(q.dtype))
+    if is_concrete(system, q0, t) and not bool(is_met):
+        raise NoConfiguration(
+            f"{type(system).__name__}: no {', '.join(moved or system.coordinates)} satisfies the configuration "
+            "constraints from this initial guess. Start from another guess."
+        )
+    return jnp.where(is_met, q, jnp.nan)
 
 
 def _why_not(system: System, q0, problem: AssemblyProblem, result: NewtonResult) -> str:

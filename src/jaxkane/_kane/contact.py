@@ -49,7 +49,7 @@ from .._system.motion import Motion
 from .._system.system import System
 from .arguments import Row, is_concrete, is_one_number
 from .description import dtype_of, jvp, structure_of
-from .impact import checked_restitution, inverse_root, least_norm
+from .impact import RowBasis, checked_restitution, inverse_root, least_norm
 from .kanes_method import KaneEquations, unit
 from .scaling import term_sizes
 from .unilateral import MOST_CONTACTS, OPEN, SLIDES, STICKS
@@ -174,6 +174,7 @@ class ContactLayout(NamedTuple):
     - `planes` (c,): the axis of N along which no point of the contact moves, or None.
     - `has_point` (c,): whether a contact has a point.
     - `reads_time`: whether any contact uses the time.
+    - `n_residuals`: the number of velocity residuals with multipliers (see `with_multipliers`).
     """
 
     names: tuple[str, ...]
@@ -183,6 +184,7 @@ class ContactLayout(NamedTuple):
     planes: tuple[int | None, ...]
     has_point: tuple[bool, ...]
     reads_time: bool = False
+    n_residuals: int = 0
 
     @property
     def d(self) -> int:
@@ -190,10 +192,18 @@ class ContactLayout(NamedTuple):
         return (2 if self.in_space else 1) if any(self.has_friction) else 0
 
     @property
-    def memory_size(self) -> int:
-        """The number of floats of the contact states: for each contact its state and the direction of its slip."""
-        return len(self.names) * (1 + (3 if self.d == 2 else self.d))
+    def memory_width(self) -> int:
+        """The number of floats of a contact state: the state itself and the direction of the slip."""
+        return 1 + (3 if self.d == 2 else self.d)
 
+    @property
+    def memory_size(self) -> int:
+        return len(self.names) * self.memory_width
+
+
+REDUNDANT = 1e-6
+"""A velocity residual with a multiplier is redundant if its part that does not depend on the others is relatively
+smaller. Lengths in files are often rounded to six digits."""
 
 NO_CONTACTS = ContactLayout((), (), (), False, (), ())
 
@@ -202,13 +212,18 @@ def has_contacts(system: System) -> bool:
     return type(system).contacts is not System.contacts
 
 
+def has_multipliers(system: System) -> bool:
+    """Whether the constraints of a system have multipliers instead of dependent speeds."""
+    return hasattr(system, "multiplier_residuals")
+
+
 def layout_of(system: System) -> ContactLayout:
     """The contacts of a system, which are traced for this.
 
     **Raises:** `TypeError` or `ValueError` for contacts that are not a dict of contacts by name; `ValueError` for more
     than four contacts, and for a system with too many speeds.
     """
-    if not has_contacts(system):
+    if not has_contacts(system) and not has_multipliers(system):
         return NO_CONTACTS
     found: list[ContactLayout] = []
 
@@ -256,7 +271,9 @@ def _traced_layout(kane: KaneEquations) -> ContactLayout:
     planes = [_plane(x, motion.N) if isinstance(x, Contact) and x.point is not None else 2 for x in contacts.values()]
     in_space = any(f and p is None for f, p in zip(frictions, planes, strict=True))
     points = [isinstance(x, Contact) and x.point is not None for x in contacts.values()]
-    return ContactLayout(tuple(contacts), tuple(frictions), tuple(bearings), in_space, tuple(planes), tuple(points))
+    n_residuals = len(ContactRows(kane, NO_CONTACTS).residuals(kane.t, kane.q, kane.u_all))
+    layout = tuple(contacts), tuple(frictions), tuple(bearings), in_space, tuple(planes), tuple(points)
+    return ContactLayout(*layout, n_residuals=n_residuals)
 
 
 def _is_zero(x: Any) -> bool:
@@ -328,6 +345,10 @@ class ContactTerms(NamedTuple):
     - `tangents` (c, d, 3): directions of the slip in N.
     - `gap_rates` (c,): rates of the gaps.
     - `Q` (n_q, n): derivatives of the rates of the coordinates by the independent speeds.
+
+    With residuals that have multipliers, X X^T is the inverse of M on the speeds that they permit. Then `a0` (n,) are
+    the accelerations that the residuals require, and `shift` (n,) is the change of the speeds to the nearest ones that
+    they permit.
     """
 
     gaps: Array
@@ -341,6 +362,8 @@ class ContactTerms(NamedTuple):
     tangents: Array
     gap_rates: Array
     Q: Array
+    a0: Array
+    shift: Array
 
     @property
     def B(self) -> Array:
@@ -399,6 +422,11 @@ class ContactRows:
                 rows.append([v.dot(motion.N.vector(*e)) for e in (n, *tangents)])
         return rows
 
+    def residuals(self, t: Component, q: Row, u: Row) -> Row:
+        """Velocity residuals that have multipliers."""
+        system: Any = self.kane.system
+        return system.multiplier_residuals(t, q, u) if has_multipliers(system) else ()
+
     def tangents_of(self, normal: Row, i: int) -> list[Row]:
         d = self.layout.d
         if not self.layout.has_friction[i]:
@@ -419,13 +447,25 @@ def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True)
 
     v = flat(rows.velocities(t, q, u))
     columns = [kane.along_speeds(velocities, kane.with_dependent(unit(kane.n, i))) for i in range(kane.n)]
-    C = stack(columns).astype(kane.dtype).T
+    C = stack(columns).astype(kane.dtype).T if c else jnp.zeros((0, kane.n), kane.dtype)
     partials = kane.partial_velocities()
     X = stack(inverse_root(kane.mass_matrix(partials))).astype(kane.dtype)
+    a0 = shift = jnp.zeros(kane.n, kane.dtype)
+    moving = (1.0, *kane.q_dot, *(0.0,) * kane.n, *kane.bias())
+    n_q = len(q)
+    if layout.n_residuals:
+        rates = [kane.along_speeds(lambda u: rows.residuals(t, q, u), unit(kane.n, i)) for i in range(kane.n)]
+        basis = RowBasis.of(stack(rates).astype(kane.dtype).T @ X, REDUNDANT)
+        residuals = as_vector(rows.residuals(t, q, u), like)
+        drift = jvp(lambda t, *z: rows.residuals(t, z[:n_q], z[n_q:]), (t, *q, *u), moving)[1]
+        a0 = X @ (basis.solve(-as_vector(drift, like))[0] @ basis.Q)
+        shift = X @ (basis.solve(-residuals)[0] @ basis.Q)
+        X = X - (X @ basis.Q.T) @ basis.Q
     u_array = as_vector(kane.u, like)
     size = jnp.abs(v) + jnp.abs(C) @ jnp.abs(u_array)
     motion, contacts = _contacts(kane, t, q, u)
-    laws = Laws(*(as_vector(row, like) for row in zip(*map(_laws, contacts.values()), strict=True)))
+    laws = [_laws(x) for x in contacts.values()]
+    laws = Laws(*(as_vector([law[i] for law in laws], like) for i in range(3)))
     tangents = [
         rows.tangents_of(_unit_normal(x, motion.N), i) if isinstance(x, Contact) and x.point is not None else
         [(0.0, 0.0, 0.0)] * layout.d
@@ -435,13 +475,11 @@ def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True)
     gaps = as_vector(rows.gaps(t, q, u), like)
     if with_forces:
         f = as_vector([add(x, y) for x, y in zip(kane.active_forces(partials), kane.inertia_forces(partials))], like)
-        moving = (1.0, *kane.q_dot, *(0.0,) * kane.n, *kane.bias())
-        n_q = len(q)
 
         def along(t: Component, *z: Component) -> list[Component]:
             return [x for row in rows.velocities(t, z[:n_q], z[n_q:]) for x in row]
 
-        b = as_vector(jvp(along, (t, *q, *u), moving)[1], like)
+        b = as_vector(jvp(along, (t, *q, *u), moving)[1], like) + C @ a0
         w = X.T @ f
         gap_rates = as_vector(rows.gap_rates(t, q, u), like)
     else:
@@ -450,7 +488,7 @@ def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True)
         kane.along_speeds(lambda u: kane.rates(t, q, u), kane.with_dependent(unit(kane.n, i))) for i in range(kane.n)
     ]
     Q = stack(along_q).astype(kane.dtype).T
-    return ContactTerms(gaps, v.reshape(c, r), size.reshape(c, r), C, b, X, w, laws, T, gap_rates, Q)
+    return ContactTerms(gaps, v.reshape(c, r), size.reshape(c, r), C, b, X, w, laws, T, gap_rates, Q, a0, shift)
 
 
 def _laws(contact: Any) -> tuple[Component, Component, Component]:
@@ -462,8 +500,9 @@ def _laws(contact: Any) -> tuple[Component, Component, Component]:
 def speeds_in_contact(system: System, t: Component, q: Array, u: Array, touching: Sequence[str]) -> Array:
     """The nearest speeds (n,), in the metric of M, for which the `touching` contacts neither approach nor separate."""
     layout = layout_of(system)
+    memory = ContactMemory.unpacked(layout, jnp.zeros(layout.memory_size, q.dtype))
     states = jnp.asarray([SLIDES if name in touching else OPEN for name in layout.names], q.dtype)
-    memory = ContactMemory(states, jnp.zeros((len(states), layout.memory_size // len(states) - 1), q.dtype))
+    memory = memory._replace(states=states)
     return projected_speeds(layout, terms_at(system, t, q, u, {}), memory, u)
 
 
@@ -522,8 +561,7 @@ class ContactMemory(NamedTuple):
 
     @classmethod
     def unpacked(cls, layout: ContactLayout, memory: Array) -> ContactMemory:
-        c = len(layout.names)
-        table = memory.reshape(c, layout.memory_size // c)
+        table = memory.reshape(len(layout.names), layout.memory_width)
         return cls(table[:, 0], table[:, 1:])
 
     def packed(self) -> Array:
@@ -560,6 +598,8 @@ class ContactForces(NamedTuple):
 def solve_forces(layout: ContactLayout, terms: ContactTerms, memory: ContactMemory) -> ContactForces:
     """The contact forces and the accelerations for given contact states."""
     c, r = terms.v.shape
+    if not c:
+        return ContactForces(jnp.zeros_like(terms.v), terms.a0 + terms.X @ terms.w)
     is_bearing = jnp.asarray(layout.is_bearing)
     closed = (memory.states >= SLIDES) & ~is_bearing
     slides = memory.states == SLIDES
@@ -581,7 +621,7 @@ def solve_forces(layout: ContactLayout, terms: ContactTerms, memory: ContactMemo
     A = jnp.where(mask[:, None] & mask[None], (B @ B.T) @ W, 0.0)
     z = least_norm(A, jnp.where(mask, -(B @ w + terms.b), 0.0))[0]
     forces = jnp.asarray(W) @ z
-    u_dot = terms.X @ (w + B.T @ forces)
+    u_dot = terms.a0 + terms.X @ (w + B.T @ forces)
     return ContactForces((forces + known).reshape(c, r), u_dot)
 
 
@@ -603,9 +643,12 @@ def _tangential_rows(layout: ContactLayout) -> np.ndarray:
 
 def projected_speeds(layout: ContactLayout, terms: ContactTerms, memory: ContactMemory, u: Array) -> Array:
     """The nearest speeds (n,), in the metric of M, for which closed contacts do not move."""
+    if not layout.names:
+        return u + terms.shift
     mask = _active_rows(layout, memory).reshape(-1)
     B = jnp.where(mask[:, None], terms.B, 0.0)
-    return u + terms.X @ least_norm(B, jnp.where(mask, -terms.v.reshape(-1), 0.0))[0]
+    v = terms.v.reshape(-1) + terms.C @ terms.shift
+    return u + terms.shift + terms.X @ least_norm(B, jnp.where(mask, -v, 0.0))[0]
 
 
 def without_gaps(terms: ContactTerms, closed: Array, q: Array) -> Array:
@@ -627,10 +670,10 @@ def _projected(
 
 
 def forces_in_contact(
-    system: System, layout: ContactLayout, t: Component, q: Array, u: Array, memory: Array, values: Any
+    system: System, layout: ContactLayout, t: Component, q: Array, u: Array, memory: Array | None, values: Any
 ) -> tuple[KaneEquations, Array, ContactForces, ContactTerms]:
     """Kane's equations at the projected speeds, these speeds, the contact forces and accelerations, and the terms."""
-    states = ContactMemory.unpacked(layout, memory)
+    states = ContactMemory.unpacked(layout, jnp.zeros(layout.memory_size, q.dtype) if memory is None else memory)
     kane, u = _projected(system, layout, t, q, u, states, values)
     terms = _terms(kane, layout)
     return kane, u, solve_forces(layout, terms, states), terms

@@ -464,34 +464,56 @@ def inverse_root(M: Rows, sizes: Sequence[Component] | None = None) -> Rows:
     return X
 
 
+class RowBasis(NamedTuple):
+    """A = T Q with orthonormal rows of Q, for A (m, n).
+
+    A row that is zero or depends linearly on the previous ones is omitted: its row of Q (m, n) and its column of T
+    (m, m) are zero. `is_new` (m,): whether each row is used.
+    """
+
+    Q: Array
+    T: Array
+    is_new: Array
+
+    @classmethod
+    def of(cls, A: Array, threshold: float | None = None) -> RowBasis:
+        """`threshold`: the largest part of a row, relative to the row, that is regarded as dependent."""
+        m = len(A)
+        threshold = float(jnp.finfo(A.dtype).eps) ** 0.75 if threshold is None else threshold
+        Q, T, is_new = jnp.zeros((0, A.shape[1]), A.dtype), [], []
+        for i in range(m):
+            rest, row = A[i], jnp.zeros(i, A.dtype)
+            for _ in range(2 if i else 0):  # Gram-Schmidt twice: after one pass, it is not orthogonal within rounding
+                along = Q @ rest
+                rest, row = rest - along @ Q, row + along
+            is_used = jax.lax.stop_gradient(jnp.max(jnp.abs(rest)) > threshold * jnp.max(jnp.abs(A[i])))
+            norm = jnp.sqrt(jnp.sum(jnp.where(is_used, rest, 1.0) ** 2))  # the derivative of a norm of zero is NaN
+            Q = jnp.concatenate([Q, jnp.where(is_used, rest / norm, 0.0)[None]])
+            T.append(jnp.concatenate([row, jnp.where(is_used, norm, 0.0)[None], jnp.zeros(m - i - 1, A.dtype)]))
+            is_new.append(is_used)
+        return cls(Q, jnp.stack(T), jnp.stack(is_new))
+
+    def solve(self, b: Array) -> tuple[Array, Array]:
+        """y (m,) of T y = b, and the part of b (m,) that the omitted rows do not satisfy. Then w = Q^T y."""
+        y, missing = jnp.zeros(0, b.dtype), []
+        for i in range(len(b)):
+            remainder, is_used = b[i] - self.T[i, :i] @ y if i else b[i], self.is_new[i]
+            y = jnp.concatenate([y, jnp.where(is_used, remainder / jnp.where(is_used, self.T[i, i], 1.0), 0.0)[None]])
+            missing.append(jnp.where(is_used, 0.0, remainder))
+        return y, jnp.stack(missing)
+
+
 def least_norm(A: Array, b: Array) -> tuple[Array, Array, Array, Array, Array]:
     """The smallest solution w (n,) of A w = b, for A (m, n) and b (m,).
 
-        A = T Q with orthonormal rows of Q,   T y = b,   w = Q^T y
-
-    A row is omitted if it is zero or linearly dependent on the previous ones. Its row of Q and its column of T are
-    zero. As `constraints.least_change`, but with products of scalars only.
+    As `constraints.least_change`, but with products of scalars only.
 
     **Returns:** w (n,), y (m,), T (m, m), whether each row is used (m,), and the part of b (m,) that the omitted rows
-    do not satisfy.
+    do not satisfy: see `RowBasis`.
     """
-    m, threshold = len(A), float(jnp.finfo(A.dtype).eps) ** 0.75
-    Q, T, y = jnp.zeros((0, A.shape[1]), A.dtype), [], jnp.zeros(0, A.dtype)
-    is_new, missing = [], []
-    for i in range(m):
-        rest, row = A[i], jnp.zeros(i, A.dtype)
-        for _ in range(2 if i else 0):  # Gram-Schmidt twice: after one pass, it is not orthogonal within rounding
-            along = Q @ rest
-            rest, row = rest - along @ Q, row + along
-        is_used = jax.lax.stop_gradient(jnp.max(jnp.abs(rest)) > threshold * jnp.max(jnp.abs(A[i])))
-        norm = jnp.sqrt(jnp.sum(jnp.where(is_used, rest, 1.0) ** 2))  # the derivative of a norm of zero is NaN
-        remainder = b[i] - row @ y if i else b[i]
-        Q = jnp.concatenate([Q, jnp.where(is_used, rest / norm, 0.0)[None]])
-        y = jnp.concatenate([y, jnp.where(is_used, remainder / norm, 0.0)[None]])
-        T.append(jnp.concatenate([row, jnp.where(is_used, norm, 0.0)[None], jnp.zeros(m - i - 1, A.dtype)]))
-        missing.append(jnp.where(is_used, 0.0, remainder))
-        is_new.append(is_used)
-    return y @ Q, y, jnp.stack(T), jnp.stack(is_new), jnp.stack(missing)
+    basis = RowBasis.of(A)
+    y, missing = basis.solve(b)
+    return y @ basis.Q, y, basis.T, basis.is_new, missing
 
 
 class _OfFunction(eqx.Module):

@@ -21,7 +21,7 @@ from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
 from .._system.system import NamedVector, State, System, has_outputs, packed, unpacked
 from .arguments import Inputs, Row, as_row, inputs_of
-from .contact import forces_in_contact, layout_of
+from .contact import forces_in_contact, has_multipliers, layout_of
 from .description import jvp
 from .kanes_method import KaneEquations, motion_rates
 from .reactions import Reactions
@@ -202,7 +202,6 @@ def outputs_in_contact(
 @ScalarFunction
 def _contact_forces(system, t, y, values):
     state, layout = unpacked(system, y), layout_of(system)
-    assert state.contacts is not None
     _, u, (forces, u_dot), _ = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
     named = {}
     for i, (name, has_friction, is_bearing) in enumerate(zip(*layout[:3], strict=True)):
@@ -317,7 +316,7 @@ def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dic
 def _vector_field(system, t, y, inputs):
     state = unpacked(system, y)
     values = values_of(system, state.x, inputs)
-    if state.contacts is not None:
+    if state.contacts is not None or has_multipliers(system):
         return _rates_in_contact(system, t, y, values)
     q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
     x_dot = None
@@ -330,13 +329,15 @@ def _vector_field(system, t, y, inputs):
 def _rates_in_contact(system: System, t: Component, y: Array, values: dict[str, Any]) -> Array:
     """The packed rates of a state with contact states, whose rates are zero."""
     state, layout = unpacked(system, y), layout_of(system)
-    assert state.contacts is not None
-    kane, _, forces, _ = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
+    memory = state.contacts
+    kane, _, forces, _ = forces_in_contact(system, layout, t, state.q, state.u, memory, values)
     x_dot = None
     if system.states:
         u_dot = as_row(forces.u_dot, system.speeds, "u_dot")
         x_dot = as_vector(evaluate_with_accelerations(kane, u_dot, _state_rates), y)
-    return packed(State(as_vector(kane.q_dot, y), forces.u_dot, x_dot, jnp.zeros(layout.memory_size, y.dtype)))
+    return packed(
+        State(as_vector(kane.q_dot, y), forces.u_dot, x_dot, None if memory is None else jnp.zeros_like(memory))
+    )
 
 
 @ScalarFunction
