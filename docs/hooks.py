@@ -108,8 +108,10 @@ SUBJECTS = {
 # Names that come first under their heading, in the order of use. The others follow in alphabetical order.
 FIRST = """
 System parameter learned Scalar State inertial Frame Point Vector Body Motion weight Force Torque
-simulate Trajectory Status Samples falling rising Impact impact outputs positions velocities constraint_forces audit
-animate Animation Sketch assemble best_dependent_speeds equations_of_motion accelerations mass_matrix forcing configure
+simulate Trajectory Status Samples falling rising Impact impact Contact DryFriction
+outputs positions velocities constraint_forces audit
+animate Animation Sketch assemble best_dependent_speeds with_multipliers
+equations_of_motion accelerations mass_matrix forcing configure
 CATALOG mechanism Link Loop Site Actuator Coupling hinge slide universal ball planar fixed free
 spring damper actuator torsional_spring torsional_damper dc_motor rotor friction torsional_friction drag
 sweep grid Table Sweep trajectories audit fits equilibrium steady_turn SteadyMotion linearize LinearModel eigenvalues

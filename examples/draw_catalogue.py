@@ -13,10 +13,11 @@ obliquely from above.
 
 Run:      python examples/draw_catalogue.py [--out FOLDER] [--each]
 Appears:  a line for each simulation; catalogue.png: a panel for each system with its name and its place in the book
-          (Kamman, Volume II, Unit 5); and catalogue/NAME.html, an animation of each. With --each, also NAME.png for
-          each system. The aircraft are drawn ten times too large for the way they fly; what a description leaves open
-          (the length of a column, the rider's back) is drawn as seems likely. Red, green and blue are a body's axes
-          1, 2 and 3; a system that is not in the table `PICTURES` is drawn as `jaxkane.animate` draws it.
+          (Kamman, Volume II, Unit 5) or its source; and catalogue/NAME.html, an animation of each. With --each, also
+          NAME.png for each system. The aircraft are drawn ten times too large for the way they fly; what a
+          description leaves open (the length of a column, the rider's back) is drawn as seems likely. Red, green and
+          blue are a body's axes 1, 2 and 3; a system that is not in the table `PICTURES` is drawn as `jaxkane.animate`
+          draws it.
 Takes:    less than a minute, most of it compilation.
 """
 
@@ -177,6 +178,44 @@ def bracket(system, motion, s):
     s.trace(BLUE, B)
 
 
+def ball(system, motion, s):
+    N, G = motion.N, motion["ball"].center.position
+    s.line(GREY, -0.4 * N.x, 0.4 * N.x)
+    s.circle(GOLD, G + 0.06 * N.y, N.x, N.y, 0.06)
+    s.trace(GOLD, G + 0.06 * N.y)
+
+
+def wheel_without_a_rim(system, motion, s):
+    S, hub, W = motion["S"], motion["hub"].position, motion["wheel"].frame
+    s.line(GREY, -0.8 * S.x, 2.6 * S.x)
+    s.line(GOLD, hub, motion["foot"])
+    for i in range(-3, 5):
+        if i:
+            angle = 2.0 * i * system.half_angle
+            s.line(BLUE, hub, hub + system.length * (jnp.sin(angle) * W.x - jnp.cos(angle) * W.y))
+    s.dot(WHITE, hub)
+    s.trace(WHITE, hub)
+
+
+def two_legs(system, motion, s):
+    S, hip = motion["S"], motion["hip"].center.position
+    s.line(GREY, -0.6 * S.x, 1.7 * S.x)
+    s.line(GOLD, motion["foot"], hip)
+    s.line(BLUE, hip, motion["toe"])
+    for body in motion.bodies:
+        s.dot(WHITE, body)
+    s.trace(WHITE, hip)
+
+
+def stone(system, motion, s):
+    O, B = motion["center"].position, motion["B"]
+    a, b, c = (x * axis for x, axis in zip((system.a, system.b, system.c), (B.x, B.y, B.z), strict=True))
+    s.line(GOLD, *(O + np.cos(angle) * a + np.sin(angle) * b for angle in AROUND), width=2.0)
+    for half in (a, b):
+        s.line(BLUE, *(O + np.cos(angle) * half - np.sin(angle) * c for angle in AROUND[:25]))
+    s.trace(GOLD, O + a)
+
+
 @dataclasses.dataclass(frozen=True)
 class Picture:
     """How a system is shown: figure, seconds, flashes, from where [degrees], the axis that points up; and the speed and
@@ -210,6 +249,11 @@ PICTURES = {
     "SpinningTop": Picture(top, 0.2, 3, 60.0, speed=0.25, watched=1.5),
     "ColumnFrameAndDisk": Picture(column_frame_and_disk, 1.8, 4),
     "Bracket": Picture(bracket, 1.2, 6, -55.0),
+    "SimplestWalker": Picture(two_legs, 2.5, 6, **PLANAR, speed=0.5),
+    "CompassGait": Picture(two_legs, 1.47, 6, **PLANAR, speed=0.5),
+    "Rattleback": Picture(stone, 0.5, 4, 20.0, 35.0, speed=0.5, watched=8.0),
+    "RimlessWheel": Picture(wheel_without_a_rim, 2.4, 4, **PLANAR),
+    "BouncingBall": Picture(ball, 1.0, 10, **PLANAR, speed=0.5, watched=3.0),
 }
 
 

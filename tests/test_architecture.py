@@ -20,9 +20,10 @@ SOURCE = Path(jk.__file__).parent
 
 # Rooms: each may import from those above it, and within itself. What the rooms do not say, is read in their own files:
 # no file imports another that imports it, directly or by way of others.
-FLOORS = ["_version", "_common", "_scalarjit", "rotations", "_system", "loads", "sensors", "catalog"]
-FLOORS += ["joints", "convert", "_kane", "_integrate", "sweep", "plot", "estimate", "fit", "data", "stability"]
-FLOORS += ["bicycles", "symbolic", "export", "_animate", "__main__"]
+FLOORS = """
+_version _common _scalarjit rotations _system loads sensors joints convert _kane _integrate catalog sweep plot estimate
+fit data stability bicycles symbolic export _animate __main__
+""".split()
 
 
 def room_of(path):

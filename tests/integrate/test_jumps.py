@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mechanisms import CompassGait, RimlessWheel
 
 import jaxkane as jk
+from jaxkane.catalog import CompassGait, RimlessWheel
 
 TS = jnp.linspace(0.0, 2.0, 21)
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
@@ -364,7 +364,7 @@ def test_a_rimless_wheel_converges_to_its_gait():
     rate = np.sqrt(4 * 9.81 * np.sin(a) * np.sin(0.08)) / np.tan(2 * a)
 
     def rates(factor):
-        start = jk.State(jnp.array([0.08 - a]), jnp.array([factor * rate]))
+        start = jk.State(jnp.array([0.08 - a, 0.0]), jnp.array([factor * rate]))
         return np.asarray(jk.simulate(RimlessWheel(), start, 4 * TS, **TIGHT).jumps.after.u[:3, 0])
 
     np.testing.assert_allclose(rates(1.0), rate, rtol=rtol)
@@ -376,14 +376,17 @@ def test_a_compass_gait():
     """The state after a step is that before it. Figures by mpmath and by Pinocchio's impulse dynamics."""
     rtol = 1e-9
     after = [-0.21866880293899055, 0.3233885580586503, 1.092383589883601, 0.3773739489071941]
-    start = jk.State(jnp.array(after[:2]), jnp.array(after[2:]))
+    start = jk.State(jnp.array([*after[:2], 0.0]), jnp.array(after[2:]))
     ride = jk.simulate(CompassGait(), start, jnp.linspace(0.0, 1.0, 21), **TIGHT)
     assert int(ride.jumps.count) == 1
     np.testing.assert_allclose(ride.jumps.t[0], 0.7343463911587195, rtol=rtol)
-    found = [*ride.jumps.before.q[0], *ride.jumps.before.u[0]]
-    np.testing.assert_allclose(found, [after[1], after[0], 1.4942048971003625, 1.8056788689878192], rtol=rtol)
-    np.testing.assert_allclose([*ride.jumps.after.q[0], *ride.jumps.after.u[0]], after, rtol=rtol)
-    np.testing.assert_allclose(ride.jumps.impulses[0], [-2.619490477212034, 13.735598013322457], rtol=rtol)
+    before = [after[1], after[0], 0.0, 1.4942048971003625, 1.8056788689878192]
+    np.testing.assert_allclose([*ride.jumps.before.q[0], *ride.jumps.before.u[0]], before, rtol=rtol)
+    step = [*after[:2], 0.5354454154300095, *after[2:]]  # with the step length
+    np.testing.assert_allclose([*ride.jumps.after.q[0], *ride.jumps.after.u[0]], step, rtol=rtol)
+    s, c = np.sin(CompassGait().slope), np.cos(CompassGait().slope)
+    impulses = np.array([[c, -s], [s, c]]) @ [-2.619490477212034, 13.735598013322457]  # along the slope, normal to it
+    np.testing.assert_allclose(ride.jumps.impulses[0], impulses, rtol=rtol)
     assert ride.jumps.energy[0] > 0
 
 
@@ -395,7 +398,7 @@ def test_the_energy_balance_over_jumps():
     np.testing.assert_allclose(audit.lost[-1], jnp.sum(ride.jumps.energy[:3]))
     assert audit.energy_balance < 1e-9
     assert "lost in jumps" in str(audit)
-    start = jk.State(jnp.array([-0.32]), jnp.array([1.2]))
+    start = jk.State(jnp.array([-0.32, 0.0]), jnp.array([1.2]))
     wheel = jk.simulate(RimlessWheel(), start, jnp.linspace(0.0, 2.0, 201), **TIGHT)
     assert int(wheel.jumps.count) > 0
     assert jk.audit(RimlessWheel(), wheel).energy_balance < 1e-9

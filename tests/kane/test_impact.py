@@ -4,13 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mechanisms import CompassGait
 
 import jaxkane as jk
 from jaxkane import Scalar, parameter
 from jaxkane._kane.description import DescriptionEvaluator
 from jaxkane._system.motion import kinetic_energy_of
-from jaxkane.catalog import CATALOG
+from jaxkane.catalog import CATALOG, CompassGait
 
 RTOL = 1e-12
 
@@ -106,8 +105,15 @@ def in_plane(name):
 
 
 toe = in_plane("toe")
-STRIKE_Q, STRIKE_U = jnp.array([0.3233885580586503, -0.21866880293899055]), [1.4942048971003625, 1.8056788689878192]
-STRIKE_U = jnp.array(STRIKE_U)
+STRIKE_Q = jnp.array([0.3233885580586503, -0.21866880293899055, 0.0])
+STRIKE_U = jnp.array([1.4942048971003625, 1.8056788689878192])
+
+
+class Massless(CompassGait):
+    """A compass gait without mass, which `CompassGait` refuses."""
+
+    hip_mass: Scalar = parameter(0.0)
+    leg_mass: Scalar = parameter(0.0)
 
 
 def test_heel_strike_of_the_compass_gait():
@@ -117,7 +123,8 @@ def test_heel_strike_of_the_compass_gait():
     np.testing.assert_allclose(after.u, [0.3773739489071941, 1.092383589883601], rtol=0, atol=RTOL)
     np.testing.assert_allclose(after.impulses, [-2.619490477212034, 13.735598013322457], rtol=0, atol=RTOL * 14)
     before = jk.kinetic_energy(walker, 0.0, STRIKE_Q, STRIKE_U)
-    exchanged = jk.kinetic_energy(walker, 0.0, STRIKE_Q[::-1], after.u[::-1])  # the new stance foot is at rest
+    new_q = STRIKE_Q[jnp.array([1, 0, 2])]
+    exchanged = jk.kinetic_energy(walker, 0.0, new_q, after.u[::-1])  # the new stance foot is at rest
     np.testing.assert_allclose(after.energy_lost, before - exchanged, rtol=1e-11)
 
 
@@ -252,7 +259,7 @@ class Block(jk.System):
         center = O.moving(q["x"] * N.x + q["y"] * N.y, u["x_dot"] * N.x + u["y_dot"] * N.y)
         corners = {"left": center.fixed(-0.2 * B.x - 0.6 * B.y), "right": center.fixed(0.2 * B.x - 0.6 * B.y)}
         body = jk.Body(1.0, (0.0, 0.0, 0.13), center, B, name="block")
-        return jk.Motion([body], points=corners | {"center": center})
+        return jk.Motion([body], points=corners | {"center": center}, frames={"N": N})
 
 
 FALLS_Q, FALLS_U = [0.0, 0.6, 0.0], [0.3, -2.0, 0.7]
@@ -379,7 +386,7 @@ def test_a_released_point_that_already_moves_stays_with_its_speeds():
 
 def strike(x, e, leg, q):
     """All results of a heel strike, in one row."""
-    after = jk.impact(CompassGait(leg=leg), 0.0, q, x, toe, (e, 0.5 * e), ("foot",))
+    after = jk.impact(CompassGait(leg_mass=leg), 0.0, q, x, toe, (e, 0.5 * e), ("foot",))
     return jnp.concatenate([after.u, after.impulses, after.energy_lost[None]])
 
 
@@ -450,7 +457,7 @@ def test_arrays_equal_written_out_scalars(case, monkeypatch):
         "walker": (CompassGait(), STRIKE_Q, STRIKE_U, toe, (0.2, 0.1), ("foot",)),
         "block": (Block(), FALLS_Q, FALLS_U, both_corners, 0.5, ("center",)),
         "hoop": (Hoop(), [0.0, 0.0, 0.35], [4.5], edge, 0.0, ("ground",)),
-        "singular": (CompassGait(hip=0.0, leg=0.0), STRIKE_Q, STRIKE_U, toe),
+        "singular": (Massless(), STRIKE_Q, STRIKE_U, toe),
     }
     system, *arguments = cases[case]
     few = jax.jit(lambda: jk.impact(system, 0.0, *arguments))()
@@ -462,7 +469,7 @@ def test_arrays_equal_written_out_scalars(case, monkeypatch):
 
 def test_a_singular_mass_matrix_is_explained():
     with pytest.raises(ValueError, match="mass"):
-        jk.impact(CompassGait(hip=0.0, leg=0.0), 0.0, STRIKE_Q, STRIKE_U, toe)
+        jk.impact(Massless(), 0.0, STRIKE_Q, STRIKE_U, toe)
 
 
 def test_impacts_of_events_have_residuals_and_coefficients():
@@ -488,7 +495,7 @@ MISUSES = {
     "square": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda t, q, u, m: u["y_dot"] ** 2), "not affine"),
     "unknown": (lambda: jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe, 0.0, "heel"), "heel"),
     "nothing": (lambda: jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe, 0.0, "toe"), "has no effect"),
-    "inertial": (lambda: jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe, 0.0, "N"), "inertial frame"),
+    "inertial": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, left, 0.0, "N"), "inertial frame"),
     "shape": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U[:2], left), "shape"),
 }
 

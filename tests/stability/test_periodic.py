@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mechanisms import CompassGait, RimlessWheel
 from scipy.special import ellipk
 
 import jaxkane as jk
 from jaxkane import Scalar, parameter
+from jaxkane.catalog import CompassGait, RimlessWheel, SimplestWalker
 from jaxkane.stability import equilibrium, family, limit_cycle, periodic
 
 
@@ -189,7 +189,7 @@ def test_orbits_of_a_conservative_system_hold_a_quantity():
     orbit = periodic(pendulum, released, hold=("angle",), period=2.1)
     np.testing.assert_allclose(orbit.period, period_of_a_pendulum(1.0), rtol=1e-11)
     np.testing.assert_allclose(orbit.multipliers, 1.0, rtol=1e-6)
-    with pytest.raises(ValueError, match="form a family, along which angle, period change"):
+    with pytest.raises(ValueError, match=r"form a family, along which (angle, period|period, angle) change"):
         periodic(pendulum, released, period=orbit.period)
 
 
@@ -303,12 +303,12 @@ def wheel_by_formula(half, slope):
 
 
 def wheel(half, slope):
-    orbit = periodic(RimlessWheel(half, slope), jk.State([-0.32], [1.2]), section="step", period=1.2)
+    orbit = periodic(RimlessWheel(half, slope), jk.State([-0.32, 0.0], [1.2]), section="step", period=1.2)
     return jnp.stack([orbit["rate"], orbit.multipliers[0].real])
 
 
 def test_rimless_wheel():
-    orbit = periodic(RimlessWheel(), jk.State([-0.32], [1.2]), section="step")
+    orbit = periodic(RimlessWheel(), jk.State([-0.32, 0.0], [1.2]), section="step")
     np.testing.assert_allclose([orbit["rate"], orbit.multipliers[0].real], wheel_by_formula(0.4, 0.08), rtol=1e-11)
     np.testing.assert_allclose([orbit["angle"], orbit.trivial_multiplier], [0.08 - 0.4, 1.0], rtol=1e-11)
     np.testing.assert_allclose(orbit.ride["angle"][-1], 0.08 + 0.4, rtol=1e-8)
@@ -321,48 +321,29 @@ def test_slopes_of_the_rimless_wheel():
     np.testing.assert_allclose(jnp.stack(found), jnp.stack(expected), rtol=1e-8, atol=1e-8)
 
 
-class SimplestWalker(jk.System):
-    """Garcia, Chatterjee, Ruina and Coleman (1998), as two particles of 1 kg whose forces are the accelerations."""
-
-    slope: Scalar = parameter(0.009, unit="rad")
-    coordinates, speeds = ("theta", "phi"), ("theta_dot", "phi_dot")
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        names = ("stance", "swing")
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[i] * N.x, u[i] * N.x), name=k) for i, k in enumerate(names)])
-
-    def loads(self, t, q, u, motion, inputs):
-        N, phi = motion.N, q["phi"]
-        stance = jnp.sin(q["theta"] - self.slope)
-        swing = stance + (u["theta_dot"] ** 2 - jnp.cos(q["theta"] - self.slope)) * jnp.sin(phi)
-        return jk.Force(stance * N.x, motion["stance"]), jk.Force(swing * N.x, motion["swing"])
-
-    def strike(self, t, q, u):
-        c, rate = jnp.cos(2.0 * q["theta"]), u["theta_dot"]
-        new = {"theta": -q["theta"], "phi": -2.0 * q["theta"]}
-        return new | {"theta_dot": c * rate, "phi_dot": c * (1 - c) * rate}
-
-    def events(self, t, q, u):
-        ahead = -0.05 - q["theta"]  # passes over the scuffing at mid-stance
-        return {"strike": jk.rising(q["phi"] - 2.0 * q["theta"], when=ahead, then=self.strike)}
-
-
 @pytest.mark.slow
 def test_simplest_walker():
-    """Fixed point and multipliers by an integration in 30 digits; the third multiplier is zero, because the swing leg
-    after the strike does not depend on its motion before."""
-    orbit = periodic(SimplestWalker(), jk.State([0.2, 0.4], [-0.2, -0.016]), section="strike")
-    found = [orbit["theta"], orbit["theta_dot"], orbit.period]
-    np.testing.assert_allclose(found, [0.20031090054424708, -0.19983247300495235, 3.882463752851374], rtol=1e-10)
-    pair = -0.19009984106588815 + np.array([1j, -1j]) * 0.5575987766820683
-    np.testing.assert_allclose(orbit.multipliers[:2], pair, rtol=1e-9)
-    np.testing.assert_allclose(orbit.multipliers[2], 0.0, atol=1e-10)
+    """Fixed point and multipliers by an integration in 30 digits for feet without mass: the value at zero of a parabola
+    through those of three small masses. The third multiplier is zero, because the swing leg after the strike does not
+    depend on its motion before."""
+    second = np.sqrt(9.81)  # in units of sqrt(l / g)
+    guess = jk.State([0.2, 0.4, 0.0], [-0.2 * second, -0.016 * second])
+
+    def numbers(foot_mass):
+        orbit = periodic(SimplestWalker(foot_mass=foot_mass), guess, section="heel_strike", period=3.88 / second)
+        pair, third = orbit.multipliers[0], orbit.multipliers[2]
+        np.testing.assert_allclose(third, 0.0, atol=1e-9)
+        state = orbit["theta"], orbit["theta_dot"] / second
+        return np.array([*state, orbit.period * second, pair.real, abs(pair.imag)])
+
+    found = (8.0 * numbers(1e-5) - 6.0 * numbers(2e-5) + numbers(4e-5)) / 3.0
+    expected = [0.20031090054424708, -0.19983247300495235, 3.882463752851374, -0.19009984106588815, 0.5575987766820683]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_the_gait_of_the_compass_and_its_period_doubling():
-    guess = jk.State([-0.22, 0.32], [1.09, 0.38])
+    guess = jk.State([-0.22, 0.32, 0.0], [1.09, 0.38])
     orbit = periodic(CompassGait(), guess, section="heel_strike")
     found = [orbit["stance"], orbit["swing"], orbit["stance_rate"], orbit["swing_rate"], orbit.period]
     expected = [-0.21866880293899055, 0.3233885580586503, 1.092383589883601, 0.3773739489071941, 0.7343463911587195]
@@ -373,6 +354,41 @@ def test_the_gait_of_the_compass_and_its_period_doubling():
     np.testing.assert_allclose(doubling.value, 0.07663563158, rtol=1e-9)  # 4.39 degrees
     expected = [-1.0, -0.30505240096878733, 0.10566775299514994]
     np.testing.assert_allclose(doubling.orbit.multipliers, expected, rtol=1e-8)
+
+
+def gait_of_two_steps(slope):
+    guess = jk.State([-0.241, 0.398, 0.0], [1.166, 0.114])
+    return periodic(CompassGait(slope=slope), guess, section="heel_strike", returns=2, period=1.5)
+
+
+@pytest.mark.slow
+def test_a_gait_of_two_steps_beyond_the_period_doubling():
+    slope = np.deg2rad(4.5)
+    orbit = gait_of_two_steps(slope)
+    walk = jk.simulate(orbit.system, orbit.state, jnp.linspace(0.0, 1.6, 3), rtol=1e-12, atol=1e-12)
+    assert int(walk.jumps.count) == 2
+    after, start = walk.jumps.after, orbit.state
+    np.testing.assert_allclose([*after.q[1, :2], *after.u[1]], [*start.q[:2], *start.u], rtol=1e-9)
+    np.testing.assert_allclose(walk.jumps.t[1], orbit.period, rtol=1e-10)
+    assert np.abs(after.q[0, :2] - start.q[:2]).min() > 0.01
+    assert int(orbit.ride.jumps.count) == 1  # the ride ends before the second jump
+    np.testing.assert_allclose(orbit.ride["swing"][-1], orbit["stance"], rtol=1e-7)  # 1e-9 of a period before it
+    low, high = (gait_of_two_steps(slope + h).period for h in (-1e-4, 1e-4))
+    slope_of_period = jax.jit(jax.grad(lambda slope: gait_of_two_steps(slope).period))(slope)
+    np.testing.assert_allclose(slope_of_period, (high - low) / 2e-4, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_two_steps_of_a_gait_have_the_squares_of_its_multipliers():
+    guess = jk.State([-0.22, 0.32, 0.0], [1.09, 0.38])
+    one, two = (periodic(CompassGait(), guess, section="heel_strike", returns=k) for k in (1, 2))
+    np.testing.assert_allclose(two.period, 2.0 * one.period, rtol=1e-11)
+    np.testing.assert_allclose(np.sort_complex(two.multipliers), np.sort_complex(one.multipliers**2), atol=1e-10)
+
+
+def test_returns_to_a_section_without_a_jump():
+    orbit = periodic(WithSections(1.0), NEAR, section="top", returns=2)
+    np.testing.assert_allclose(orbit.period, 2.0 * MU_1[1], rtol=1e-11)
 
 
 # -- bad input
@@ -390,6 +406,7 @@ def test_the_gait_of_the_compass_and_its_period_doubling():
         ({"autonomous": False, "period": 6.6, "section": "top"}, "Omit `section`"),
         ({"hold": ("z",)}, "unknown: z; there are x, v"),
         ({"segments": 0}, "`segments` must be a positive whole number"),
+        ({"returns": 1.0}, "`returns` must be a positive whole number, got 1.0"),
     ],
 )
 def test_bad_options(options, message):
@@ -407,8 +424,10 @@ def test_guesses_without_an_orbit():
         periodic(WithSections(), jk.State([0.5], [0.0]), section="top", period=1.0)
     with pytest.raises(ValueError, match="crosses the section 'top' against the direction"):
         periodic(WithSections(), jk.State([-2.0], [0.0]), section="top", period=6.66)
+    with pytest.raises(ValueError, match="`returns` = 2 with `segments` = 3"):
+        periodic(RimlessWheel(), jk.State([-0.32, 0.0], [1.1]), section="step", returns=2, segments=3)
     with pytest.raises(ValueError, match="the section 'step' is not crossed within"):
-        periodic(RimlessWheel(), jk.State([-0.32], [0.1]), section="step")
+        periodic(RimlessWheel(), jk.State([-0.32, 0.0], [0.1]), section="step")
 
 
 def test_under_a_trace_there_is_no_exception():

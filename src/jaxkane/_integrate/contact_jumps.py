@@ -233,7 +233,7 @@ def _states_by_accelerations(
         if d == 1:
             directions = jnp.sign(jax.lax.stop_gradient(start))
         else:
-            signs = jnp.sign(start[:, :1]) * np.array([1.0, 0.0, 0.0])
+            signs = jnp.sign(start[:, :1]) * np.array([[1.0, 0.0, 0.0]])
             directions = jnp.where(bearing[:, None], signs, jnp.sum(start[:, :, None] * terms.tangents, axis=1))
     return ContactMemory(states, directions), found.determined
 

@@ -214,9 +214,9 @@ class Problem(NamedTuple):
             return fast_loop(*how, *limits, jumps)
         if self.events.continue_:
             raise ValueError(
-                f"{type(self.system).__name__}: an event changes the state (`then`). This needs the solver loop of "
-                "jaxkane. Omit `controller` and `progress`, use adjoint='reverse', 'forward' or 'both', and a solver "
-                "that is not implicit-explicit."
+                f"{type(self.system).__name__} has contacts, or an event that changes the state (`then`). This needs "
+                "the solver loop of jaxkane. Omit `controller` and `progress`, use adjoint='reverse', 'forward' or "
+                "'both', and a solver that is not implicit-explicit."
             )
         return diffrax_loop(*how, *limits, settings.progress)
 

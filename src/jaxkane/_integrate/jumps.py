@@ -26,9 +26,11 @@ from .._common.lookup import refuse_unknown
 from .._kane.contact import has_contacts
 from .._kane.impact import Impact, after_impact
 from .._kane.kanes_method import KaneEquations
+from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, as_vector, component
 from .._scalarjit.nan import nan_if_not_zero
 from .._scalarjit.scalar_function import ScalarFunction
+from .._system.prints import wrapped
 from .._system.system import NamedVector, State, System, unpacked
 from .events import Events, call_with_states, crossings, events_of
 
@@ -39,11 +41,13 @@ class JumpTable(eqx.Module):
     Attributes:
 
     - `t` (m,) [s]: times. Their derivatives are those of the times of the events.
-    - `event` (m,): the number of the event, in alphabetical order; -1 if unused. `name(i)` is its name.
+    - `event` (m,): the number of the event, in alphabetical order; -1 if unused. `name(i)` is its name. A contact has
+        two events: its normal and its tangential one.
     - `before`, `after`: states before and after the jumps, with arrays (m, ...).
     - `energy` (m,) [J]: the kinetic energy that was lost. It is negative if energy was gained.
     - `impulses` (m, r) [N s or N m s]: of the residuals of the `Impact` of the event. NaN for events without an
-        `Impact`, and beyond the number of its residuals.
+        `Impact`, and beyond the number of its residuals. For a system with contacts: of the contacts, in alphabetical
+        order, each with its normal impulse first.
     - `inputs`: by name (m,), before and after the jumps.
     - `count`: the number of jumps.
     """
@@ -57,6 +61,14 @@ class JumpTable(eqx.Module):
     inputs: tuple[dict[str, Float[Array, "*batch m"]], ...]
     count: Int[Array, "*batch"]
     names: tuple[str, ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        if isinstance(self.count, Tracer) or np.ndim(self.count):
+            return f"JumpTable(shape={self.t.shape})"
+        n, shown = int(self.count), 8
+        items = [f"{self.name(i)} at {float(self.t[i]):.6g} s" for i in range(min(n, shown))]
+        more = [f"{n - shown} more"] if n > shown else []
+        return wrapped(f"JumpTable({n} jumps{': ' * bool(n)}{', '.join([*items, *more])})")
 
     def name(self, i: int) -> str:
         """The name of the event of jump `i`."""

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._kane.api import InputValues, _dependent_accelerations, checked_arrays, finite_or_explained
+from .._kane.arguments import refuse_multipliers
 from .._kane.kanes_method import KaneEquations, motion_rates
 from .._kane.reactions import forces_now, multipliers_now
 from .._kane.right_hand_side import outputs_at, rates
@@ -31,6 +32,8 @@ def along(f: Callable[..., Any], system: System, t: Any, q: Any, u: Any, inputs:
     **Raises:** `ValueError` for a trajectory of another system, and at one time if equations without a solution make
     the result NaN. `TypeError` for a trajectory together with `q`, `u` or `inputs`.
     """
+    if f not in (_positions, _velocities, _orientations):
+        refuse_multipliers(system)
     if not isinstance(t, Trajectory):
         arrays = checked_arrays(system, t, q, u, inputs)
         return finite_or_explained(f(*arrays), arrays)

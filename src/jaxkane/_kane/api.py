@@ -25,6 +25,7 @@ from .arguments import (
     checked_values,
     is_concrete,
     refuse_incomplete,
+    refuse_multipliers,
 )
 from .checks import check_system
 from .constraint_residuals import check_left_out
@@ -69,6 +70,7 @@ def equations_of_motion(
     **Raises:** `ValueError` for wrong shapes and for an unknown input. Also if the numbers of velocity residuals and
     dependent speeds differ, or if the methods of the system contradict each other.
     """
+    refuse_multipliers(system)
     arrays = checked_arrays(system, t, q, u, inputs)
     return as_one_program(rates_and_equations, system)(*arrays)[1:]
 
@@ -82,6 +84,7 @@ def accelerations(
     a speed moves no mass, or if the constraints cannot be solved for the dependent speeds. If the arguments are traced,
     the result is NaN or infinite instead.
     """
+    refuse_multipliers(system)
     arrays = checked_arrays(system, t, q, u, inputs)
     return finite_or_explained(as_one_program(motion_rates, system)(*arrays)[1], arrays)
 
@@ -166,6 +169,7 @@ def generalized_inertia_forces(
 
     - `u_dot`: accelerations (n,), or a dict by name. The default is zero.
     """
+    refuse_multipliers(system)
     arrays = checked_arrays(system, t, q, u, inputs)
     if u_dot is not None:
         u_dot = as_array(u_dot, system.speeds, f"{type(system).__name__}: u_dot")
@@ -216,6 +220,7 @@ def dependent_accelerations(
 
     Arguments as `equations_of_motion`.
     """
+    refuse_multipliers(system)
     arrays = checked_arrays(system, t, q, u, inputs)
     u_dot = as_one_program(motion_rates, system)(*arrays)[1]
     return finite_or_explained(_dependent_accelerations(*arrays, u_dot), arrays)

@@ -86,6 +86,15 @@ def check_is_system(system: Any) -> None:
         raise TypeError(f"The first argument must be an instance of a System, got {system!r}.{hint}")
 
 
+def refuse_multipliers(system: Any) -> None:
+    """**Raises:** `ValueError` for a system of `with_multipliers`, whose equations are more than M u_dot = f."""
+    if hasattr(system, "multiplier_residuals"):
+        raise ValueError(
+            f"{type(system).__name__} has multipliers: it can be assembled, simulated and swept, but this function "
+            "does not contain its constraint forces. Pass the system without multipliers (its attribute `inner`)."
+        )
+
+
 def check_time(name: str, t: Component) -> None:
     """Raise an exception if `t` is not one finite number. `name` is the name of the system."""
     if not is_one_number(t):

@@ -56,6 +56,7 @@ from .._scalarjit.nan import nan_where
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point
 from .._system.motion import flatten_residuals
+from .._system.prints import module_text
 from .._system.system import NamedVector, System
 from .api import checked_arrays, finite_or_explained
 from .arguments import Row, as_row, is_concrete, is_one_number
@@ -85,7 +86,7 @@ class Impact(eqx.Module):
     - `release`: names of points and frames of the `Motion`. Their constraints transmit no impulse. For example, the
         stance foot of a walker is fixed by the description, but it leaves the ground when the other foot strikes. The
         speeds after the impact are those of the description, so the next stage must exchange the legs. A direction in
-        which a released part moves no mass remains fixed.
+        which a released part moves no mass remains fixed, and no residual may depend on it.
 
     **Raises:** `ValueError` without residuals, and for a coefficient of restitution outside [0, 1]. `TypeError` for
     arguments of a wrong type.
@@ -166,6 +167,9 @@ class ImpactResult(eqx.Module):
     energy_lost: Float[Array, ""]
     unique: Bool[Array, ""]
 
+    def __repr__(self) -> str:
+        return module_text(self, ndim=1)
+
 
 class ImpactSolution(NamedTuple):
     """An `ImpactResult` and the reasons for which it may be NaN.
@@ -173,12 +177,14 @@ class ImpactSolution(NamedTuple):
     - `C` (m, N): derivatives of the residuals by the independent speeds and the speeds of released parts.
     - `is_affine` (m,): whether each residual is affine in the speeds.
     - `is_consistent` (): whether the residuals can be satisfied together.
+    - `is_determined` (): whether no residual depends on a motion of a released part that moves no mass.
     """
 
     result: ImpactResult
     C: Array
     is_affine: Array
     is_consistent: Array
+    is_determined: Array
 
 
 def after_impact(kane: KaneEquations, read: ReadImpact) -> ImpactSolution:
@@ -379,11 +385,14 @@ class ImpulseCoordinates(NamedTuple):
     - `X` (N, N): the change of the speeds is X w.
     - `C` (m, N): derivatives of the residuals by all speeds.
     - `h` (N,): generalized momenta before the impact.
+    - `undetermined` (m,): how much motions of released parts without mass change each residual; None if nothing is
+      released.
     """
 
     X: Array
     C: Array
     h: Array
+    undetermined: Array | None = None
 
     @classmethod
     def of(cls, M: Array, C: Array, before: Quantities) -> ImpulseCoordinates:
@@ -394,10 +403,12 @@ class ImpulseCoordinates(NamedTuple):
         B = X.T @ released.M_own
         S = released.M - B.T @ B
         sizes = [released.M[i, i] for i in range(len(S))]
-        X_a = stack(inverse_root(_rows(S), sizes)).astype(M.dtype)
+        X_a, Z = (stack(rows).astype(M.dtype) for rows in _inverse_root(_rows(S), sizes))
+        undetermined = jnp.sum(jnp.abs(released.C @ Z - (C @ X) @ B @ Z), axis=1)
         lower = jnp.concatenate([jnp.zeros_like(released.M_own.T), X_a], axis=1)
         X = jnp.concatenate([jnp.concatenate([X, -X @ B @ X_a], axis=1), lower], axis=0)
-        return cls(X, jnp.concatenate([C, released.C], axis=1), jnp.concatenate([before.h, released.h]))
+        C, h = jnp.concatenate([C, released.C], axis=1), jnp.concatenate([before.h, released.h])
+        return cls(X, C, h, undetermined)
 
     def energy_lost(self, w: Array) -> Array:
         """Kinetic energy before the impact minus that after it [J]."""
@@ -417,10 +428,13 @@ def _solved(M: Array, C: Array, before: Quantities) -> ImpactSolution:
     tolerance = float(jnp.finfo(M.dtype).eps) ** 0.5
     is_consistent = jnp.all(jnp.abs(missing) <= tolerance * size)
     is_consistent &= jnp.all((before.restitution >= 0) & (before.restitution <= 1))
+    is_determined = jnp.ones((), bool)
+    if coordinates.undetermined is not None:
+        is_determined = jnp.all(coordinates.undetermined <= tolerance * jnp.sum(jnp.abs(C), axis=1))
     is_affine = jnp.abs(before.deviation) <= tolerance * before.size
     values = before.u + (X @ w)[:n], p, coordinates.energy_lost(w)
-    u, p, energy_lost = (jnp.where(is_consistent & jnp.all(is_affine), x, jnp.nan) for x in values)
-    return ImpactSolution(ImpactResult(u, p, energy_lost, jnp.all(is_new)), C, is_affine, is_consistent)
+    u, p, energy_lost = (jnp.where(is_consistent & is_determined & jnp.all(is_affine), x, jnp.nan) for x in values)
+    return ImpactSolution(ImpactResult(u, p, energy_lost, jnp.all(is_new)), C, is_affine, is_consistent, is_determined)
 
 
 def _rows(A: Array) -> list[list[Component]]:
@@ -436,15 +450,24 @@ def _own_root(M: Array) -> Array:
     return jsl.solve_triangular(K, jnp.eye(len(M), dtype=M.dtype), lower=True).T
 
 
-def inverse_root(M: Rows, sizes: Sequence[Component] | None = None) -> Rows:
+def inverse_root(M: Rows) -> Rows:
     """X (n, n) with X^T M X = 1, upper triangular, by the Cholesky factors M = K K^T, X = K^-T.
 
-    A pivot that is zero within rounding gives NaN. If the `sizes` (n,) of the diagonal before cancellation are passed,
-    it gives a column of zeros. These directions move no mass, or move it as the directions before them.
+    A pivot that is zero within rounding gives NaN.
+    """
+    X, _ = _inverse_root(M, None)
+    return X
+
+
+def _inverse_root(M: Rows, sizes: Sequence[Component] | None) -> tuple[Rows, Rows]:
+    """X as `inverse_root`, and directions Z (n, n) with M Z = 0.
+
+    If the `sizes` (n,) of the diagonal before cancellation are passed, a pivot that is zero within rounding gives a
+    column of zeros in X and a column that is not zero in Z. This direction moves no mass.
     """
     n = len(M)
     K: list[list[Component]] = [[0.0] * n for _ in range(n)]
-    reciprocals: list[Component] = []
+    regular, reciprocals = [], []
     for j in range(n):
         pivot = sub(M[j][j], dot(K[j][:j], K[j][:j]))
         size = M[j][j] if sizes is None else sizes[j]
@@ -452,16 +475,21 @@ def inverse_root(M: Rows, sizes: Sequence[Component] | None = None) -> Rows:
         # With cancelled digits, the rounding error of a pivot is that of the whole Schur complement.
         is_regular = pivot > (100 * eps if sizes is None else eps**0.75) * size
         root = jnp.sqrt(jnp.where(is_regular, pivot, 1.0))
-        reciprocals.append(jnp.where(is_regular, 1.0 / root, math.nan if sizes is None else 0.0))
+        regular.append(is_regular)
+        reciprocals.append(jnp.where(is_regular, 1.0 / root, math.nan if sizes is None else 1.0))
         for i in range(j + 1, n):
-            K[i][j] = mul(sub(M[i][j], dot(K[i][:j], K[j][:j])), reciprocals[j])
+            column = mul(sub(M[i][j], dot(K[i][:j], K[j][:j])), reciprocals[j])
+            K[i][j] = column if sizes is None else jnp.where(is_regular, column, 0.0)
     X: list[list[Component]] = [[0.0] * n for _ in range(n)]
     for i in range(n):
         X[i][i] = reciprocals[i]
         for j in range(i):
             # K K^-1 = 1
             X[j][i] = mul(mul(-1.0, reciprocals[i]), total(mul(K[i][k], X[j][k]) for k in range(j, i)))
-    return X
+    if sizes is None:
+        return X, []
+    Z = [[jnp.where(regular[i], 0.0, x) for i, x in enumerate(row)] for row in X]
+    return [[jnp.where(regular[i], x, 0.0) for i, x in enumerate(row)] for row in X], Z
 
 
 class RowBasis(NamedTuple):
@@ -476,10 +504,9 @@ class RowBasis(NamedTuple):
     is_new: Array
 
     @classmethod
-    def of(cls, A: Array, threshold: float | None = None) -> RowBasis:
-        """`threshold`: the largest part of a row, relative to the row, that is regarded as dependent."""
-        m = len(A)
-        threshold = float(jnp.finfo(A.dtype).eps) ** 0.75 if threshold is None else threshold
+    def of(cls, A: Array, redundant: float = 0.0) -> RowBasis:
+        """`redundant`: the largest part of a row, relative to the row, that is regarded as dependent."""
+        m, threshold = len(A), max(redundant, float(jnp.finfo(A.dtype).eps) ** 0.75)
         Q, T, is_new = jnp.zeros((0, A.shape[1]), A.dtype), [], []
         for i in range(m):
             rest, row = A[i], jnp.zeros(i, A.dtype)
@@ -602,6 +629,12 @@ def _explain(solution: ImpactSolution, arrays: Any) -> None:
                 f"{name}: the velocity residual {i} of the impact is not zero and does not depend on the speeds, so no "
                 "impulse can change it. Pass a velocity, such as motion['P'].velocity.dot(motion.N.y)."
             )
+    if not solution.is_determined:
+        raise ValueError(
+            f"{name}: a released part can move without moving a mass, and a residual of the impact depends on this "
+            "motion, so the speeds after the impact are undetermined. Give the bodies an inertia, or do not release "
+            "the part."
+        )
     finite_or_explained(solution.result, arrays)
     if not solution.is_consistent:
         raise ValueError(

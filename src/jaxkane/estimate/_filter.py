@@ -20,7 +20,15 @@ from .._common.lookup import hint, real_number
 from .._integrate.jumps import refuse_jumps
 from .._integrate.simulate import checked_state
 from .._kane.api import dependent_speeds
-from .._kane.arguments import check_is_system, check_time, checked_inputs, is_concrete, is_numeric, is_one_number
+from .._kane.arguments import (
+    check_is_system,
+    check_time,
+    checked_inputs,
+    is_concrete,
+    is_numeric,
+    is_one_number,
+    refuse_multipliers,
+)
 from .._kane.checks import check_system
 from .._kane.consistent_state import AssemblyProblem, euler_parameters
 from .._kane.constraint_residuals import (
@@ -156,6 +164,7 @@ class Filter(eqx.Module):
         substeps: int = 1,
     ):
         check_is_system(system)
+        refuse_multipliers(system)
         refuse_jumps(system, "Filter", "A Kalman filter cannot represent jumps. Estimate between the jumps only.")
         noise, drift = {} if noise is None else noise, {} if drift is None else drift
         measurable = (*system.coordinates, *system.speeds, *system.states, *system.dependent_speeds)

@@ -16,7 +16,15 @@ from jaxtyping import Array, Float
 from .._common.lookup import as_names, hint, refuse_unknown
 from .._integrate.trajectory import refuse_other_system
 from .._kane.api import dependent_speeds
-from .._kane.arguments import as_array, check_is_system, checked_inputs, is_concrete, is_one_number, refuse_incomplete
+from .._kane.arguments import (
+    as_array,
+    check_is_system,
+    checked_inputs,
+    is_concrete,
+    is_one_number,
+    refuse_incomplete,
+    refuse_multipliers,
+)
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import SINGULAR_ROUNDING, configuration_residual
 from .._kane.diagnosis import diagnosis
@@ -127,6 +135,7 @@ def linearize(
     """
     name = type(system).__name__
     check_is_system(system)
+    refuse_multipliers(system)
     if isinstance(motion, SteadyMotion):
         refuse_other_system(f"linearize({name})", system, motion)
         inputs = motion.inputs if inputs is None else inputs

@@ -78,6 +78,7 @@ class OrbitEquations(eqx.Module):
     - `hold`: indices of the entries that keep their value at the start.
     - `section`: the name of the event at which the orbit starts, or "".
     - `jumps`: whether the event of the section changes the state. The orbit then starts after this jump.
+    - `returns`: the number of these jumps in one period. With more than one, there is one segment.
     - `autonomous`: whether the phase is free, so that the equations contain a phase condition.
     - `period_of`: the period of the force as a function of the system, or None.
     - `constrained`: whether the system has configuration constraints.
@@ -89,6 +90,7 @@ class OrbitEquations(eqx.Module):
     hold: tuple[int, ...] = eqx.field(static=True)
     section: str = eqx.field(static=True)
     jumps: bool = eqx.field(static=True)
+    returns: int = eqx.field(static=True)
     autonomous: bool = eqx.field(static=True)
     period_of: Callable[[System], Any] | None = eqx.field(static=True)
     constrained: bool = eqx.field(static=True)
@@ -136,9 +138,21 @@ class OrbitEquations(eqx.Module):
         n = len(self.closed)
         y, t, duration = args.start.at[self.places].set(segment[:n]), segment[n], segment[n + 1]
         if last and self.jumps:
-            end, elapsed = self.until_jump(args, y, t, 2.0 * args.period)
+            end, elapsed = self.until_return(args, y, t, 2.0 * args.period)
             return jnp.append(end[self.places], elapsed - duration)
         return jnp.append(self.flow(args, y, t, duration)[self.places], 0.0 * duration)
+
+    def until_return(self, args: OrbitArguments, y: Array, t: Array, longest: Array) -> tuple[Array, Array]:
+        """The packed state after `returns` jumps at the section, and the time until then. NaN if one takes longer."""
+        if self.returns == 1:
+            return self.until_jump(args, y, t, longest)
+
+        def step(carry, _):
+            y, elapsed = carry
+            after, duration = self.until_jump(args, y, t + elapsed, longest)
+            return (after, elapsed + duration), None
+
+        return jax.lax.scan(step, (y, jnp.zeros_like(t)), length=self.returns)[0]
 
     def until_jump(self, args: OrbitArguments, y: Array, t: Array, longest: Array) -> tuple[Array, Array]:
         """The packed state after the next jump at the section, and the time until then. NaN if it takes longer."""
@@ -158,9 +172,11 @@ class OrbitEquations(eqx.Module):
         assert ride.end is not None
         return jnp.where(ride.ok, packed_motion(ride.end), jnp.nan)
 
-    def simulate(self, args: OrbitArguments, y: Array, ts: Array, adjoint: Any = "forward") -> Trajectory:
-        """A simulation that does not end at the section, or ends there before its jump."""
-        system = with_section(args.system, self.section, self.jumps)
+    def simulate(
+        self, args: OrbitArguments, y: Array, ts: Array, adjoint: Any = "forward", jumping: bool = False
+    ) -> Trajectory:
+        """A simulation that does not end at the section, or ends there before its jump. With `jumping` it continues."""
+        system = args.system if jumping else with_section(args.system, self.section, self.jumps)
         if self.constrained:  # `simulate` refuses a state that violates the constraints
             n_q = len(system.coordinates)
             y = jnp.concatenate([projected(system, ts[0], y[:n_q]), y[n_q:]])

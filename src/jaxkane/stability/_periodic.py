@@ -122,6 +122,7 @@ def periodic(
     hold: Sequence[str] | Mapping[str, Any] = (),
     advance: Mapping[str, Any] | None = None,
     segments: int = 1,
+    returns: int = 1,
     t: float = 0.0,
     rtol: float | None = None,
     atol: float | None = None,
@@ -154,6 +155,9 @@ def periodic(
         that rotates. By default 0.
     - `segments`: the number of segments of multiple shooting. More segments find orbits whose multipliers are large,
         and give multipliers that are tiny with full relative accuracy.
+    - `returns`: the number of returns to the section in one period: 2 for a walker whose gait repeats after two steps.
+        The orbit with fewer returns is also a solution, so pass a guess that is nearer to the orbit with more returns.
+        Without a jump at the section, `returns` only selects the default of `period`. With a jump, use one segment.
     - `t`: the time of the start [s].
     - `rtol`, `atol`, `max_steps`: as for `simulate`; by default 1e-12 in float64.
     - `solver`: as for `simulate`, by default `diffrax.Dopri8`.
@@ -165,14 +169,21 @@ def periodic(
     crossed, or if more quantities must be held. Under a trace the orbit is NaN instead.
     """
     name = f"periodic({type(system).__name__})"
-    if isinstance(segments, bool) or not isinstance(segments, int) or segments < 1:
-        raise ValueError(f"{name}: `segments` must be a positive whole number, got {segments!r}.")
+    for key, value in {"segments": segments, "returns": returns}.items():
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name}: `{key}` must be a positive whole number, got {value!r}.")
     y, T, states = _checked_guess(name, system, guess, segments, t)
     _check_options(name, system, section, period, autonomous, y)
     equations, args = orbit_equations(
-        system, y, inputs, hold=hold, advance=advance, section=section, segments=segments, t=t, rtol=rtol, atol=atol,
-        solver=solver, max_steps=max_steps, autonomous=bool(autonomous), period_of=period if callable(period) else None,
+        system, y, inputs, hold=hold, advance=advance, section=section, segments=segments, returns=returns, t=t,
+        rtol=rtol, atol=atol, solver=solver, max_steps=max_steps, autonomous=bool(autonomous),
+        period_of=period if callable(period) else None,
     )  # fmt: skip
+    if equations.jumps and returns > 1 and segments > 1:
+        raise ValueError(
+            f"{name}: `returns` = {returns} with `segments` = {segments}: the jumps at the section {section!r} can be "
+            "in any segment. Omit `segments`."
+        )
     y, entries = args.start, (*system.coordinates, *system.speeds, *system.states)
     if period is not None:
         T = period(system) if callable(period) else period
@@ -200,6 +211,7 @@ def orbit_equations(
     advance: Mapping[str, Any] | None = None,
     section: str | None = None,
     segments: int = 1,
+    returns: int = 1,
     t: Any = 0.0,
     rtol: float | None = None,
     atol: float | None = None,
@@ -231,6 +243,7 @@ def orbit_equations(
         hold=tuple(places.values()),
         section=section or "",
         jumps=_changes_state(system, section, y),
+        returns=returns,
         autonomous=autonomous,
         period_of=None if autonomous else period_of,
         constrained=has_configuration_constraints(system, t, unpacked(system, y).q),
@@ -387,7 +400,7 @@ def _first_return(name: str, equations: OrbitEquations, args: OrbitArguments, y:
     if equations.jumps:
         duration = 1e-2
         for _ in range(_DOUBLINGS // 2):
-            time = float(_time_until_jump(equations, args, y, jnp.asarray(duration, y.dtype)))
+            time = float(_time_until_return(equations, args, y, jnp.asarray(duration, y.dtype)))
             if np.isfinite(time):
                 return y, time
             duration *= 2.0
@@ -421,9 +434,9 @@ def _first_return(name: str, equations: OrbitEquations, args: OrbitArguments, y:
         near = np.linalg.norm(at, axis=1) <= (
             np.inf if equations.section else 0.25 * np.max(np.linalg.norm(at, axis=1))
         )
-        returns = [i for i in crossed if near[i]]
-        if returns:
-            time, _ = _crossing(g, taus, ys, returns[0])
+        found = [i for i in crossed if near[i]]
+        if len(found) >= equations.returns:
+            time, _ = _crossing(g, taus, ys, found[equations.returns - 1])
             return jnp.asarray(first[1], y.dtype), time - first[0]
         duration *= 2.0
     what = f"the section {equations.section!r} is not crossed" if equations.section else "the guess does not return"
@@ -452,8 +465,8 @@ def _sampled(equations: OrbitEquations, args: OrbitArguments, y: Array, duration
 
 
 @jit
-def _time_until_jump(equations: OrbitEquations, args: OrbitArguments, y: Array, longest: Array) -> Array:
-    return equations.until_jump(args, y, args.t, longest)[1]
+def _time_until_return(equations: OrbitEquations, args: OrbitArguments, y: Array, longest: Array) -> Array:
+    return equations.until_return(args, y, args.t, longest)[1]
 
 
 class _Found(eqx.Module):
@@ -677,7 +690,8 @@ def _ride(equations: OrbitEquations, z: Array, args: OrbitArguments) -> Trajecto
     y, T = equations.states(z, args)[0], equations.period(z, args)
     # A ride to a jump ends just before it: a sample at its time would be on either side.
     last = 1.0 - 1e-9 if equations.jumps else 1.0
-    return equations.simulate(args, y, args.t + jnp.linspace(0.0, last, 201, dtype=z.dtype) * T, adjoint="auto")
+    ts = args.t + jnp.linspace(0.0, last, 201, dtype=z.dtype) * T
+    return equations.simulate(args, y, ts, adjoint="auto", jumping=equations.jumps and equations.returns > 1)
 
 
 def _no_orbit(name: str, equations: OrbitEquations, entries: tuple[str, ...], found: _Found) -> str:

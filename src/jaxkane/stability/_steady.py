@@ -14,7 +14,15 @@ from jaxtyping import Array, Float, PyTree
 
 from .._common.lookup import as_names, by_name, hint, refuse_unknown
 from .._kane.api import dependent_speeds
-from .._kane.arguments import as_array, check_is_system, check_time, checked_values, is_concrete, is_one_number
+from .._kane.arguments import (
+    as_array,
+    check_is_system,
+    check_time,
+    checked_values,
+    is_concrete,
+    is_one_number,
+    refuse_multipliers,
+)
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import configuration_residual
 from .._kane.diagnosis import diagnosis
@@ -103,6 +111,7 @@ def equilibrium(
     """
     hold = hold if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold))
     check_is_system(system)
+    refuse_multipliers(system)
     return steady_turn(system, q, None, inputs, hold={**dict.fromkeys(system.speeds, 0.0), **hold}, find=find, t=t)
 
 
@@ -140,6 +149,7 @@ def steady_turn(
     """
     name = type(system).__name__
     check_is_system(system)
+    refuse_multipliers(system)
     values = dict(hold) if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold))
     texts = [k for k, x in values.items() if not (x is None or is_one_number(x))]
     if texts:
@@ -421,6 +431,7 @@ def cyclic_coordinates(system: System) -> tuple[str, ...]:
     **Raises:** `ValueError` if no trial has finite accelerations.
     """
     check_is_system(system)
+    refuse_multipliers(system)
     leaves, treedef = jax.tree.flatten(system)
     shapes = tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)
     key = (type(system), str(treedef), shapes, version_of(system))

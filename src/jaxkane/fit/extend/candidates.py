@@ -174,13 +174,13 @@ def _refuse_nothing_new(fit: Fit, candidate: Candidate) -> None:
     names = candidate.names(fit.problem.system)
     free = [name for name in names if name in fit.names]
     if free:
-        raise ValueError(f"{candidate.name}: the fit already estimates {', '.join(free)}. Leave this candidate out.")
+        raise ValueError(f"{candidate.name}: the fit already estimates {', '.join(free)}. Omit this candidate.")
     known = deviations_by_name(fit.problem.specification.unknown)
     starts = [name for name in deviations_by_name(candidate.unknown) if name in known]
     if starts:
         raise ValueError(
-            f"{candidate.name}: the initial values of {', '.join(starts)} are already `unknown` in the fit. Leave them "
-            "out of the candidate."
+            f"{candidate.name}: the initial values of {', '.join(starts)} are already `unknown` in the fit. Omit them "
+            "from the candidate."
         )
     if not names and candidate.has_parameters_only:
         raise ValueError(

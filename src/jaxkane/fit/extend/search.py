@@ -139,6 +139,7 @@ class Model:
         at = without_priors(fit.problem).linearize(fit.point) if fit.parameters.has_prior.any() else fit.linearization
         if at is None or not usable(at):
             raise ValueError("the residuals have no finite derivatives at its minimum")
+        # `linearized_problem` adds the rows of the priors. If `at` contained them too, they would be counted twice.
         linearized, correlation = linearized_problem(fit.problem, at, fit.point), _correlation(fit)
         at_bound = fit.identifiability.at_bound
         free = [i for i, name in enumerate(fit.names) if name not in at_bound]
@@ -304,6 +305,7 @@ class Search:
                     ordered = (one, *(other for other in extensions if other is not one))
                     other = Branch(models[one.name], (*branch.rounds, Round(branch.model, ordered)))
                     key = other.model.key
+                    # Several branches may lead to the same model. Only the best of them is extended.
                     if key not in accepted or other.model.rank < accepted[key].model.rank:
                         longer[key] = accepted[key] = other
             branches = sorted(longer.values(), key=lambda branch: branch.model.rank)[:beam]
@@ -376,6 +378,7 @@ class Search:
         base = [i for i, name in enumerate(names) if name in model.names and i not in of_terms]
         free = [names.index(name) for name in model.names]
         cost = at.cost + float(np.sum(linearized.priors[free, -1] ** 2))
+        # The absolute tolerance is for simulated measurements, whose cost is almost zero.
         nested = abs(cost - model.cost) <= NESTED * model.cost + 1e-9
         at_bound = [names.index(name) for name in model.at_bound]
         return Group(problem, point, cost, linearized, base, own, at_bound, nested)
@@ -448,6 +451,8 @@ class Search:
         terms = (*kept, *move.add)
         base, both = group.places(kept), group.places(terms)
         dropped = [i for i in group.places(model.terms) if i not in base]
+        # A subset of the augmented problem, not a problem of its own, which would have to be compiled for each
+        # candidate.
         parameters = group.problem.model.parameters.subset(both, on_device(group.neutral(dropped)))
         problem = dataclasses.replace(
             group.problem, model=eqx.tree_at(lambda m: m.parameters, group.problem.model, parameters)

@@ -190,7 +190,7 @@ def forward_selection(
     elif folds is not None or exchange:
         raise ValueError(
             "forward_selection: cross-validation (`folds`, `exchange`) needs at least two trials, got one. Cut the "
-            "trial with `Trial.between`, or leave out `folds` and `exchange`."
+            "trial with `Trial.between`, or omit `folds` and `exchange`."
         )
     with tqdm(disable=not progress, desc="forward selection", unit=" step") as bar:
         search = Search(fit, terms, exchange, depth, refits, level, ranges, groups, bar)
@@ -202,6 +202,7 @@ def forward_selection(
         problem = fit.problem.with_specification(extended_specification(terms.base, best.model.terms))
         start = mapped_point(best.model.problem, best.model.point, problem, best.model.names)
         after = solve(problem, LeastSquares(), start=start)
+    # A subset of the selected model is an earlier stage of it, not an alternative.
     others = {branch.model.key: branch for branch in accepted if not branch.model.key <= best.model.key}
     others = sorted(others.values(), key=lambda branch: branch.model.rank)
     selected = tuple(c.name for c in best.model.terms if c in terms.candidates)

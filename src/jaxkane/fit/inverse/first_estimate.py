@@ -182,7 +182,7 @@ def _check_linear(spec: RegressorSpec, parameters: Parameters) -> None:
         if after.shape != Y.shape or np.abs(after - Y).max() > 1e-6 * np.abs(Y).max():
             raise ValueError(
                 f"{type(spec.system).__name__}: the equations of motion are not linear in {name}, which changes "
-                "lengths, positions or inputs. Leave it out here, and free it in the fit."
+                "lengths, positions or inputs. Omit it here, and free it in the fit."
             )
     check_linear(spec, np.zeros((), jnp.result_type(float)), None)
 
@@ -227,6 +227,7 @@ def _projection(
         row[base.fixed] = 10.0 * np.sqrt(max(eigenvalues.max(initial=0.0), 1e-300))
         root = np.vstack([root, row])
     has_prior = parameters.has_prior
+    # `least_squares` calls `residuals` and `slopes` at the same x. Both come from one evaluation.
     memory: dict[bytes, Any] = {}
 
     def evaluate(x: np.ndarray) -> Any:

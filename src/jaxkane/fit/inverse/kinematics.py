@@ -66,14 +66,16 @@ def spline(trial: Trial, name: str, y: np.ndarray, spacing: float) -> Any:
     t, y = trial.t[finite], y[finite]
     if len(t) < 3 * (DEGREE + 1):
         raise ValueError(
-            f"{trial.name}: {name} has {len(t)} samples. Accelerations need at least {3 * (DEGREE + 1)}. Leave this "
-            "trial out."
+            f"{trial.name}: {name} has {len(t)} samples. Accelerations need at least {3 * (DEGREE + 1)}. Omit this "
+            "trial."
         )
     weights = None if name not in trial.sigma else 1.0 / trial.sigma[name][finite]
     n = max(1, round((t[-1] - t[0]) / spacing))
     inner, last = [], 0
     for knot in np.linspace(t[0], t[-1], n + 1)[1:-1]:
         upto = int(np.searchsorted(t, knot))
+        # Without samples between two knots, the least-squares problem is singular (condition of Schoenberg and
+        # Whitney).
         if upto - last >= 2 and len(t) - upto >= 2:
             inner.append(knot)
             last = upto

@@ -41,6 +41,7 @@ class Interval(eqx.Module):
     def far(self) -> float:
         """An x at which the value equals the bound within rounding. The x of the bound itself is infinite."""
         ends = [abs(float(self.start - end)) for end in (self.lower, self.upper) if np.isfinite(float(end))]
+        # exp(-50) = 2e-22 is below the rounding error of float64.
         return 50.0 * max(ends) / float(self.scale)
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, " 1"]:
@@ -75,7 +76,7 @@ class Interval(eqx.Module):
         start, lower, upper = (float(x) for x in (self.start, self.lower, self.upper))
         reach = {(False, False): np.inf, (False, True): upper - start, (True, False): start - lower}
         both = (start - lower) * (upper - start) / (upper - lower) if all(self.bounded) else 0.0
-        return 3.0 * reach.get(self.bounded, both) / float(self.scale)
+        return 3.0 * reach.get(self.bounded, both) / float(self.scale)  # exp(3) = 20
 
     def log_prior_constants(self, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
         """log p(value) + (value - mean)^2 / (2 deviation^2), (1,).
@@ -180,6 +181,7 @@ class PossibleBody(eqx.Module):
         """
         if not np.all(np.isfinite(deviation)):
             return np.where(np.isfinite(deviation), 0.0, np.nan)
+        # The same samples in every call: two models with the same prior must get the same constant.
         draws = np.random.default_rng(0).normal(mean, deviation, (10_000, len(mean)))
         x = jax.vmap(self.inverse)(jnp.asarray(draws, self.start.dtype))
         share = np.mean(np.all(np.isfinite(np.asarray(x)), axis=1))

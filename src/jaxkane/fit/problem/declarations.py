@@ -60,6 +60,7 @@ class Free:
     bounds: tuple[float | None, float | None] | None = None
     scale: float | None = None
     prior: Prior | None = None
+    # A frozen dataclass hashes all its fields, and a dict has no hash.
     tied: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)
     name: str | None = None
     unit: str = ""

@@ -236,7 +236,7 @@ def _with_groups(part: Part, item: Item, trials: Sequence[Trial], joint: list[Jo
         if len(members) < 3:
             raise ValueError(
                 f"{name}: a distribution needs at least three groups, but {each!r} has {len(members)}. Pass "
-                "prior=(mean, standard deviation), or leave it out."
+                "prior=(mean, standard deviation), or omit `prior`."
             )
         mean = f"{'median' if logarithmic else 'mean'} of {name}"
         parts = [([entries[0]._replace(name=mean)], bijection, starts, scales, priors), *parts]
@@ -395,7 +395,7 @@ def _of_leaves(system: System, item: Free):
         if followers and many:
             raise ValueError(
                 f"{leaf_name(path)} has several entries, and other parameters can be tied to a single number only. "
-                "Leave out `tied`."
+                "Omit `tied`."
             )
         for place, index in enumerate(np.ndindex(leaf.shape)):
             label = item.name if item.name and not many else leaf_name(path)

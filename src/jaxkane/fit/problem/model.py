@@ -98,6 +98,7 @@ class Simulation:
             rtol=None if fixed else 1e-6 if self.rtol is None else self.rtol,
             atol=self.atol,
             solver=solver,
+            # A placeholder: `Model.simulate` replaces it by the step of each window.
             step=1.0 if fixed else None,
             adjoint="forward",
             # With a fixed step, the default is the number of steps in a window.
@@ -302,6 +303,7 @@ class Model(eqx.Module):
         settings = self.settings if self.settings.step is None else dataclasses.replace(self.settings, step=window.step)
         origin, t = window.t[0], window.t
         signals = self.signals(window, self.nuisance.with_local(calibration, b, z))
+        # The integrator gets times since the start of the window: at 1e4 s, float32 resolves only 1 ms.
         signals = share_times(since(origin, signals, t.dtype))
         return dataclasses.replace(solve(system, unpacked(system, start), origin, t - origin, signals, settings), t=t)
 
@@ -355,6 +357,7 @@ class Model(eqx.Module):
         ride = self.simulate(window, start, z, b, x)
         calibration, n = self.parameters.apply(self.system, x, window.applies)[1], self.nuisance
         simulated = self.simulated(ride, n.with_local(calibration, b, z))
+        # `where`, because the product of a weight of zero and a simulated value of NaN is NaN.
         difference = jnp.where(window.weight > 0, (simulated - window.measured) * window.weight, 0.0)
         end = packed_motion(ride.state())
         following = self.known(window.next_start, calibration)

@@ -131,7 +131,7 @@ class Parameters(eqx.Module):
             if not has_value.all():
                 raise ValueError(
                     f"{trials[int(np.argmin(has_value))].name} belongs to none of the groups of "
-                    f"{', '.join(self.all_entries[i].name for i in same)}. Leave the trial out, or give the parameter "
+                    f"{', '.join(self.all_entries[i].name for i in same)}. Omit the trial, or give the parameter "
                     "a distribution (prior='normal'), whose mean applies to other groups."
                 )
         return own
@@ -327,6 +327,7 @@ class Parameters(eqx.Module):
         if not self.joint_target.size:
             return jnp.zeros(0, self.start.dtype)
         values = jnp.asarray(self.all_values(x))
+        # A parameter without a log-normal prior may be negative. Its factor of zero times NaN would be NaN.
         both = jnp.concatenate([values, jnp.log(jnp.where(self._logarithmic, values, 1.0))])
         return (self.joint_matrix @ both - self.joint_target) / self.joint_deviation
 

@@ -379,6 +379,7 @@ class Problem:
         missing = []
         for i in range(len(self.slices)):
             windows, z = jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], (self.windows, point.window_starts))
+            # One window at a time, because the exception that `_starts` catches does not identify the window.
             alone = dataclasses.replace(self, windows=windows)
             missing.append(alone.starts(Unknowns(point.parameters, point.trial_unknowns, z)) is None)
         return np.array(missing)

@@ -129,7 +129,7 @@ def _difference_quotients(trial: Trial) -> Iterator[str]:
                 if size.size >= FEWEST and np.max(size) < 1e-6 * np.nanmax(np.abs(quotient)):
                     yield (
                         f"{b} is the difference quotient of {a}: it was computed, not measured, and contains no new "
-                        "information. Leave it out."
+                        "information. Omit it."
                     )
                     break
 

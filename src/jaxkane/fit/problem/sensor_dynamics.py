@@ -14,6 +14,7 @@ def delayed_signal(t: Float[Array, " n"], y: Float[Array, " n"], delay: Array) -
     be repeated, which occurs in padded windows.
     """
     h = jnp.diff(t)
+    # Replace the divisor too: masking only the quotient leaves NaN in its derivative.
     lasting = jnp.where(h > 0, h, jnp.ones_like(h))
     d = jnp.where(h > 0, jnp.diff(y) / lasting, 0.0)  # (n-1,)
     d = jnp.where(h > 0, d, d[jnp.maximum(jnp.sum(h > 0) - 1, 0)])
@@ -47,6 +48,7 @@ def low_passed(t: Float[Array, " n"], y: Float[Array, " n"], time_constant: Arra
     ramp = T * jnp.where(h > 0, jnp.diff(y) / jnp.where(h > 0, h, 1.0), 0.0)  # (n - 1,)
     lasts = T > 0
     a = jnp.where(lasts, jnp.exp(-h / jnp.where(lasts, T, 1.0)), 0.0)
+    # A repeated last time must not change x, which it would for T <= 0.
     a = jnp.where(h > 0, a, 1.0)
 
     def go_on(x: Array, now: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:

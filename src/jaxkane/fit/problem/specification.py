@@ -188,6 +188,7 @@ def nuisance_of(spec: ProblemSpec, channels: Sequence[str], sampled: Sequence[st
             f"{own.names[int(np.argmax(of_window))]}: each='window' is not supported together with `noise` or "
             "`defect_std`. Use each='trial'."
         )
+    # `Model.priors` is zero at z = 0 and b = 0. So these must be the prior mean, not the initial guess.
     center, deviation = np.where(own.has_prior, own.prior_mean, own.start), np.asarray(own.prior_deviation)
     for kind, name in (role for entry in own.entries for role in entry.roles):
         known = channels if kind.endswith("sensor") else system.inputs if kind == "offset of input" else sampled
@@ -220,6 +221,7 @@ def reach_of(trials: Sequence[Trial], parameters: Parameters, nuisance: Nuisance
     **Raises:** `ValueError` if a delay may be longer than a trial.
     """
     if any(kind == "delay of input" for entry in nuisance.trial for kind, _ in entry.roles):
+        # A delay of each trial has no bounds (`is_eliminated`), so all input samples of the trial are kept.
         return np.inf, np.inf
     shortest = min(trials, key=lambda trial: np.ptp(trial.t))
     reaches = [(0.0, 0.0)]

@@ -82,9 +82,7 @@ class Trial:
         }
         self.sigma = self._sigmas(sigma)
         if not any(np.isfinite(x).any() for x in self.measured.values()):
-            raise ValueError(
-                f"{self.name}: all measurements are NaN ({', '.join(self.measured)}). Leave this trial out."
-            )
+            raise ValueError(f"{self.name}: all measurements are NaN ({', '.join(self.measured)}). Omit this trial.")
 
     def _checked_labels(self, labels: Any) -> dict[str, str | float]:
         if labels is not None and not isinstance(labels, Mapping):
@@ -157,7 +155,7 @@ class Trial:
         if t.ndim != 1 or t.shape[0] < 2:
             raise ValueError(f"{self.name}: `t` must be at least two times (n_t,), got the shape {t.shape}.")
         if not np.all(np.isfinite(t)):
-            raise ValueError(f"{self.name}: t[{int(np.argmin(np.isfinite(t)))}] is not finite. Leave this sample out.")
+            raise ValueError(f"{self.name}: t[{int(np.argmin(np.isfinite(t)))}] is not finite. Omit this sample.")
         steps = np.diff(t)
         if not np.all(steps > 0):
             i = int(np.argmax(steps <= 0))
@@ -175,6 +173,7 @@ class Trial:
             if isinstance(value, np.ma.MaskedArray):  # masked samples are missing samples
                 value = np.ma.filled(value.astype(float), np.nan) if value.dtype.kind in "iuf" else value.data
             array = np.asarray(value)
+            # `astype(float)` alone would accept booleans, dates and the text "1.5" without an error.
             if array.dtype.kind not in "iuf":
                 raise ValueError(f"their type is {array.dtype}")
             return array.astype(float)

@@ -97,6 +97,7 @@ class Windows(eqx.Module):
         times = self.t_input + delay
         if self.n_acting == times.shape[0]:
             return times, self.inputs
+        # One step before the window, because a ramp (`Ramps`) begins one step before its discontinuity.
         first = jnp.maximum(jnp.searchsorted(times, self.t[0] - self.step, side="right") - 1, 0)
 
         def chosen(x):
@@ -147,6 +148,7 @@ class Windows(eqx.Module):
         rows, places = np.minimum(np.arange(shape.windows), W - 1), np.minimum(np.arange(shape.samples), n_t - 1)
         added, spare = np.arange(shape.windows) >= W, np.arange(shape.samples) >= n_t
         own = jax.tree.map(lambda x: np.asarray(x)[rows], self)
+        # The added input times must increase: `Samples` divides by the intervals between them.
         after = np.maximum(np.arange(shape.inputs) - own.t_input.shape[1] + 1, 0)  # samples behind the last
         inputs = np.minimum(np.arange(shape.inputs), own.t_input.shape[1] - 1)
         new = dataclasses.replace(
@@ -242,6 +244,7 @@ def cut(
     pairs = tuple(zip(names, guesses, strict=True))
     start = np.array([[_start(trials[k], i, n, *pair) for pair in pairs] for k, i, n in places])
     owner = np.array([k for k, _, _ in places])
+    # One step on each side of a window, for the ramps that begin or end there.
     span = np.ptp(columns["t"], axis=1) + 2 * np.array(columns["step"])
     longest = {k: span[owner == k].max() for k in owner.tolist()}
     windows = Windows(
@@ -314,6 +317,7 @@ def first_after(trial: Trial, late: Mapping[str, float]) -> int:
     **Raises:** `ValueError` if fewer than two samples remain.
     """
     longest = max((lag for name, lag in late.items() if np.ptp(trial.inputs.get(name, 0.0)) > 0), default=0.0)
+    # Without the tolerance, rounding would exclude a sample that is exactly `longest` after the first one.
     first = int(np.searchsorted(trial.t, trial.t[0] + longest * (1 - 1e-9)))
     if first > len(trial.t) - 2:
         raise ValueError(

@@ -135,7 +135,7 @@ def design(
     for name in ("noise", "errors"):
         if options.get(name) is not None:
             raise ValueError(
-                f"design: `{name}` is not supported, because a design assumes white normal errors. Leave it out."
+                f"design: `{name}` is not supported, because a design assumes white normal errors. Omit it."
             )
     problem = Problem.of(system, plan.trial(coefficients), free, **options)
     names, about = problem.parameters.names, as_names(about or ())
@@ -261,6 +261,7 @@ def objective_of(
 ) -> Objective:
     """The criterion of optimal design plus a penalty for exceeded limits, as a function that JAX can differentiate."""
     point, is_one_motion = problem.start, problem.model.nuisance.has_defects
+    # Only linked windows start at states that depend on the input. The others are computed once, outside the search.
     fixed = None if is_one_motion else starts_of(problem.model, problem.windows, point)
     bounds = jnp.asarray([limits.get(c, np.inf) for c in problem.channels], t.dtype)
     # Indices of the samples of the windows in the samples of the trial. They do not depend on the coefficients.
@@ -273,6 +274,8 @@ def objective_of(
         windows = _one_motion(model, windows, point) if is_one_motion else windows
         starts, starts_dot = starts_of(model, windows, point) if fixed is None else fixed
         information, simulated = _information(model, windows, point, starts, starts_dot)
+        # Without the floor, a parameter without information makes the first value infinite, and the search cannot
+        # start.
         floor = 1e-12 * jnp.trace(information) * jnp.eye(information.shape[0], dtype=information.dtype)
         covariance = jnp.linalg.inv(information + floor)[places][:, places]
         value = jnp.linalg.slogdet(covariance)[1] if criterion == "D" else jnp.trace(covariance)

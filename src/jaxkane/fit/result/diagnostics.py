@@ -59,6 +59,7 @@ def unrecorded_inputs(problem: Problem, point: Unknowns) -> Iterator[str]:
     """Inputs whose first sample is used for earlier times, because they are delayed by more than two intervals."""
     before, nuisance = delayed_inputs(problem.specification)[1], problem.model.nuisance
     names, calibration = trial_names(problem), problem.parameters.apply(problem.system, point.parameters)[1]
+    # Reversed, so that the dict keeps the first window of each trial.
     starts = {k: first for k, first, _ in reversed(problem.slices)}
     for name in (name for name in problem.system.inputs if name not in before):
         delays = [
@@ -109,6 +110,7 @@ def poorly_fitted_channels(tests: Mapping[str, Mapping[str, ResidualTest]], vari
     worst: dict[str, float] = {}
     for channels in tests.values():
         for channel, test in channels.items():
+            # `fmin` ignores NaN, which is the share of a constant channel.
             worst[channel] = np.fmin(worst.get(channel, np.inf), test.variance_accounted_for)
     poor = [channel for channel, share in worst.items() if share <= 0.5]
     if variance >= 2 and poor:

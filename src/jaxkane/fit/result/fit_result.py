@@ -167,6 +167,7 @@ class Fit(FitState):
         **Raises:** `ValueError` if a parameter differs between trials and has no distribution over groups. Use
         `systems`.
         """
+        # A distribution over groups has a mean that applies to all trials. Such a parameter has a common value.
         common = {place for e in self.parameters.all_entries if e.group is None for place in places_of(e)}
         differs = [
             e.name for e in self.parameters.all_entries if e.group and not common & {*places_of(e)} and e.targets

@@ -117,6 +117,7 @@ def _without_priors(blocks: Blocks, rows: np.ndarray) -> Blocks:
     for w in np.flatnonzero(np.any(rows, axis=(1, 2))):
         squares = R[w].T @ R[w] - rows[w].T @ rows[w]
         scale = np.sqrt(np.maximum(squares.diagonal(), np.finfo(float).tiny))
+        # No Cholesky decomposition: by rounding, the difference may have slightly negative eigenvalues.
         values, V = np.linalg.eigh(squares / np.outer(scale, scale))
         R[w] = 0.0
         R[w, : len(V)] = np.sqrt(np.maximum(values, 0.0))[:, None] * V.T * scale

@@ -60,9 +60,7 @@ def laplace(fit: Any) -> Laplace:
     """See `Fit.laplace`."""
     undetermined = [name for name, error in fit.standard_errors.items() if np.isinf(error)]
     if undetermined:
-        raise ValueError(
-            f"These data do not determine {', '.join(undetermined)}. Add a prior, or leave it out of `free`."
-        )
+        raise ValueError(f"These data do not determine {', '.join(undetermined)}. Add a prior, or omit it from `free`.")
     eliminated = eliminate(fit.linearization.blocks, 0.0)
     to_gain = fit.linearization.squares - eliminated.step(1e-9)[1]
     if fit.status == "validated" or not to_gain < 0.1:

@@ -215,7 +215,7 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
     error, best = fit.standard_errors[name], fit.estimates[name]
     if not np.isfinite(error):
         raise ValueError(
-            f"profile: these data do not determine {name}: {fit.message}. Add a prior, or leave it out of `free`."
+            f"profile: these data do not determine {name}: {fit.message}. Add a prior, or omit it from `free`."
         )
     if span is None:
         low, high = fit.intervals(level)[name]

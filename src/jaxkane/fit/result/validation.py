@@ -328,6 +328,8 @@ def cross_validate(fit: Fit, folds: int | str | Sequence[Sequence[int]] | None =
             failures.append(f"Without {without} the other trials do not determine {names}.")
             values[alone] = np.nan
         else:
+            # The error models are those of the other trials. Estimated from the held-out ones, they would hide poor
+            # predictions.
             held_out[group] = costs_by_trial(fit.problem.with_errors_of(trained.problem), trained.point)[group]
         estimates.append(dict(zip(fit.names, values.tolist(), strict=True)))
     owner = np.asarray(fit.problem.windows.trial)
@@ -353,6 +355,7 @@ def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
     Priors of the initial states and unknowns of a trial are included. Priors of parameters are not, because they belong
     to no single trial. Infinite for trials that cannot be simulated.
     """
+    # `Model.priors` counts the priors of parameters in the very first window only, so without one they are not counted.
     windows = eqx.tree_at(lambda w: w.very_first, problem.windows, jnp.zeros_like(problem.windows.very_first))
     problem = dataclasses.replace(problem, windows=windows)
     try:
@@ -435,7 +438,9 @@ def predict(
             )
         for now in np.arange(t[0] + past, t[-1] - times.max() + 0.5 * dt, times.max()):
             piece = trial.between(max(now - past, t[0]) - 0.25 * dt, now + times.max() + 0.5 * dt)
+            # Quarters of an interval, because `now` and the times of the samples differ by rounding.
             unseen = piece.t > now + 0.25 * dt
+            # The simulation continues through samples of NaN, but they do not influence the initial state.
             hidden = {name: np.where(unseen, np.nan, y) for name, y in piece.measured.items()}
             if unseen.sum() < 1 or not any(np.isfinite(y).any() for y in hidden.values()):
                 continue

@@ -176,6 +176,7 @@ class Eliminated(NamedTuple):
             z = z[:, :m]
         else:
             z = _back(self.z_rows, np.broadcast_to(shared[:, None], (T, m, shared.shape[-1])))
+        # One row more, because `windows` is padded with the index W. This row is removed below.
         of_windows = np.zeros((W + 1, n_z), x.dtype)
         of_windows[np.asarray(self.blocks.windows)] = z
         return of_windows[:W], shared[:, :n_b]
@@ -243,6 +244,7 @@ def _safe(squares: np.ndarray) -> np.ndarray:
 def _triangle(R: np.ndarray, n: int, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows (..., n, k) for the first n unknowns, and the triangle (..., k-n, k-n) of the other unknowns."""
     k = R.shape[-1]
+    # At least k rows in total. With fewer, QR returns a triangle that is too short for the slices below.
     rows = np.zeros((*R.shape[:-2], max(n, k - R.shape[-2]), k), R.dtype)
     rows[..., np.arange(n), np.arange(n)] = damping
     R = triangle(np.concatenate([R, rows], axis=-2))

@@ -39,6 +39,7 @@ def read_state(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     **Raises:** `ValueError` if the file cannot be read.
     """
     try:
+        # Unpickling could run code, and a checkpoint may come from another person.
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
         return dict(json.loads(str(arrays.pop("key")))), arrays

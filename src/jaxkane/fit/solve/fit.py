@@ -271,7 +271,7 @@ def _refuse_start_of_another(problem: Problem, start: Any) -> None:
     if shapes != own:
         raise ValueError(
             "`start` belongs to another problem: its parameters, unknowns of trials and initial values of windows "
-            f"have the shapes {shapes}, but this problem has {own}. If a fit left trials out, use `fit.problem`."
+            f"have the shapes {shapes}, but this problem has {own}. If a fit omitted trials, use `fit.problem`."
         )
 
 
@@ -335,6 +335,8 @@ def _is_stiff(problem: Problem, history: Sequence[float]) -> bool:
 def _first(problem: Problem, optimizer: Optimizer, start: Unknowns, steps: int) -> _Run:
     whole = np.array([n for _, _, n in problem.slices])
     for share in optimizer.horizons or ():
+        # Without `horizons=()`, `_first` would call itself without end. `rtol=1.0`, because only a start for the next
+        # share is needed.
         coarse: Any = dataclasses.replace(optimizer, rtol=1.0, horizons=())  # type: ignore[type-var]
         part = problem.shortened(np.maximum(2, np.round(share * whole).astype(int)))
         run = _first(part, coarse, start, steps)

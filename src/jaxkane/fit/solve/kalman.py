@@ -189,8 +189,10 @@ class _Motion:
         noise: Noise = self.model.noise
         n, n_w, dtype = v.shape[0], len(noise.names), v.dtype
         density, named = noise.spectral_densities(self.calibration), (self.system.speeds, self.system.states)
+        # The derivative of a square root is infinite at zero, and zero times infinity is NaN: mask the argument too.
         lasts = density > 0
         amplitude = jnp.tile(jnp.where(lasts, jnp.sqrt(jnp.where(lasts, density, 1.0)), 0.0), MODES)
+        # Without the tolerance, rounding of the times would double the steps of an interval that is one step long.
         number = jnp.maximum(jnp.ceil((t1 - t0) / self.window.step - 1e-6), 1.0)
         moving = t1 > t0
         length = jnp.where(moving, (t1 - t0) / number, self.window.step)
@@ -199,6 +201,7 @@ class _Motion:
             v, S, back, reached = carry
             done = i.astype(dtype)
             t_start = t0 + done * length
+            # The last step must end exactly at the sample: the next step and its inputs start there.
             t_end = jnp.where(done + 1 >= number, t1, t_start + length)
 
             def flow(v: Array, xi: Array) -> Array:
@@ -210,6 +213,7 @@ class _Motion:
             S, Q = root(A)
             return jnp.where(reached.status > 0, jnp.nan, v1), S, back @ Q[:n], reached
 
+        # The number of steps is traced, so JAX can differentiate this loop in forward mode only.
         times = jnp.where(moving, number, 0.0).astype(jnp.int32)
         return jax.lax.fori_loop(jnp.int32(0), times, piece, (v, S, jnp.eye(n, dtype=dtype), reached))
 
@@ -219,6 +223,7 @@ class _Motion:
         return jnp.concatenate([one_step(self.system, y, t0, t1, self.signals(b), settings, disturbance), b])
 
     def reached(self, v: Array, t: Array, before: Reached) -> Reached:
+        # A status is an integer. Without `stop_gradient`, the event functions would be differentiated for nothing.
         y = jax.lax.stop_gradient(v[: self.n])
         ended = ends_between(self.system, before.t, before.y, t, y, self.signals(v[self.n :]))
         status = jnp.where(jnp.all(jnp.isfinite(y)), ended, jnp.int32(Status.STEP_TOO_SMALL))

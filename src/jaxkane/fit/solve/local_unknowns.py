@@ -50,7 +50,7 @@ class Unsimulated(ValueError):
         k, words = next(iter(self.reasons.items()))
         super().__init__(
             f"{problem.trials[k].name}: with the initial guess {words}, in {int(bad.sum())} of {len(bad)} windows. "
-            "Choose shorter windows or other initial guesses, or leave this part of the trial out."
+            "Choose shorter windows or other initial guesses, or omit this part of the trial."
         )
 
 
@@ -89,15 +89,19 @@ def _solved(problem: Problem, point: Unknowns, steps: int, rtol: float) -> tuple
     at = problem.shortened(samples).linearize(point)
     while at is None or not at.good.all():
         bad = ~at.good if at is not None else np.full(len(whole), True)
+        # A window of two samples has one interval and cannot be shortened further.
         if at is None or np.any(samples[bad] <= 2):
             raise Unsimulated(problem, point, at, bad & (samples <= 2))
         samples = np.where(bad, np.maximum(samples // 2, 2), samples)
         at = problem.shortened(samples).linearize(point)
     stuck = 0
     while True:
+        # A shortened window only has to lead to a longer one, so two steps are enough.
         point, at = refined(problem.shortened(samples), point, at, steps if np.all(samples == whole) else 2, rtol)
         if np.all(samples == whole):
             return point, at
+        # After a failure, a window grows by a quarter: an unstable motion that ends just behind the horizon would fail
+        # again if the horizon were doubled.
         longer = (
             np.minimum(2 * samples, whole) if stuck == 0 else np.minimum(samples + np.maximum(samples // 4, 1), whole)
         )
@@ -134,6 +138,7 @@ def refined(
         if there is not None and better.any():
             point, at = _chosen(better, owner, (tried, there), (point, at))
             before = np.where(better, after, before)
+        # At a minimum, rounding errors reject every step of a trial. Such a trial must not keep the loop running.
         done = better | (after <= before + 1e-9 * at.squares)
         if (done.all() and gained <= rtol * at.squares) or at.cost <= enough:
             break

@@ -25,6 +25,7 @@ def estimated_deviations(problem: Problem, point: Unknowns) -> np.ndarray:
     variance of a residual is estimated together with them, as C / nu.
     """
     parameters = problem.parameters
+    # With infinite standard deviations, the rows of the distributions are zero. `criterion` adds them with its own.
     first = problem.with_deviations(np.full(len(parameters.distributions), np.inf)).linearize(point)
     assert first is not None
     data = triangle(np.column_stack(eliminate(first.blocks, 0.0).rows).astype(float))
