@@ -353,7 +353,7 @@ class Problem(NamedTuple):
         args, system, settings = dataclasses.replace(self.args, within=None), self.system, self.settings
         inputs = args.inputs(tree_of(args.system), t, unpacked(system, y))
         tolerances = jnp.asarray(settings.rtol, y.dtype), jnp.max(jnp.asarray(settings.atol, y.dtype))
-        rest = REST * self.taus[-1]
+        rest = max(REST, 256 * float(jnp.finfo(y.dtype).eps)) * self.taus[-1]
         return changed_contacts(
             tree_of(args.system), self.events.layout, args.clock(t), y, inputs, what, reach, rest, tolerances
         )

@@ -365,7 +365,7 @@ def _at_events(
     unknown = kept & functools.reduce(operator.or_, [x != x for x in values], jnp.array(False))
     fails = unknown & (h <= resolution)
     kept &= ~unknown
-    event, x = first_event(events, _shortest(t1, duration), start, end, h)
+    event, x = first_event(events, _shortest(t1, duration), start, end, h, t1 < before.rejected_end)
     crossed = kept & (x <= 1)
     # Signs, since a product of two small determinants underflows in float32.
     over = kept & (jnp.sign(start.bound) * jnp.sign(end.bound) < 0)

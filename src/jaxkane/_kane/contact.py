@@ -719,7 +719,7 @@ def event_functions(
     slip = jnp.sum(terms.v[:, 1:] * start, axis=1)
     friction = _norm(forces[:, 1:])
     bound = jnp.where(is_bearing, terms.laws.static, terms.laws.static * forces[:, 0])
-    has = jnp.asarray(layout.has_friction)
+    has = jnp.asarray(layout.has_friction) & (terms.laws.static > 0)
     tangential = jnp.where(memory.states == STICKS, bound - friction, jnp.where(closed, slip, one))
     return normal, jnp.where(has, tangential, one)
 
