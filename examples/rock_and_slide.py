@@ -10,7 +10,7 @@ its energy: by impacts of the corners or by sliding.
     friction                    coefficient of friction of the corners             -
 
 Run:      python examples/rock_and_slide.py [--out FOLDER]
-Appears:  the changes of the contact states for two coefficients of friction; and rock_and_slide.png: the angle, the
+Appears:  the first changes of the contact states for two coefficients of friction; and rock_and_slide.png: the angle, the
           contact states and the lost energy over time.
 Takes:    half a minute.
 """
@@ -62,7 +62,7 @@ def fall(friction: float) -> tuple[jk.Trajectory, jk.Audit]:
     """The motion after a start on the left corner, which slides to the right at 0.5 m/s."""
     block = Block(friction=friction)
     start = jk.assemble(block, {"x": 0.0, "angle": 0.4}, {"x_dot": 0.5}, touching=("left",))
-    ride = jk.simulate(block, start, jnp.linspace(0.0, 1.2, 1201))
+    ride = jk.simulate(block, start, jnp.linspace(0.0, 1.6, 1601))
     return ride, jk.audit(block, ride)
 
 
@@ -70,7 +70,7 @@ def print_changes(friction: float, ride: jk.Trajectory) -> None:
     print(f"friction {friction}: {ride.reason}")
     jumps = ride.jumps
     width = jumps.after.contacts.shape[1] // 2
-    for i in range(int(jumps.count)):
+    for i in range(min(int(jumps.count), 8)):  # the block that rocks has thirty impacts
         left, right = (STATES[int(state)] for state in jumps.after.contacts[i, ::width])
         lost = float(jumps.energy[i])
         print(f"  {float(jumps.t[i]):.4f} s  left {left:<6}  right {right:<6}  loses {abs(lost):.4f} J")
@@ -82,15 +82,16 @@ def main(out: Path) -> None:
         print_changes(friction, ride)
         assert ride.ok
 
-    # With little friction, the block is at rest on both corners.
+    # At the end, the block is at rest on both corners.
     slides, rocks = (ride for ride, _ in motions.values())
-    assert slides.contacts["left"][-1] == slides.contacts["right"][-1] == 2
-    np.testing.assert_allclose([slides["angle"][-1], slides["y"][-1] - 0.5, slides["rate"][-1]], 0.0, atol=1e-9)
+    for ride in (slides, rocks):
+        assert ride.contacts["left"][-1] == ride.contacts["right"][-1] == 2
+        np.testing.assert_allclose([ride["angle"][-1], ride["y"][-1] - 0.5, ride["rate"][-1]], 0.0, atol=1e-9)
 
-    # With more friction, it rocks. Each impact reduces its rate by 1 - 3/2 sin^2(alpha), tan(alpha) = width / height
+    # With more friction, it rocks. Each impact multiplies its rate by 1 - 3/2 sin^2(alpha), tan(alpha) = width / height
     # (Housner 1963).
     jumps = rocks.jumps
-    impacts = np.flatnonzero(np.asarray(jumps.impulses[: int(jumps.count), ::2]).max(axis=1) > 0)
+    impacts = np.flatnonzero(np.asarray(jumps.energy[: int(jumps.count)]) > 1e-6)  # the last impacts are very small
     ratios = np.asarray(jumps.after.u[impacts, 2] / jumps.before.u[impacts, 2])
     print("rate after an impact / before:", ratios)
     np.testing.assert_allclose(ratios, 1.0 - 1.5 * 0.6**2 / (0.6**2 + 1.0**2), rtol=1e-9)
