@@ -10,8 +10,8 @@ its energy: by impacts of the corners or by sliding.
     friction                    coefficient of friction of the corners             -
 
 Run:      python examples/rock_and_slide.py [--out FOLDER]
-Appears:  the first changes of the contact states for two coefficients of friction; and rock_and_slide.png: the angle, the
-          contact states and the lost energy over time.
+Appears:  the first changes of the contact states for two coefficients of friction; and rock_and_slide.png: the angle,
+          the contact states and the lost energy over time.
 Takes:    half a minute.
 """
 
