@@ -318,8 +318,8 @@ PICTURES = {
     "SliderCrankWithClearance": Picture(slider_crank, 0.02, 5, **PLANAR, speed=0.01, watched=0.04),
     "RockingBlock": Picture(block, 1.2, 5, **PLANAR, speed=0.5, watched=4.0),
     "KerbWheel": Picture(wheel_at_a_kerb, 1.1, 5, **PLANAR, speed=0.5, watched=2.0),
-    "Backlash": Picture(coupling_with_play, 1.2, 5, **PLANAR, speed=0.5),
-    "Belt": Picture(block_on_a_belt, 3.6, 6, **PLANAR, watched=9.0),
+    "Backlash": Picture(coupling_with_play, 1.0, 4, **PLANAR, up="y"),
+    "Belt": Picture(block_on_a_belt, 3.6, 4, **PLANAR, up="y", watched=9.0),
     "BouncingBall": Picture(ball, 1.0, 10, **PLANAR, speed=0.5, watched=3.0),
 }
 

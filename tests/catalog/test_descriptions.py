@@ -37,9 +37,9 @@ def test_every_system_is_exported_and_listed():
         "SliderCrankWithClearance",  # Flores
         "SimplestWalker",
         "CompassGait",
-        "Rattleback",
         "RockingBlock",  # Housner
         "KerbWheel",  # Irodov
+        "Rattleback",
         "RimlessWheel",
         "Backlash",  # Nordin
         "Belt",  # Popp

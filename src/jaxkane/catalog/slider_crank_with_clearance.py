@@ -21,7 +21,7 @@ from ._entry import entry
 class SliderCrankWithClearance(System):
     """A slider-crank mechanism with clearance between the slider and its guide (Flores et al., 2010).
 
-    The source is Flores, Leine and Glocker (2010), *Modeling and analysis of planar rigid multibody systems with
+    The source is Flores et al. (2010), *Modeling and analysis of planar rigid multibody systems with
     translational clearance joints based on the non-smooth dynamics approach*, Multibody System Dynamics 23(2). The
     corners of the slider collide with the guide and slide along it. The defaults are those of the source.
 
