@@ -158,7 +158,7 @@ def test_other_independent_speeds_keep_contacts_and_events_that_read_states():
         def contacts(self, t, q, u, motion):
             return {"stop": jk.Contact(gap=q["q0"] - 0.8)}
 
-    own = jk.assemble(Crank(), START[:2].tolist() + [-0.3, -0.9], None)
+    own = jk.assemble(Crank(), [*START[:2].tolist(), -0.3, -0.9], None)
     others = [jk.with_multipliers(Crank()), jk.stability.with_speeds(Crank(), ("u0", "u2"))]
     ts = jnp.linspace(0.0, 0.3, 4)
     wanted = jk.simulate(Crank(), own, ts)
