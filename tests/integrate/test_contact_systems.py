@@ -91,6 +91,37 @@ def test_a_block_slides_on_both_corners():
     np.testing.assert_allclose(ride["left.normal"] + ride["right.normal"], 9.81, rtol=1e-10)
 
 
+def test_random_blocks_satisfy_the_contact_laws():
+    rng = np.random.default_rng(1)
+    for _ in range(40):
+        b, h = rng.choice([0.2, 0.6]), rng.choice([0.3, 0.6])
+        mu, e = rng.choice([0.0, 0.1, 0.4, 0.8, 2.0]), rng.choice([0.0, 0.3])
+        start = tilted(rng.uniform(-0.5, 0.5), 2 * b, 2 * h, rate=rng.choice([0.0, 1.0, -2.0]))
+        q = {**start.q, "y": start.q["y"] + rng.choice([1e-3, 0.2])}
+        block = TwoCornerBlock(2 * b, 2 * h, mu, e)
+        ride = jk.simulate(block, jk.State(q, start.u), jnp.linspace(0, 0.97, 21), **TIGHT)
+        if ride.reason == "max jumps":  # e.g. infinitely many bounces of one corner between those of the other one
+            continue
+        assert ride.ok
+        assert np.all(np.diff(jumps_of(ride)) >= 0)
+        for name, side in (("left", -b), ("right", b)):
+            x = h * np.sin(ride["angle"]) + side * np.cos(ride["angle"])
+            y = side * np.sin(ride["angle"]) - h * np.cos(ride["angle"])
+            gap, slip = ride["y"] + y, ride["x_dot"] - ride["rate"] * y
+            normal, friction, states = ride[f"{name}.normal"], ride[f"{name}.friction"], ride.contacts[name]
+            closed = np.asarray(states) > OPEN
+            assert np.min(gap) > -1e-9
+            np.testing.assert_allclose(gap[closed], 0.0, atol=1e-9)
+            np.testing.assert_allclose((ride["y_dot"] + ride["rate"] * x)[closed], 0.0, atol=1e-9)
+            np.testing.assert_allclose(slip[states == STICKS], 0.0, atol=1e-9)
+            assert np.all(normal > -1e-9)
+            assert np.all(np.abs(friction) <= mu * normal + 1e-8)
+            slides = (states == SLIDES) & (np.abs(slip) > 1e-6)
+            np.testing.assert_allclose(friction[slides], (-np.sign(slip) * mu * normal)[slides], atol=1e-8)
+        squares = ride["x_dot"] ** 2 + ride["y_dot"] ** 2 + (b**2 + h**2) / 3 * ride["rate"] ** 2
+        assert np.all(np.diff(0.5 * squares + 9.81 * ride["y"]) < 1e-8)
+
+
 # -- Balls in a row (exact fractions).
 class BallsInARow(jk.System):
     restitution: jk.Scalar = jk.parameter(0.9)
