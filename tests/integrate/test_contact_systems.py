@@ -277,6 +277,17 @@ def test_a_wheel_strikes_a_kerb():
     np.testing.assert_allclose(energy[on_edge], 0.5 * about_edge * after**2, rtol=1e-9)
 
 
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="the direction of a slip that begins is stiff")
+def test_a_falling_wheel_begins_to_slip_sideways():
+    """It rolls and falls to its side. Static friction is the kinetic one, so the slip begins without an acceleration."""
+    start = jk.State({"x": -3.0, "z": 0.35 * np.cos(0.4), "lean": -0.4}, {"x_dot": 1.575, "spin_rate": 4.5})
+    ride = jk.simulate(KerbWheel(friction=0.3), start, jnp.linspace(0, 0.36, 21), rtol=1e-10, atol=1e-10)
+    assert ride.ok
+    assert int(ride.jumps.count) == 1
+    assert ride.contacts["road"][-1] == SLIDES
+
+
 # -- Stops and loops.
 @pytest.mark.slow
 def test_a_gear_with_backlash():
