@@ -122,6 +122,40 @@ def test_random_blocks_satisfy_the_contact_laws():
         assert np.all(np.diff(0.5 * squares + 9.81 * ride["y"]) < 1e-8)
 
 
+class KickedBlock(TwoCornerBlock):
+    """It gets 1 m/s along the floor at 0.5 s, and 2 m/s away from it at 1 s."""
+
+    states = ("kicks",)
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return {}
+
+    def events(self, t, q, u, x):
+        along = {"x_dot": u["x_dot"] + 1.0, "kicks": x["kicks"] + 1.0}
+        return {"along": jk.rising(t - 0.5, then=along), "away": jk.rising(t - 1.0, then={"y_dot": u["y_dot"] + 2.0})}
+
+
+@pytest.mark.slow
+def test_events_change_the_state_of_closed_contacts():
+    """Both corners slide, stick, open together and land together. Then the simulation continues from its end."""
+    atol = 1e-10
+    block = KickedBlock(1.2, 0.4, 0.4)
+    ride = jk.simulate(block, jk.State({"y": 0.2}, {}), jnp.linspace(0, 2, 21), **TIGHT)
+    stops, lands = 0.5 + 1 / (0.4 * 9.81), 1.0 + 4 / 9.81
+    np.testing.assert_allclose(jumps_of(ride), [0.5, stops, 1.0, lands], atol=atol)
+    assert [ride.jumps.name(i) for i in (0, 2)] == ["along", "away"]
+    np.testing.assert_allclose(end_of(ride), [0.5 / (0.4 * 9.81), 0.2, 0, 0, 0, 0], atol=atol)
+    t = np.asarray(ride.t)
+    expected = np.select([(t >= 0.5) & (t < stops), (t >= 1) & (t < lands)], [SLIDES, OPEN], STICKS)
+    for name in ("left", "right"):
+        np.testing.assert_array_equal(ride.contacts[name], expected)
+    half = jk.simulate(block, jk.State({"y": 0.2}, {}), jnp.linspace(0, 0.6, 21), **TIGHT)
+    rest = jk.simulate(block, half.end, jnp.linspace(0.6, 2.0, 21), **TIGHT)
+    np.testing.assert_array_equal(rest.contacts["left"][0], SLIDES)
+    np.testing.assert_allclose(end_of(rest), end_of(ride), atol=atol)
+    np.testing.assert_allclose(jumps_of(rest), [stops, 1.0, lands], atol=atol)
+
+
 # -- Balls in a row (exact fractions).
 class BallsInARow(jk.System):
     restitution: jk.Scalar = jk.parameter(0.9)
@@ -280,7 +314,7 @@ def test_a_wheel_strikes_a_kerb():
 @pytest.mark.slow
 @pytest.mark.xfail(strict=True, reason="the direction of a slip that begins is stiff")
 def test_a_falling_wheel_begins_to_slip_sideways():
-    """It rolls and falls to its side. Static friction is the kinetic one, so the slip begins without an acceleration."""
+    """It rolls and falls to its side. Static equals kinetic friction, so the slip begins without an acceleration."""
     start = jk.State({"x": -3.0, "z": 0.35 * np.cos(0.4), "lean": -0.4}, {"x_dot": 1.575, "spin_rate": 4.5})
     ride = jk.simulate(KerbWheel(friction=0.3), start, jnp.linspace(0, 0.36, 21), rtol=1e-10, atol=1e-10)
     assert ride.ok
