@@ -133,7 +133,7 @@ def changed_contacts(
     v_N = before.v[:, 0]
     # The limit of the friction and the normal force may vanish together. Then the contact opens.
     push = solve_forces(layout, before, memory).forces[:, 0]
-    needed = jnp.sum(jnp.abs(before.B) * jnp.abs(before.w), axis=1) + jnp.abs(before.b)
+    needed = jnp.abs(before.B) @ jnp.abs(before.w) + jnp.abs(before.b)
     vanishes = ~bearing & (push * _stiffness(before) <= 1e-8 * needed.reshape(before.v.shape)[:, 0])
     opens, slips = event.opens | (event.slips & vanishes), event.slips & ~vanishes
     event = event._replace(opens=opens, slips=slips)
