@@ -216,6 +216,68 @@ def stone(system, motion, s):
     s.trace(GOLD, O + a)
 
 
+def block(system, motion, s):
+    N, body, b, h = motion.N, motion["block"], system.half_width, system.half_height
+    G, B = body.center.position, body.frame
+    s.line(GREY, -1.0 * N.x, 1.2 * N.x)
+    s.line(GOLD, *(G + i * b * B.x + j * h * B.y for i, j in ((1, 1), (-1, 1), (-1, -1), (1, -1), (1, 1))))
+    s.dot(WHITE, G)
+    s.trace(WHITE, G)
+    s.trace(BLUE, motion["left"], motion["right"])
+
+
+def block_on_a_belt(system, motion, s):
+    N, G = motion.N, motion["block"].center.position
+    for x in (-1.3, 1.3):
+        s.circle(GREY, x * N.x - 0.32 * N.y, N.x, N.y, 0.2)
+    for y in (-0.12, -0.52):
+        s.line(GREY, -1.3 * N.x + y * N.y, 1.3 * N.x + y * N.y)
+    s.line(GOLD, *(G + N.vector(0.12 * i, 0.12 * j, 0.0) for i, j in ((1, 1), (-1, 1), (-1, -1), (1, -1), (1, 1))))
+    wall, end = -1.5 * N.x, G - 0.12 * N.x
+    turns = [wall + i / 16 * (end - wall) + 0.05 * (-1) ** i * N.y for i in range(2, 15)]
+    s.line(BLUE, wall, *turns, end)
+    s.line(GREY, wall - 0.2 * N.y, wall + 0.2 * N.y)
+    s.trace(GOLD, G)
+
+
+def coupling_with_play(system, motion, s):
+    N, M, L = motion.N, motion["motor"].frame, motion["load"].frame
+    half = 0.5 * system.play
+    s.circle(BLUE, 0.0 * N.x, L.x, L.y, 1.0)
+    for sign in (-1.0, 1.0):
+        side = jnp.cos(half) * L.x + sign * jnp.sin(half) * L.y
+        s.line(BLUE, 0.75 * side, 1.0 * side)
+    s.circle(GOLD, 0.0 * N.x, M.x, M.y, 0.45)
+    s.line(GOLD, 0.0 * N.x, 0.9 * M.x)
+    s.trace(GOLD, 0.9 * M.x)
+    s.trace(BLUE, 1.0 * L.x)
+
+
+def slider_crank(system, motion, s):
+    N, A, B = motion.N, motion["A"].position, motion["slider"].center.position
+    for sign in (-1.0, 1.0):
+        y = sign * (system.half_height + system.clearance)
+        s.line(GREY, 0.05 * N.x + y * N.y, 0.55 * N.x + y * N.y)
+    s.line(GOLD, 0.0 * N.x, A)
+    s.line(BLUE, A, B)
+    corners = [motion[name].position for name in ("upper left", "upper right", "lower right", "lower left")]
+    s.line(WHITE, *corners, corners[0])
+    s.dot(GOLD, A)
+    s.trace(GOLD, A)
+    s.trace(WHITE, B)
+
+
+def wheel_at_a_kerb(system, motion, s):
+    N, wheel = motion.N, motion["wheel"]
+    top, W = system.kerb * N.y, wheel.frame
+    s.line(GREY, -1.0 * N.x + top, top, 0.0 * N.x, 1.6 * N.x)
+    s.circle(GOLD, wheel, W.x, W.y, system.radius)
+    for axis in (W.x, W.y):
+        s.line(BLUE, wheel.center.position - system.radius * axis, wheel.center.position + system.radius * axis)
+    s.trace(GOLD, wheel)
+    s.trace(BLUE, wheel.center.position + system.radius * W.x)
+
+
 @dataclasses.dataclass(frozen=True)
 class Picture:
     """How a system is shown: figure, seconds, flashes, from where [degrees], the axis that points up; and the speed and
@@ -253,6 +315,11 @@ PICTURES = {
     "CompassGait": Picture(two_legs, 1.47, 6, **PLANAR, speed=0.5),
     "Rattleback": Picture(stone, 0.5, 4, 20.0, 35.0, speed=0.5, watched=8.0),
     "RimlessWheel": Picture(wheel_without_a_rim, 2.4, 4, **PLANAR),
+    "SliderCrankWithClearance": Picture(slider_crank, 0.02, 5, **PLANAR, speed=0.01, watched=0.04),
+    "RockingBlock": Picture(block, 1.2, 5, **PLANAR, speed=0.5, watched=4.0),
+    "KerbWheel": Picture(wheel_at_a_kerb, 1.1, 5, **PLANAR, speed=0.5, watched=2.0),
+    "Backlash": Picture(coupling_with_play, 1.0, 4, **PLANAR, up="y"),
+    "Belt": Picture(block_on_a_belt, 3.6, 4, **PLANAR, up="y", watched=9.0),
     "BouncingBall": Picture(ball, 1.0, 10, **PLANAR, speed=0.5, watched=3.0),
 }
 

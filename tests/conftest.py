@@ -9,6 +9,7 @@ How to run them:
     JAXKANE_TEST_CACHE=FOLDER     keeps them elsewhere
     JAXKANE_TEST_CACHE=0          keeps none, and leaves XLA as a user has it
     pytest -m ""                  the slow ones too
+    pytest -m "slow and not long"  the slow ones that CI runs
     JAXKANE_VALIDATION=docs/validation.md pytest -m published    writes the table of published figures
 """
 
@@ -172,8 +173,13 @@ def _kernels_of(item):
     return item.callspec.params["kernels"] if "kernels" in item.fixturenames else None
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Tests of a file that are compiled in one way follow each other."""
+    """Tests of a file that are compiled in one way follow each other; those of `long_tests.txt` are marked."""
+    names = set((pathlib.Path(__file__).parent / "long_tests.txt").read_text(encoding="utf-8").splitlines())
+    for item in items:
+        if item.nodeid in names:
+            item.add_marker(pytest.mark.long)
     files = {}
     items.sort(key=lambda item: (files.setdefault(item.path, len(files)), Compilation.of(item)))
 

@@ -21,7 +21,7 @@ SOURCE = Path(jk.__file__).parent
 # Rooms: each may import from those above it, and within itself. What the rooms do not say, is read in their own files:
 # no file imports another that imports it, directly or by way of others.
 FLOORS = """
-_version _common _scalarjit rotations _system loads sensors joints convert _kane _integrate catalog sweep plot estimate
+_version _common _scalarjit rotations _system loads sensors _kane joints convert _integrate catalog sweep plot estimate
 fit data stability bicycles symbolic export _animate __main__
 """.split()
 

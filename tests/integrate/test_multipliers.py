@@ -143,3 +143,29 @@ def test_what_multipliers_refuse():
         jk.assemble(system, [0.1, 0.1, 0.1, 0.1], None, free=("q3",))
     with pytest.raises(ValueError, match="has multipliers"):
         jk.accelerations(system, 0.0, START, np.zeros(4))
+
+
+def test_other_independent_speeds_keep_contacts_and_events_that_read_states():
+    class Crank(Links):
+        states = ("turns",)
+
+        def state_rates(self, t, q, u, x, motion, now):
+            return u["u0"] / (2 * jnp.pi)
+
+        def events(self, t, q, u, x):
+            return {"turned": jk.falling(x["turns"] + 0.05)}
+
+        def contacts(self, t, q, u, motion):
+            return {"stop": jk.Contact(gap=q["q0"] - 0.8)}
+
+    own = jk.assemble(Crank(), [*START[:2].tolist(), -0.3, -0.9], None)
+    others = [jk.with_multipliers(Crank()), jk.stability.with_speeds(Crank(), ("u0", "u2"))]
+    ts = jnp.linspace(0.0, 0.3, 4)
+    wanted = jk.simulate(Crank(), own, ts)
+    assert int(wanted.jumps.count) > 0
+    for system in others:
+        state = jk.State(own.q, jnp.zeros(len(system.speeds)), own.x)
+        ride = jk.simulate(system, state, ts)
+        np.testing.assert_allclose(ride.q, wanted.q, atol=1e-6)
+        assert ride.contacts["stop"].tolist() == wanted.contacts["stop"].tolist()
+        assert ride.reason == wanted.reason

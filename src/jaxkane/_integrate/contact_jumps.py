@@ -66,10 +66,12 @@ class ContactEvent(NamedTuple):
 
 
 def gaps_at_start(system: System, t: Array, state: State) -> tuple[Array, Array]:
-    """Which contacts touch (c,), and whether none penetrates by more than a rounding error."""
-    gaps, sizes = gap_sizes(*constant((system, t, state.q, state.u)))
+    """Which contacts touch (c,), and whether none penetrates by more than a rounding error and their laws are valid."""
+    arguments = constant((system, t, state.q, state.u))
+    gaps, sizes = gap_sizes(*arguments)
     tolerance = float(jnp.finfo(gaps.dtype).eps) ** 0.6 * sizes
-    return jnp.abs(gaps) <= tolerance, jnp.all(gaps >= -tolerance)
+    laws = terms_at(*arguments, dict.fromkeys(system.inputs, jnp.zeros((), gaps.dtype))).laws
+    return jnp.abs(gaps) <= tolerance, jnp.all(gaps >= -tolerance) & laws.are_valid()
 
 
 def rates_from_motion(system: System, t: Array, y: Array, inputs: dict[str, Array]) -> Array:

@@ -304,27 +304,23 @@ def _tangents(normal: Row, plane: int | None, in_space: bool) -> list[Row]:
     a, b, c = normal
     if plane is not None:
         # n x the axis, with the sign for which a floor has the slip along x (or y).
-        along: Row = [(0.0, c, _minus(b)), (c, 0.0, _minus(a)), (b, _minus(a), 0.0)][plane]
+        along: Row = [(0.0, c, -b), (c, 0.0, -a), (b, -a, 0.0)][plane]
         return [along, (0.0, 0.0, 0.0)] if in_space else [along]
     is_flat = is_exact(a) and is_exact(b) and is_exact(c)
     if is_flat and abs(float(c)) > 0.9:
-        first: Any = (c, 0.0, _minus(a))
+        first: Any = (c, 0.0, -a)
     elif is_flat:
-        first = (b, _minus(a), 0.0)
+        first = (b, -a, 0.0)
     else:
         steep = jnp.abs(jnp.asarray(c)) > 0.6
-        first = tuple(jnp.where(steep, x, y) for x, y in zip((c, 0.0 * c, _minus(a)), (b, _minus(a), 0.0 * c)))
+        first = tuple(jnp.where(steep, x, y) for x, y in zip((c, 0.0 * c, -a), (b, -a, 0.0 * c)))
     size = jnp.sqrt(sum(jnp.asarray(x) ** 2 for x in first))
-    first = first if is_flat and float(np.asarray(_number(size))) == 1.0 else tuple(x / size for x in first)
+    first = first if is_flat and _number(size) == 1.0 else tuple(x / size for x in first)
     return [first, cross(normal, first)]  # pyright: ignore[reportArgumentType]
 
 
 def _number(x: Any) -> float:
     return float(x) if is_concrete(x) else float("nan")
-
-
-def _minus(x: Component) -> Component:
-    return -x
 
 
 class Laws(NamedTuple):
@@ -333,6 +329,10 @@ class Laws(NamedTuple):
     restitution: Array
     friction: Array
     static: Array
+
+    def are_valid(self) -> Array:
+        e, kinetic, static = jax.lax.stop_gradient(self)
+        return jnp.all((e >= 0) & (e <= 1) & (kinetic >= 0) & (static >= kinetic))
 
 
 class ContactTerms(NamedTuple):

@@ -12,6 +12,7 @@ A residual that depends linearly on the others is omitted where it does, so over
 from __future__ import annotations
 
 import functools
+import inspect
 from typing import Any
 
 from .._system.motion import Motion
@@ -49,8 +50,8 @@ class _WithMultipliers(System):
     def implied_constraints(self, t, q):
         return self.inner.implied_constraints(t, q)
 
-    def events(self, t, q, u):
-        return self.inner.events(t, q, u)
+    def events(self, t, q, u, x=()):
+        return events_of_inner(self.inner, t, q, u, x)
 
     def multiplier_residuals(self, t: Any, q: Row, u: Row) -> Row:
         evaluator, q, u = DescriptionEvaluator(self.inner), tuple(q), tuple(u)
@@ -63,6 +64,12 @@ class _WithMultipliers(System):
 
 for _name in ("coordinates", "dependent_coordinates", "inputs", "states", "units", "check_inertia"):
     setattr(_WithMultipliers, _name, property(lambda self, name=_name: getattr(self.inner, name)))
+
+
+def events_of_inner(inner: System, t: Any, q: Any, u: Any, x: Any) -> Any:
+    """The events of a system, whose method may have a fourth argument for the first-order states."""
+    takes_states = len(inspect.signature(inner.events).parameters) > 3
+    return inner.events(t, q, u, x) if takes_states else inner.events(t, q, u)  # type: ignore[call-arg]
 
 
 class _Outputs(System):

@@ -9,7 +9,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
 from pathlib import Path as FilePath
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,7 +19,12 @@ Path = str | os.PathLike[str]
 
 
 def from_mjcf(
-    model: Path, *, strict: bool = False, dependent: Sequence[str] | None = None, name: str | None = None
+    model: Path,
+    *,
+    strict: bool = False,
+    stops: Sequence[str] | Literal[True] = (),
+    dependent: Sequence[str] | None = None,
+    name: str | None = None,
 ) -> Mechanism:
     """The mechanism of an MJCF file.
 
@@ -28,13 +33,16 @@ def from_mjcf(
 
     Supported are bodies; hinge, slide, ball and free joints with damping, stiffness, springref, armature and ref;
     gravity; sites; actuators on joints whose force is affine in control, length and velocity; `connect`, `weld` and
-    `joint` equalities, as rigid constraints. Other elements are omitted and listed in `left_out`: contacts, limits,
-    friction, tendons, ...
+    `joint` equalities, as rigid constraints. Other elements are omitted and listed in `left_out`: contacts, friction,
+    tendons, ... Limits of joints are omitted unless `stops` contains the joint.
 
     **Arguments:**
 
     - `model`: a path, or the text of a file, which begins with "<".
     - `strict`: raise an exception for unsupported elements, instead of omitting them with a warning.
+    - `stops`: names of hinges and sliders whose limits become contacts without restitution, `NAME lower` and
+        `NAME upper`, with the parameters `lower.NAME`, `upper.NAME`. True: all that have a range. At most four contacts
+        are possible, so name the joints that reach their limits.
     - `dependent`: hinges and sliders that are solved for in closed loops, as in `jaxkane.joints.mechanism`.
     - `name`: of the class; the model's name by default.
 
@@ -44,10 +52,11 @@ def from_mjcf(
     and inertias are those that MuJoCo compiles, also from geoms and meshes.
 
     **Raises:** `ImportError` without MuJoCo; `ValueError` for a file that MuJoCo cannot read, one without a moving
-    body, two names that differ only by a dot, and with `strict` for unsupported elements.
+    body, two names that differ only by a dot, `stops` without a limit, more than four contacts, and with `strict` for
+    unsupported elements.
     """
     mujoco = _mujoco()
-    return _ModelReader(mujoco, _compiled(mujoco, model), name).mechanism(strict, dependent)
+    return _ModelReader(mujoco, _compiled(mujoco, model), name, stops).mechanism(strict, dependent)
 
 
 def from_urdf(
@@ -55,6 +64,7 @@ def from_urdf(
     *,
     floating: bool = False,
     strict: bool = False,
+    stops: Sequence[str] | Literal[True] = (),
     gravity: Any = (0.0, 0.0, -9.81),
     dependent: Sequence[str] | None = None,
     name: str | None = None,
@@ -80,7 +90,7 @@ def from_urdf(
     couplings = _mimics(robot)
     has_friction = any(float(dynamics.get("friction", 0.0)) for dynamics in robot.findall("joint/dynamics"))
     compiled = _compiled(mujoco, _for_mujoco(text, floating))
-    reader = _ModelReader(mujoco, compiled, name or robot.get("name"))
+    reader = _ModelReader(mujoco, compiled, name or robot.get("name"), stops)
     reader.gravity = gravity
     reader.left_out += ["friction of joints"] * has_friction
     reader.loops += couplings
@@ -186,7 +196,7 @@ def _mimics(robot: ElementTree.Element) -> list[Loop | Coupling]:
 class _ModelReader:
     """Reads a compiled model into links, sites, actuators and loops of a mechanism, and lists omitted elements."""
 
-    def __init__(self, mujoco: ModuleType, model: Any, name: str | None):
+    def __init__(self, mujoco: ModuleType, model: Any, name: str | None, stops: Sequence[str] | Literal[True]):
         self.m, self.kinds = model, mujoco
         self.name = name or _model_name(model) or "Mechanism"
         self.left_out: list[str] = []
@@ -195,6 +205,7 @@ class _ModelReader:
             self.gravity = (0.0, 0.0, 0.0)
         self.bodies = self._names("body", model.nbody)
         self.joints = self._names("joint", model.njnt)
+        self.stops = self._joints_with_stops(stops)
         self.sites: list[Site] = []
         self.loops: list[Loop | Coupling] = []
 
@@ -219,6 +230,25 @@ class _ModelReader:
         for i, name in enumerate(names):
             if not name:
                 names[i] = _unused_name(f"{kind}{i}", names, "_")
+        return names
+
+    def _joints_with_stops(self, stops: Sequence[str] | Literal[True]) -> list[str]:
+        """The names of the joints whose limits become contacts."""
+        types, m = self.kinds.mjtJoint, self.m
+        with_axis = int(types.mjJNT_HINGE), int(types.mjJNT_SLIDE)
+        limited = [] if self._is_off("LIMIT", "CONSTRAINT") else range(m.njnt)
+        limited = [self.joints[j] for j in limited if m.jnt_limited[j] and int(m.jnt_type[j]) in with_axis]
+        if stops is True:
+            return limited
+        if isinstance(stops, str):
+            raise TypeError(f"{self.name}: `stops` must be a list of names, e.g. [{stops!r}]; got {stops!r}.")
+        names = [name.replace(".", "_") for name in stops]
+        wrong = [name for name in names if name not in limited]
+        if wrong:
+            raise ValueError(
+                f"{self.name}: `stops` contains {wrong[0]!r}, which is not a hinge or a slider with a range. Those "
+                f"with a range are: {', '.join(limited) or 'none'}."
+            )
         return names
 
     def mechanism(self, strict: bool, dependent: Sequence[str] | None) -> Mechanism:
@@ -279,7 +309,7 @@ class _ModelReader:
     def _joint(self, j: int) -> Joint:
         m, kind, name = self.m, self.m.jnt_type[j], self.joints[j]
         dof, place = int(m.jnt_dofadr[j]), int(m.jnt_qposadr[j])
-        common = {
+        common: dict[str, Any] = {
             "damping": 0.0 if self._is_off("DAMPER", "PASSIVE") else float(m.dof_damping[dof]),
             "armature": float(m.dof_armature[dof]),
             "stiffness": 0.0 if self._is_off("SPRING", "PASSIVE") else float(m.jnt_stiffness[j]),
@@ -288,6 +318,7 @@ class _ModelReader:
         if kind in (int(types.mjJNT_HINGE), int(types.mjJNT_SLIDE)):
             common |= {"reference": float(m.qpos0[place])}
             common |= {"rest": float(m.qpos_spring[place])} if common["stiffness"] else {}
+            common |= {"stops": _floats(m.jnt_range[j])} if name in self.stops else {}
             if kind == int(types.mjJNT_SLIDE):
                 return slide(name, _floats(m.jnt_axis[j]), **common)
             return hinge(name, _floats(m.jnt_axis[j]), anchor=_floats(m.jnt_pos[j]), **common)
@@ -410,7 +441,7 @@ class _ModelReader:
 
         effects = {
             "contacts": (collides or m.npair > 0) and not off("CONTACT"),
-            "limits of joints": has("jnt_limited") and not off("LIMIT"),
+            "limits of joints": np.sum(m.jnt_limited) > len(self.stops) and not off("LIMIT"),
             "friction of joints": has("dof_frictionloss") and not off("FRICTIONLOSS"),
             "limits of controls and forces": has("jnt_actfrclimited") and m.nu > 0,
             "tendons": m.ntendon > 0,

@@ -82,6 +82,7 @@ class JointType:
     name: str
     axis: Triple = (0.0, 0.0, 1.0)
     reference: float = 0.0  # the coordinate at the link's initial position and orientation
+    has_stops: tuple[bool, bool] = (False, False)  # a lower and an upper limit of the coordinate
 
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = ()  # ending of the name, unit
     speeds: ClassVar[tuple[tuple[str, str], ...]] = ()
@@ -238,6 +239,9 @@ def _rotation_vector(e: Sequence[Component]) -> tuple[Component, ...]:
     return tuple(factor * x for x in v)
 
 
+Stops = tuple[Component | None, Component | None]
+
+
 class Joint(NamedTuple):
     """The connection of a link to its parent: a chain of joint types, and numbers by the names of parameters."""
 
@@ -255,6 +259,7 @@ def hinge(
     rest: Component = 0.0,
     armature: Component = 0.0,
     reference: float = 0.0,
+    stops: Stops = (None, None),
 ) -> Joint:
     """A hinge: the coordinate `name` [rad], the speed `name_rate` [rad/s].
 
@@ -267,11 +272,14 @@ def hinge(
     - `armature` [kg m^2]: the inertia of a geared rotor, reflected to the joint. It is added to the diagonal of the
         mass matrix.
     - `reference` [rad]: the coordinate at the link's `position` and `orientation`. An exact number, not a parameter.
+    - `stops` [rad]: the lower and the upper limit of the coordinate; None for no limit. Each limit is a
+        `jaxkane.Contact` without restitution: `name lower`, `name upper`. At most four contacts are possible.
     """
     values = _numbers(name, damping=damping, stiffness=stiffness, rest=rest, armature=armature)
+    has_stops, limits = _limits(stops, name)
     return Joint(
-        (Hinge(name, unit_vector(axis, name), _reference(reference, name)),),
-        values | components(f"anchor.{name}", anchor),
+        (Hinge(name, unit_vector(axis, name), _reference(reference, name), has_stops),),
+        values | limits | components(f"anchor.{name}", anchor),
     )
 
 
@@ -284,13 +292,31 @@ def slide(
     rest: Component = 0.0,
     armature: Component = 0.0,
     reference: float = 0.0,
+    stops: Stops = (None, None),
 ) -> Joint:
     """A slider along `axis` of the link's frame: the coordinate `name` [m], the speed `name_rate` [m/s].
 
-    **Arguments** as of `hinge`: `damping` [N s/m], `stiffness` [N/m], `rest` [m], `armature` [kg], `reference` [m].
+    **Arguments** as of `hinge`: `damping` [N s/m], `stiffness` [N/m], `rest` [m], `armature` [kg], `reference` [m],
+    `stops` [m].
     """
     values = _numbers(name, damping=damping, stiffness=stiffness, rest=rest, armature=armature)
-    return Joint((Slide(name, unit_vector(axis, name), _reference(reference, name)),), values)
+    has_stops, limits = _limits(stops, name)
+    return Joint((Slide(name, unit_vector(axis, name), _reference(reference, name), has_stops),), values | limits)
+
+
+def _limits(stops: Any, name: str) -> tuple[tuple[bool, bool], dict[str, Any]]:
+    """Which limits a joint has, and their parameters.
+
+    **Raises:** `ValueError` if they are not two numbers in increasing order, or None.
+    """
+    lower, upper = stops if isinstance(stops, (tuple, list)) and len(stops) == 2 else ("", "")
+    limits = {end: x for end, x in (("lower", lower), ("upper", upper)) if x is not None}
+    is_concrete = not any(isinstance(x, Tracer) for x in limits.values())
+    if any(np.ndim(x) or isinstance(x, str) for x in limits.values()) or (
+        is_concrete and len(limits) == 2 and not float(lower) < float(upper)
+    ):
+        raise ValueError(f"The stops of {name!r} must be a lower and a larger upper limit, or None; got {stops!r}.")
+    return (lower is not None, upper is not None), _numbers(name, **limits)
 
 
 def _reference(value: Any, name: str) -> float:

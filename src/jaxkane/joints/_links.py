@@ -11,6 +11,7 @@ import numpy as np
 
 from .. import rotations
 from .._common.lookup import not_there
+from .._kane.unilateral import MOST_CONTACTS
 from .._scalarjit.compat import Tracer
 from ..rotations import Matrix
 from ._joints import Hinge, Joint, JointType, Slide, components, exact, exact_numbers, is_structural_zero
@@ -159,7 +160,7 @@ def mechanism(
     in the order of the tree.
 
     **Raises:** `ValueError` for names that are used twice or contain a dot, an unknown parent, links that carry each
-    other in a circle, and wrong numbers of values.
+    other in a circle, more than four stops, and wrong numbers of values.
     """
     for what, given, kind in (
         ("links", links, "Link"),
@@ -193,6 +194,7 @@ def mechanism(
     if not any(link.has_mass for link in link_structures):
         raise ValueError(f"{name}: no movable link has a mass. Pass Link(..., mass=1.0).")
     _check_names(structure)
+    _check_stops(structure)
     closures = [_loop(loop, structure, joints) for loop in loops]
     structure = structure._replace(
         loops=tuple(x for x in closures if isinstance(x, LoopStructure)),
@@ -352,11 +354,21 @@ def _check_names(structure: Structure) -> None:
             raise ValueError(f"Two {what} have the name {twice[0]!r}.")
 
 
+def _check_stops(structure: Structure) -> None:
+    stops = [joint.name for joint in structure.joints for has in joint.has_stops if has]
+    if len(stops) > MOST_CONTACTS:
+        raise ValueError(
+            f"{structure.name} has {len(stops)} contacts, which are the limits of {', '.join(dict.fromkeys(stops))}. "
+            f"At most {MOST_CONTACTS} are possible. Name fewer joints in `stops`, or use MuJoCo."
+        )
+
+
 _UNITS = {"mass": "kg", "inertia": "kg m^2", "gravity": "m/s^2"} | dict.fromkeys(
     ("center", "position", "anchor", "site"), "m"
 )
 _OF_HINGES = {"damping": "N m s/rad", "stiffness": "N m/rad", "rest": "rad", "armature": "kg m^2"}
-_OF_SLIDERS = {"damping": "N s/m", "stiffness": "N/m", "rest": "m", "armature": "kg"}
+_OF_HINGES |= {"lower": "rad", "upper": "rad"}
+_OF_SLIDERS = {"damping": "N s/m", "stiffness": "N/m", "rest": "m", "armature": "kg", "lower": "m", "upper": "m"}
 
 
 def _field(name: str, joints: Mapping[str, JointType]) -> Field:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from .._common.lookup import hint, not_there
+from .._kane.contact import Contact
 from .._scalarjit.components import (
     ZERO3,
     Component,
@@ -95,7 +96,7 @@ class Structure(NamedTuple):
 
 _OWNERS = {
     **dict.fromkeys(("mass", "center", "inertia", "position"), "links"),
-    **dict.fromkeys(("anchor", "damping", "stiffness", "rest", "armature"), "joints"),
+    **dict.fromkeys(("anchor", "damping", "stiffness", "rest", "armature", "lower", "upper"), "joints"),
     **dict.fromkeys(("gain", "offset", "position_gain", "velocity_gain"), "actuators"),
     "site": "sites",
 }
@@ -268,6 +269,19 @@ class Mechanism(System):
             return []
         return self._loops_at_rest(t, q, independent=False)
 
+    def stops(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion) -> dict[str, Contact]:
+        """The limits of the joints, which are the `contacts` of a mechanism that has such limits."""
+        contacts = {}
+        for joint in self.structure.joints:
+            has_lower, has_upper = joint.has_stops
+            if has_lower:
+                gap = sub(q[joint.name], self._read(f"lower.{joint.name}"))
+                contacts[f"{joint.name} lower"] = Contact(gap=gap)
+            if has_upper:
+                gap = sub(self._read(f"upper.{joint.name}"), q[joint.name])
+                contacts[f"{joint.name} upper"] = Contact(gap=gap)
+        return contacts
+
     def _loops_at_rest(self, t: Component, q: NamedVector, independent: bool) -> GroupedResiduals:
         rest = dict.fromkeys((*self.speeds, *self.dependent_speeds), 0.0)
         return loop_residuals(self, self.motion(t, q, tuple(rest.values())).sites, q, rest, independent)[0]
@@ -435,6 +449,8 @@ def class_of(structure: Structure, fields: tuple[Field, ...]) -> type[Mechanism]
         "inputs": tuple(actuator.name for actuator in structure.actuators),
         "units": units,
     }
+    if any(any(joint.has_stops) for joint in joints):
+        members["contacts"] = Mechanism.stops  # without it, a mechanism is simulated without contact states
     cls: Any = type(Mechanism)(structure.name, (Mechanism,), members | of_parameters)  # pyright: ignore
     return cls
 

@@ -27,7 +27,9 @@ from .._kane.arguments import (
 )
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import SINGULAR_ROUNDING, configuration_residual
+from .._kane.contact import has_contacts
 from .._kane.diagnosis import diagnosis
+from .._kane.multipliers import events_of_inner
 from .._kane.right_hand_side import has_outputs, output_names, outputs_at, rates, values_of
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Component, Numbers, solve, stack
@@ -318,8 +320,8 @@ class _WithSpeeds(System):
     def implied_constraints(self, t, q):
         return self.inner.implied_constraints(t, q)
 
-    def events(self, t, q, u):
-        return self.inner.events(t, q, self._in_order(u))
+    def events(self, t, q, u, x=()):
+        return events_of_inner(self.inner, t, q, self._in_order(u), x)
 
 
 for _name in ("coordinates", "auxiliary_speeds", "dependent_coordinates", "inputs", "states", "units", "check_inertia"):
@@ -359,10 +361,17 @@ def with_speeds(system: System, speeds: Sequence[str]) -> System:
         )
     inner: Any = type(system)
     base: Any = _WithSpeedsAndOutputs if has_outputs(system) else _WithSpeeds
-    return _class_with(inner, base)(system, speeds, tuple(name for name in everything if name not in speeds))
+    return _class_with(inner, base, has_contacts(system))(
+        system, speeds, tuple(name for name in everything if name not in speeds)
+    )
 
 
 @functools.lru_cache(maxsize=1000)
-def _class_with(inner: Any, base: Any) -> Any:
+def _class_with(inner: Any, base: Any, contacts: bool) -> Any:
     """A subclass with the name of the inner class, which messages show."""
-    return type(base)(inner.__name__, (base,), {"__doc__": inner.__doc__})
+
+    def contacts_of_inner(self, t, q, u, motion):
+        return self.inner.contacts(t, q, self._in_order(u), motion)
+
+    own = {"contacts": contacts_of_inner} if contacts else {}
+    return type(base)(inner.__name__, (base,), {"__doc__": inner.__doc__, **own})
