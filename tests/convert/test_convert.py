@@ -176,6 +176,9 @@ def test_joints_that_follow_others():
     with pytest.warns(UserWarning, match="omitted.*limits of joints"):
         system = jk.convert.from_urdf(text)
     assert (system.speeds, system.dependent_speeds) == (("ja_rate",), ("jb_rate",))
+    with pytest.warns(UserWarning, match="omitted.*limits of joints"):  # that of jb
+        limited = jk.convert.from_urdf(text, stops=["ja"])
+    assert {name: float(limited.lower[name]) for name in limited.lower} == {"ja": -1.0}
     np.testing.assert_allclose(jk.mass_matrix(system, 0.0, [0.2, 0.1 - 0.6], [0.0]), [[0.2 + 9 * 0.3]], rtol=1e-12)
     degree = '<equality><joint joint1="k" joint2="j" polycoef="0 2 0.5 0 0"/></equality>'
     two = BODY.format("") + BODY.replace('"a"', '"b"').replace('"j"', '"k"').format("")

@@ -490,3 +490,34 @@ def test_a_coordinate_that_is_named_stays_though_the_library_chose_it_as_depende
     i = system.coordinates.index(free_one)
     assert found[i] == state.q[i] + 1e-3
     assert np.all(np.delete(found - state.q, i) != 1e-3)
+
+
+def test_stops_are_contacts_of_a_mechanism():
+    links = [
+        Link("cart", None, slide("x", (1, 0, 0), stops=(0.0, 0.5)), mass=1.0),
+        Link("bar", "cart", hinge("q", (0, 1, 0), stops=(None, 1.2)), **BAR),
+    ]
+    arm = mechanism(links)
+    assert {name: float(arm.upper[name]) for name in arm.upper} == {"x": 0.5, "q": 1.2}
+    assert "lower.x" not in arm.lower  # the number 0 is part of the structure
+    assert parameters_of(arm, ["upper.x", "upper.q"]).units == ("m", "rad")
+    for system in (arm, pickle.loads(pickle.dumps(arm)), arm.with_outputs(lambda *args: {})):
+        contacts = system.contacts(0.0, [0.1, 0.3], [0.0, 0.0], None)
+        assert list(contacts) == ["x lower", "x upper", "q upper"]
+        np.testing.assert_allclose([float(x.gap) for x in contacts.values()], [0.1, 0.4, 0.9], rtol=1e-15)
+    moved = arm.replace({"upper.x": 0.7}).contacts(0.0, [0.1, 0.3], [0.0, 0.0], None)
+    np.testing.assert_allclose(float(moved["x upper"].gap), 0.6, rtol=1e-15)
+    assert type(mechanism(pendulums())).contacts is jk.System.contacts
+
+
+@pytest.mark.parametrize(
+    "stops", [(1.0, 0.5), (1.0, 1.0), 0.3, (0.1,), ("a", 1.0), ((0.0, 1.0), 2.0), (float("nan"), 1.0)]
+)
+def test_stops_are_two_limits(stops):
+    with pytest.raises(ValueError, match="stops of 'q' must be a lower and a larger upper limit"):
+        hinge("q", stops=stops)
+
+
+def test_a_mechanism_has_four_stops():
+    with pytest.raises(ValueError, match=r"6 contacts, which are the limits of q0, q1, q2. At most 4 .* fewer joints"):
+        mechanism(pendulums(3, stops=(-1.0, 1.0)))

@@ -29,6 +29,7 @@ from .._kane.contact import (
     gap_sizes,
     layout_of,
     projected_speeds,
+    solve_forces,
     terms_at,
     without_gaps,
 )
@@ -130,6 +131,12 @@ def changed_contacts(
     before = before._replace(v=before.v + (before.C @ (u - state.u)).reshape(before.v.shape))
     closed = (memory.states >= SLIDES) & ~bearing
     v_N = before.v[:, 0]
+    # The limit of the friction and the normal force may vanish together. Then the contact opens.
+    push = solve_forces(layout, before, memory).forces[:, 0]
+    needed = jnp.sum(jnp.abs(before.B) * jnp.abs(before.w), axis=1) + jnp.abs(before.b)
+    vanishes = push * _stiffness(before) <= 1e-8 * needed.reshape(before.v.shape)[:, 0]
+    opens, slips = event.opens | (event.slips & vanishes), event.slips & ~vanishes
+    event = event._replace(opens=opens, slips=slips)
     # -- The impact, if contacts close.
     # Events are simultaneous within their rounding errors, which are large for a gap of large coordinates.
     errors = 256 * float(jnp.finfo(y.dtype).eps) * constant(gap_sizes(system, t, state.q, state.u)[1])
@@ -151,7 +158,7 @@ def changed_contacts(
     after: ContactTerms = terms_at(system, t, state.q, u, values)
     negligible = jnp.maximum(_negligible(before), _negligible(after))
     is_apart = after.v[:, 0] > negligible[:, 0] + jnp.where(is_impact, 1e-10 * jnp.abs(v_N), 0.0)
-    is_apart &= is_impact | ~event.is_own
+    is_apart &= is_impact | ~event.is_own | event.touches
     # A block that rocks on its corners in turn: each corner opens for a shorter time than the one before.
     fall, rise = -after.a[:, 0], after.v[:, 0]
     is_apart &= ~((fall > 0) & ((2.0 * rise < rest * fall) | (0.5 * rise**2 <= fall * (errors / 16))))
@@ -167,6 +174,11 @@ def changed_contacts(
     y = jnp.concatenate([q, u, y[n_q + n_u : y.size - layout.memory_size], new.packed()])
     delay = jnp.max(jnp.where(rests & (new.states != OPEN), bounces, 0.0), initial=0.0)
     return Change(y, delay, impulses, is_determined & (~is_impact | hit.determined))
+
+
+def _stiffness(terms: ContactTerms) -> Array:
+    """G_NN (c,) of each contact: its normal acceleration by a force of 1 N."""
+    return jnp.sum(terms.B.reshape(*terms.v.shape, -1)[:, 0] ** 2, axis=1)
 
 
 def _negligible(terms: ContactTerms) -> Array:

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .._kane.contact import NO_CONTACTS, ContactLayout, layout_of
 from .._kane.kanes_method import KaneEquations
+from .._kane.unilateral import OPEN
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
 from .._scalarjit.scalar_function import ScalarFunction
@@ -195,6 +195,16 @@ class Events(NamedTuple):
         names, directions, stages, conditions, contacts = (tuple(column) for column in columns)
         return Events(names, directions, stages, conditions, True, self.read_time | layout.reads_time, contacts, layout)
 
+    def closing_at_start(self, y: Array, values: EventValues, rounding: Array) -> Array | None:
+        """Whether each function (n,) is the gap of an open contact that touches and closes; None without contacts."""
+        if not self.layout.names or values.noise is None:
+            return None
+        states = y[y.size - self.layout.memory_size :: self.layout.memory_width]
+        no = jnp.zeros((), bool)
+        opens = [no if x is None or x[1] else states[x[0]] == OPEN for x in self.contacts]
+        limit = jnp.maximum(jnp.abs(values.rates) * rounding, 64 * values.noise)
+        return jnp.stack(opens) & (jnp.abs(values.values) <= limit) & (values.rates < 0)
+
     @property
     def continue_(self) -> bool:
         """Whether any event changes the state, so that the simulation continues."""
@@ -313,18 +323,24 @@ class EventValues(NamedTuple):
         """The inverse of `packed`, for `n` events."""
         return cls(numbers[1 : n + 1], numbers[n + 1 : 2 * n + 1], numbers[0], numbers[2 * n + 1 :])
 
-    def at_start(self, events: Events, rounding: Array, before: Array | None = None) -> EventValues:
+    def at_start(
+        self, events: Events, rounding: Array, before: Array | None = None, closing: Array | None = None
+    ) -> EventValues:
         """The same where steps begin.
 
         A function is set to zero if it would reach zero within a rounding error [s]. If its condition is not met, its
         crossing is passed over: it is set to the side on which it will be. `before` (n,): its rates before a jump.
+        `closing` (n,): whether it is the gap of a contact that touches and closes at the start of the simulation.
         """
         rates = jnp.abs(self.rates) if before is None else jnp.maximum(jnp.abs(self.rates), jnp.abs(before))
         vanishes = jnp.abs(self.values) <= rates * rounding
         values = jnp.where(vanishes, jnp.zeros_like(self.values), self.values)
         if any(contact is not None for contact in events.contacts):
             # The states of the contacts were just found, so none of their functions vanishes here.
-            of_contacts = np.array([contact is not None for contact in events.contacts])
+            of_contacts = jnp.asarray([contact is not None for contact in events.contacts])
+            if closing is not None:
+                values = jnp.where(closing, 0.0, values)
+                of_contacts &= ~closing
             own = jnp.where(of_contacts & vanishes, jnp.maximum(self.rates, 0.0), self.rates)
             values = jnp.where(of_contacts, jnp.maximum(values, jnp.finfo(values.dtype).tiny), values)
             return self._replace(values=values, rates=own).passed(events, vanishes)
@@ -475,7 +491,7 @@ def moved_to_event(
     limit = jnp.abs(g_dot) * reach
     if quantities.noise is not None:
         noise = sum(jnp.where(which == i, x, 0.0) for i, x in enumerate(quantities.noise))
-        limit += jnp.minimum(2 * noise, 1e4 * limit)
+        limit += jnp.minimum(2 * noise, 1e6 * limit)
     is_small = jnp.abs(g) <= limit
     moves = happened & is_small & (g_dot != 0)
     step = jnp.where(moves, -g / jnp.where(moves, g_dot, jnp.ones_like(g_dot)), jnp.zeros_like(g))

@@ -633,6 +633,8 @@ def _jump_table(problem: Problem, record: JumpRecord, follows_from: list[Array])
         for y in (before, after)
     ]
     values = times, before, after, lost, impulses, tuple(sides)
+    rough = jnp.cumsum(jnp.where(unused, 0.0, 1.0 - constant(record.smooth))) > 0
+    values = nan_derivative_where(rough, values, follows_from)
     values = nan_beyond_second_derivative(record.count > 0, values, follows_from)
     t, before, after, lost, impulses, inputs = nan_where(unused, values, follows_from)
     events = jnp.where(unused, -1, record.events.astype(jnp.int32))

@@ -118,7 +118,8 @@ class StepSizeController(diffrax.AbstractAdaptiveStepSizeController[Array, None]
         self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any
     ) -> tuple[Array, Any]:
         """The end of the first step, and the state of the controller."""
-        end, state = _first(self._numbers(), self._values(t0, t0, y0, args), self._stop_after(t0))
+        contacts = constant(y0) if self.events.layout.names else None
+        end, state = _first(self._numbers(), contacts, self._values(t0, t0, y0, args), self._stop_after(t0))
         if self.inner is None:
             return end, (state, None)
         proposed, inner_state = self.inner.init(terms, t0, t1, y0, end - t0, args, func, error_order)
@@ -215,12 +216,16 @@ def _resolution(t1: Array, h: Array, duration: Array) -> Array:
 
 
 @ScalarFunction.compile_cheaply
-def _first(control: StepSizeController, values: EventValues | None, stop: Array | None) -> tuple[Array, Array]:
+def _first(
+    control: StepSizeController, y0: Array | None, values: EventValues | None, stop: Array | None
+) -> tuple[Array, Array]:
     end = jnp.minimum(control.first, control.longest) if control.step is None else control.step
     end = end if stop is None else _clipped(jnp.zeros_like(end), end, stop)
     status, past, never, zero = (jnp.full_like(end, x) for x in (Status.COMPLETED, -jnp.inf, jnp.inf, 0.0))
-    values = values and values._replace(noise=None)
-    start = values and values.at_start(control.events, 1e6 * jnp.finfo(end.dtype).eps * control.first)
+    start, rounding = None, 1e6 * jnp.finfo(end.dtype).eps * control.first
+    if values is not None:
+        closing = None if y0 is None else control.events.closing_at_start(y0, values, rounding)
+        start = values._replace(noise=None).at_start(control.events, rounding, closing=closing)
     state = ControllerState(status, past, never, zero, end, zero - 1, zero - 1, start)
     return jnp.minimum(end, control.duration), state.packed()
 

@@ -22,8 +22,8 @@ class Backlash(System):
     """A motor and a load, which a coupling with play connects (Nordin and Gutman, 2002).
 
     The source is Nordin and Gutman (2002), *Controlling mechanical systems with backlash: a survey*, Automatica 38(10).
-    There the shaft is elastic. Here the coupling is rigid, so its sides meet in impacts, between which they move
-    together or separately.
+    There the shaft is elastic. Here the coupling is rigid, so its sides meet in impacts. After an impact with
+    `restitution` 0, motor and load move together until the contact force is zero.
 
     | parameter | source | meaning |
     |---|---|---|
