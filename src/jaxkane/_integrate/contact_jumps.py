@@ -133,8 +133,8 @@ def changed_contacts(
     v_N = before.v[:, 0]
     # The limit of the friction and the normal force may vanish together. Then the contact opens.
     push = solve_forces(layout, before, memory).forces[:, 0]
-    needed = jnp.sum(jnp.abs(before.B) * jnp.abs(before.w), axis=1) + jnp.abs(before.b)
-    vanishes = push * _stiffness(before) <= 1e-8 * needed.reshape(before.v.shape)[:, 0]
+    needed = jnp.abs(before.B) @ jnp.abs(before.w) + jnp.abs(before.b)
+    vanishes = ~bearing & (push * _stiffness(before) <= 1e-8 * needed.reshape(before.v.shape)[:, 0])
     opens, slips = event.opens | (event.slips & vanishes), event.slips & ~vanishes
     event = event._replace(opens=opens, slips=slips)
     # -- The impact, if contacts close.
@@ -227,15 +227,20 @@ def _states_by_accelerations(
         v = terms.v[:, 1:]
         speed = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(v) ** 2, axis=1))
         stops = event.stops
+        rtol, atol = tolerances
+        errors = atol * jnp.sum(jnp.abs(terms.C), axis=1).reshape(terms.v.shape) + rtol * terms.size
+        is_slow = speed <= 100 * jnp.sum(errors[:, 1:], axis=1)
         if d == 2:
             # In space, the slip need not vanish where its component along its first direction does.
-            rtol, atol = tolerances
-            errors = atol * jnp.sum(jnp.abs(terms.C), axis=1).reshape(terms.v.shape) + rtol * terms.size
-            stops &= speed <= 100 * jnp.sum(errors[:, 1:], axis=1)
+            stops &= is_slow
+        # Both corners of a block stop at the same time.
+        stops |= jnp.any(stops) & is_slow & (memory.states == SLIDES) & ~bearing
         is_still = stops | sticks | (speed <= jnp.max(negligible[:, 1:], axis=1))
+        # If one corner of a block is at its limit, both slip when the other one reaches its limit.
+        slips = event.slips | (jnp.any(event.slips) & (memory.states == SLIDES) & is_still & ~stops)
         slip = v / jnp.where(is_still, 1.0, jnp.where(speed > 0, speed, 1.0))[:, None]
         slip = jnp.sign(jax.lax.stop_gradient(slip)) if d == 1 else slip
-        known = Slip(~is_still, slip, static, ~event.slips & (terms.laws.static > 0))
+        known = Slip(~is_still, slip, static, ~slips & (terms.laws.static > 0))
     found = contact_impact(G, a, jnp.zeros_like(kinetic), kinetic, candidates, layout.has_friction, known)
     states = jnp.where(candidates, found.states, OPEN).astype(a.dtype)
     if d:

@@ -52,7 +52,7 @@ from .description import dtype_of, jvp, structure_of
 from .impact import RowBasis, checked_restitution, inverse_root, least_norm
 from .kanes_method import KaneEquations, unit
 from .scaling import term_sizes
-from .unilateral import MOST_CONTACTS, OPEN, SLIDES, STICKS
+from .unilateral import MOST_CONTACTS, OPEN, SLIDES, STICKS, force_scales
 
 
 @dataclasses.dataclass(frozen=True, init=False)
@@ -619,7 +619,13 @@ def solve_forces(layout: ContactLayout, terms: ContactTerms, memory: ContactMemo
     W = (np.eye(c, dtype=w.dtype)[:, None, :, None] * blocks[:, :, None, :]).reshape(c * r, c * r)
     mask = active.reshape(-1)
     A = jnp.where(mask[:, None] & mask[None], (B @ B.T) @ W, 0.0)
-    z = least_norm(A, jnp.where(mask, -(B @ w + terms.b), 0.0))[0]
+    needed = jnp.where(mask, -(B @ w + terms.b), 0.0)
+    z = least_norm(A, needed)[0]
+    if c > 1 and layout.d:
+        normal = (jnp.asarray(W) @ z).reshape(c, r)[:, 0]
+        limits = terms.laws.static * jnp.where(is_bearing, 1.0, normal)
+        scales = force_scales(limits, memory.states == STICKS, r)
+        z = scales * least_norm(A * scales[None], needed)[0]
     forces = jnp.asarray(W) @ z
     u_dot = terms.a0 + terms.X @ (w + B.T @ forces)
     return ContactForces((forces + known).reshape(c, r), u_dot)

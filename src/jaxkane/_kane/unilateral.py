@@ -92,8 +92,9 @@ def contact_impact(
     rows = tuple(d if each else 0 for each in has_friction or (True,) * c)
     states, signs = _combinations(rows)
     each = _Combination(jnp.asarray(states), jnp.asarray(signs, G.dtype))
+    is_impact = slip is None
     slip = Slip.unknown(friction, d) if slip is None else slip
-    problem = _Problem(G, v, restitution, friction, slip)
+    problem = _Problem(G, v, restitution, friction, slip, is_impact)
     fixed = jax.tree.map(jax.lax.stop_gradient, problem)
     found = jax.vmap(fixed.solved)(each)
     takes_part = jnp.all(closed[None] | (each.states == OPEN), axis=1)
@@ -215,6 +216,7 @@ class _Problem(eqx.Module):
     restitution: Array
     friction: Array
     slip: Slip
+    is_impact: bool = eqx.field(static=True)
 
     @property
     def in_space(self) -> bool:
@@ -308,8 +310,13 @@ class _Problem(eqx.Module):
         A = jnp.where(mask[:, None] & mask[None], G @ W, 0.0)
         b, is_regular = jnp.where(mask, target.reshape(-1), 0.0), jnp.ones((), bool)
         if inverse is None:
-            inverse, is_new = _pseudo_inverse(jax.lax.stop_gradient(A))
+            fixed = jax.lax.stop_gradient(A)
+            inverse, is_new = _pseudo_inverse(fixed)
             is_regular = jnp.all(is_new | ~mask)
+            if c > 1 and rows > 1 and not self.is_impact:
+                limits = self.slip.static * (W @ (inverse @ jax.lax.stop_gradient(b))).reshape(c, rows)[:, 0]
+                scales = force_scales(limits, sticks, rows)
+                inverse = scales[:, None] * _pseudo_inverse(fixed * scales[None])[0]
         z = inverse @ b
         for _ in range(2):  # the derivative of A z = b; the inverse is not differentiated
             z = z + inverse @ (b - A @ z)
@@ -342,6 +349,19 @@ class _Problem(eqx.Module):
                 is_opposite = jnp.sum(L[:, 1:] * v[:, 1:], axis=1) + force * slip <= force * limit
             conditions += [~sticks | is_held, ~slides | is_opposite | self.slip.is_known]
         return jnp.all(jnp.stack(conditions)) & jnp.all(jnp.isfinite(v))
+
+
+def force_scales(limits: Array, sticks: Array, rows: int) -> Array:
+    """Scales (c rows,) of the forces of c contacts, in which the smallest forces are chosen if they are not unique.
+
+    Those of friction are proportional to their `limits` (c,). Otherwise one corner of a block would reach its limit
+    before the other one, which carries more weight, and neither of them could slip.
+    """
+    largest = jnp.max(jnp.where(sticks, limits, 0.0))
+    # The smallest sum of F^2 / scale^2 has F proportional to scale^2.
+    shares = jnp.clip(limits / jnp.where(largest > 0, largest, 1.0), 1e-8, 1.0)
+    scales = jnp.where(sticks & (largest > 0), jnp.sqrt(shares), 1.0)[:, None]
+    return jnp.concatenate([jnp.ones_like(scales), jnp.repeat(scales, rows - 1, axis=1)], axis=1).reshape(-1)
 
 
 def _angle(x: Array, y: Array) -> Array:
