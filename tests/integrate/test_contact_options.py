@@ -41,6 +41,7 @@ def test_each_member_of_a_batch_bounces_at_its_own_times():
         np.testing.assert_array_equal(batch.contacts["floor"][i], one.contacts["floor"])
 
 
+@pytest.mark.slow
 def test_more_jumps_than_allowed():
     ride = drop(0.05, 0.985, 0.0, max_jumps=16)
     assert ride.reason == "max jumps"

@@ -145,6 +145,7 @@ def test_what_multipliers_refuse():
         jk.accelerations(system, 0.0, START, np.zeros(4))
 
 
+@pytest.mark.slow
 def test_other_independent_speeds_keep_contacts_and_events_that_read_states():
     class Crank(Links):
         states = ("turns",)
