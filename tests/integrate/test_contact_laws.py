@@ -547,7 +547,7 @@ def test_members_with_different_contact_states_are_independent():
 def test_reverse_mode_equals_forward_mode():
     """Without NaN from contact states that do not occur."""
     reverse = jax.jit(jax.grad(lambda p: plain(p, jnp.linspace(0, 2.5, 21), PUSH, adjoint="reverse").end.q[0]))
-    for p, values in zip(ALL, MEMBERS, strict=False):
+    for p, values in zip(ALL, MEMBERS, strict=True):
         _, slopes = ride_of(np.linspace(0, 2.5, 21), push=PUSH, **values)
         forward = [slope["end"][0] for slope in slopes.values()]
         np.testing.assert_allclose(reverse(p), forward, rtol=1e-8, atol=1e-9)

@@ -346,7 +346,7 @@ class SliderInGuides(jk.System):
 
     def motion(self, t, q, u):
         N, O = jk.inertial()
-        A, B, S = (N.rotate(3, x, rate) for x, rate in zip(q, u, strict=False))
+        A, B, S = (N.rotate(3, x, rate) for x, rate in zip(q, u, strict=True))
         pin = O.fixed(0.153 * A.x)
         P = pin.fixed(0.306 * B.x)
         crank = jk.Body(0.038, (0.0, 0.0, 7.4e-5), O.fixed(0.0765 * A.x), A, name="crank")
