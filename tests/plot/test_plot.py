@@ -83,7 +83,7 @@ def test_the_catalogue_declares_its_units(name):
 
 
 def test_trajectories_have_names_units_and_an_end(style):
-    ride = trajectory(status=10, t_end=1.01)
+    ride = trajectory(status=jk.Status.EVENT, t_end=1.01)
     axes = jk.plot.trajectories(ride, ["roll", ("yaw_rate", "steer_torque"), "x"], degrees=True)
     assert is_legible(axes, style)
     assert [ax.get_ylabel() for ax in axes] == ["roll\n[deg]", "", "x\n[m]"]
@@ -105,7 +105,7 @@ ODD = ("a$_{b$", "$c")
 def test_names_are_no_mathematics():
     """Dollars in names are written as they stand."""
     ride = dataclasses.replace(
-        trajectory(status=10, t_end=1.01),
+        trajectory(status=jk.Status.EVENT, t_end=1.01),
         names=(ODD, ("$u",), (), ()),
         events=("x$^{$",),
         units=(("a$_{b$", "m$^{$"),),
