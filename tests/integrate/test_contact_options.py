@@ -23,6 +23,7 @@ def drop(height=1.0, restitution=0.8, drag=0.1, ts=TS, **options):
     return jk.simulate(system, jk.State(h[None], jnp.zeros_like(h)[None]), ts, **{**TIGHT, **options})
 
 
+@pytest.mark.slow
 def test_each_member_of_a_batch_bounces_at_its_own_times():
     """A member equals its own simulation: one bounces until it rests, one a hundred times, one never."""
     heights, restitutions = jnp.array([0.2, 0.05, 60.0]), jnp.array([0.5, 0.985, 0.5])

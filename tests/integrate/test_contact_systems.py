@@ -231,6 +231,7 @@ def test_a_particle_on_a_slope_changes_the_direction_of_its_slip():
     np.testing.assert_allclose(ride["plane.normal"], 9.81 * np.cos(np.arctan(0.5)), rtol=rtol)
 
 
+@pytest.mark.slow
 def test_a_particle_bounces_and_stops_in_space():
     """Impulses of friction mu L_N along the slip, then friction mu m g until it stops; all along one line."""
     atol = 1e-9
