@@ -81,7 +81,8 @@ class Orbit(eqx.Module):
 
     @property
     def stable(self) -> Bool[Array, "*batch"]:
-        """Whether all multipliers are inside the unit circle. Multipliers of conservative systems are on it."""
+        """Whether all multipliers are inside the unit circle. False for an orbit of a conservative system, whose
+        multipliers come in pairs with the product 1."""
         return jnp.all(jnp.abs(self.multipliers) < 1.0, axis=-1)
 
     @property
