@@ -522,6 +522,10 @@ def _work_with_jumps(
     t = np.asarray(trajectory.t, float)[reached]
     times, eps = np.asarray(jumps.t, float)[:m], float(np.finfo(jumps.t.dtype).eps)
     near = 64 * eps * (t[-1] - t[0])
+    # Jumps within a rounding error are one: no polynomial can pass between them.
+    first = np.flatnonzero(np.append(True, np.diff(times) > near)[:m])
+    last = np.append(first[1:], m)[: len(first)] - 1
+    places, lost_until, times = (first, last), times, times[first]
     is_own = np.abs(t[:, None] - times).min(axis=1, initial=np.inf) > near  # a sample at a jump is that after it
     known = trajectory.discontinuities
     sides = known.inputs if known is not None and known.inputs else (trajectory.inputs, trajectory.inputs)
@@ -534,7 +538,7 @@ def _work_with_jumps(
         at_jumps = {"q": state.q, "u": state.u, **inputs, **of_states}
         if trajectory.contact_memory is not None:
             samples[CONTACTS], at_jumps[CONTACTS] = trajectory.contact_memory, state.contacts
-        parts = {name: (np.asarray(x)[reached][is_own], at_jumps[name][:m]) for name, x in samples.items()}
+        parts = {name: (np.asarray(x)[reached][is_own], at_jumps[name][places[side]]) for name, x in samples.items()}
         return {name: np.concatenate(pair) for name, pair in parts.items()}
 
     clock = np.concatenate([t[is_own], times]) - t[0]
@@ -557,9 +561,9 @@ def _work_with_jumps(
         powers = _powers_along(*arguments, values, input_rates)
     power, rate = (np.asarray(x, float).sum(axis=1) for x in powers)
     fine, coarse = (pieces.integral(clock, power, 4, rate, spared) for spared in (0, 1))
-    places = np.searchsorted(clock, t - t[0] - near)
-    lost = np.append(0.0, np.cumsum(np.asarray(jumps.energy, float)[:m]))[np.searchsorted(times, t + near)]
-    return fine[places], float(np.abs(fine - coarse).max()), lost
+    at_samples = np.searchsorted(clock, t - t[0] - near)
+    lost = np.append(0.0, np.cumsum(np.asarray(jumps.energy, float)[:m]))[np.searchsorted(lost_until, t + near)]
+    return fine[at_samples], float(np.abs(fine - coarse).max()), lost
 
 
 def _pieces(system: System, trajectory: Trajectory, reached: np.ndarray) -> Pieces:
