@@ -133,8 +133,7 @@ def changed_contacts(
     v_N = before.v[:, 0]
     # The limit of the friction and the normal force may vanish together. Then the contact opens.
     push = solve_forces(layout, before, memory).forces[:, 0]
-    needed = jnp.abs(before.B) @ jnp.abs(before.w) + jnp.abs(before.b)
-    vanishes = ~bearing & (push * _stiffness(before) <= 1e-8 * needed.reshape(before.v.shape)[:, 0])
+    vanishes = ~bearing & (push * before.mobility[:, 0] <= 1e-8 * before.a_size[:, 0])
     opens, slips = event.opens | (event.slips & vanishes), event.slips & ~vanishes
     event = event._replace(opens=opens, slips=slips)
     # -- The impact, if contacts close.
@@ -176,11 +175,6 @@ def changed_contacts(
     return Change(y, delay, impulses, is_determined & (~is_impact | hit.determined))
 
 
-def _stiffness(terms: ContactTerms) -> Array:
-    """G_NN (c,) of each contact: its normal acceleration by a force of 1 N."""
-    return jnp.sum(terms.B.reshape(*terms.v.shape, -1)[:, 0] ** 2, axis=1)
-
-
 def _negligible(terms: ContactTerms) -> Array:
     """Velocities (c, r) that are rounding errors. All velocities of a contact have the size of the largest."""
     size = jnp.max(terms.size, axis=1, keepdims=True)
@@ -188,7 +182,7 @@ def _negligible(terms: ContactTerms) -> Array:
 
 
 def _rest_of_bounces(terms: ContactTerms, strikes: Array) -> Array:
-    """The time (c,) that all bounces after this impact take, 2 v / (a (1 - e)); infinity if there is no end [s]."""
+    """The time (c,) that all bounces after this impact take, 2 v / (a (1 - e)); infinity if they do not end [s]."""
     fall, e = -terms.a[:, 0], terms.laws.restitution
     ends = strikes & (fall > 0) & (e < 1)
     return jnp.where(ends, -2.0 * e * terms.v[:, 0] / jnp.where(ends, fall * (1.0 - e), 1.0), jnp.inf)

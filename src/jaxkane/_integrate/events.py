@@ -6,8 +6,7 @@ An event ends the simulation, or changes the state (`jumps.py`).
 from __future__ import annotations
 
 import dataclasses
-import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +20,7 @@ from .._kane.unilateral import OPEN
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
 from .._scalarjit.scalar_function import ScalarFunction
-from .._system.system import NamedVector, State, System, unpacked
+from .._system.system import NamedVector, State, System, call_with_states, unpacked
 from .status import REASONS
 
 
@@ -260,13 +259,6 @@ def crossings(system: System, t: Component, q: Any, u_all: Any, x: Any, dtype: D
     if reserved:
         raise ValueError(f"{type(system).__name__}: the event name {reserved[0]!r} is reserved. Use another name.")
     return {name: _as_crossing(name, events[name], dtype) for name in sorted(events)}
-
-
-def call_with_states(f: Callable[..., Any], t: Component, q: Any, u: Any, x: Any) -> Any:
-    """f(t, q, u), or f(t, q, u, x) if the function has a fourth argument for the first-order states."""
-    parameters = inspect.signature(f).parameters.values()
-    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    return f(t, q, u, x) if len(positional) > 3 else f(t, q, u)
 
 
 def _as_crossing(name: str, event: Any, dtype: DTypeLike) -> Crossing:

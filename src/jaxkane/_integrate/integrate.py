@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -293,10 +294,8 @@ class Problem(NamedTuple):
 
         (values, noise), (rates, _) = jax.jvp(of_contacts, (t, y), (jnp.ones_like(t), y_dot))
         # The own events and the contacts, each in alphabetical order
-        order: list[int] = []
-        for contact in events.contacts:
-            own_place = len(order) - sum(x >= len(own.values) for x in order)
-            order.append(own_place if contact is None else len(own.values) + 2 * contact[0] + contact[1])
+        n, places = len(own.values), itertools.count()
+        order = [next(places) if contact is None else n + 2 * contact[0] + contact[1] for contact in events.contacts]
         pairs = (own.values, values), (own.rates, rates), (jnp.zeros_like(own.values), noise)
         values, rates, noise = (jnp.stack([jnp.concatenate(pair)[i] for i in order]) for pair in pairs)
         return own._replace(values=values, rates=rates, noise=noise)

@@ -31,8 +31,8 @@ from .._scalarjit.components import Component, as_vector, component
 from .._scalarjit.nan import nan_if_not_zero
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.prints import wrapped
-from .._system.system import NamedVector, State, System, unpacked
-from .events import Events, call_with_states, crossings, events_of
+from .._system.system import NamedVector, State, System, call_with_states, unpacked
+from .events import Events, crossings, events_of
 
 
 class JumpTable(eqx.Module):

@@ -19,7 +19,7 @@ from .._scalarjit.cache_key import jit
 from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component, Numbers
 from .._scalarjit.nan import nan_where
-from .._system.system import State, System
+from .._system.system import State, System, with_class
 from .api import constraint_jacobian, dependent_speeds
 from .arguments import as_array, check_is_system, check_time, is_concrete
 from .checks import check_system
@@ -101,19 +101,12 @@ def with_touching(system: System, touching: Sequence[str]) -> System:
     own = type(system)
 
     def system_of(self: System) -> System:
-        return _with_class(self, own)
+        return with_class(self, own)
 
     name = f"{own.__name__} with {', '.join(touching)} touching"
     changed: Any = type(own)(own.__name__, (own,), {"configuration_constraints": configuration_constraints})  # type: ignore[misc]
     changed.__qualname__ = name
-    return _with_class(system, changed)
-
-
-def _with_class(system: System, kind: type) -> System:
-    new = object.__new__(kind)
-    for key, value in vars(system).items():
-        object.__setattr__(new, key, value)
-    return new
+    return with_class(system, changed)
 
 
 _EULER_PARAMETERS = Cache()  # indices of Euler parameters by structure

@@ -52,7 +52,7 @@ from .description import dtype_of, jvp, structure_of
 from .impact import RowBasis, checked_restitution, inverse_root, least_norm
 from .kanes_method import KaneEquations, unit
 from .scaling import term_sizes
-from .unilateral import MOST_CONTACTS, OPEN, SLIDES, STICKS, force_scales
+from .unilateral import MOST_CONTACTS, OPEN, SLIDES, STICKS, force_scales, with_friction
 
 
 @dataclasses.dataclass(frozen=True, init=False)
@@ -343,7 +343,6 @@ class ContactTerms(NamedTuple):
     - `X` (n, n): with X^T M X = 1. `w` (n,): X^T f.
     - `laws`: restitution and friction.
     - `tangents` (c, d, 3): directions of the slip in N.
-    - `gap_rates` (c,): rates of the gaps.
     - `Q` (n_q, n): derivatives of the rates of the coordinates by the independent speeds.
 
     With residuals that have multipliers, X X^T is the inverse of M on the speeds that they permit. Then `a0` (n,) are
@@ -360,7 +359,6 @@ class ContactTerms(NamedTuple):
     w: Array
     laws: Laws
     tangents: Array
-    gap_rates: Array
     Q: Array
     a0: Array
     shift: Array
@@ -374,6 +372,16 @@ class ContactTerms(NamedTuple):
     def a(self) -> Array:
         """v_dot (c, r) if all contacts were open."""
         return (self.B @ self.w + self.b).reshape(self.v.shape)
+
+    @property
+    def a_size(self) -> Array:
+        """The sizes of the terms of `a` (c, r)."""
+        return (jnp.abs(self.B) @ jnp.abs(self.w) + jnp.abs(self.b)).reshape(self.v.shape)
+
+    @property
+    def mobility(self) -> Array:
+        """The acceleration (c, r) of each row by a force of 1 N along it: the diagonal of G."""
+        return jnp.sum(self.B.reshape(*self.v.shape, -1) ** 2, axis=2)
 
     @property
     def delassus(self) -> Array:
@@ -481,14 +489,13 @@ def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True)
 
         b = as_vector(jvp(along, (t, *q, *u), moving)[1], like) + C @ a0
         w = X.T @ f
-        gap_rates = as_vector(rows.gap_rates(t, q, u), like)
     else:
-        b, w, gap_rates = jnp.zeros_like(v), jnp.zeros(kane.n, kane.dtype), jnp.zeros_like(gaps)
+        b, w = jnp.zeros_like(v), jnp.zeros(kane.n, kane.dtype)
     along_q = [
         kane.along_speeds(lambda u: kane.rates(t, q, u), kane.with_dependent(unit(kane.n, i))) for i in range(kane.n)
     ]
     Q = stack(along_q).astype(kane.dtype).T
-    return ContactTerms(gaps, v.reshape(c, r), size.reshape(c, r), C, b, X, w, laws, T, gap_rates, Q, a0, shift)
+    return ContactTerms(gaps, v.reshape(c, r), size.reshape(c, r), C, b, X, w, laws, T, Q, a0, shift)
 
 
 def _laws(contact: Any) -> tuple[Component, Component, Component]:
@@ -615,18 +622,17 @@ def solve_forces(layout: ContactLayout, terms: ContactTerms, memory: ContactMemo
     else:
         known, ratios = jnp.zeros(c * r, w.dtype), jnp.zeros((c, r), w.dtype)
     # F = W z:  the friction of a contact that slides is proportional to its normal force
-    blocks = np.eye(r, dtype=w.dtype)[None] + ratios[:, :, None] * np.eye(r, dtype=w.dtype)[None, :1]
-    W = (np.eye(c, dtype=w.dtype)[:, None, :, None] * blocks[:, :, None, :]).reshape(c * r, c * r)
+    W = with_friction(ratios)
     mask = active.reshape(-1)
     A = jnp.where(mask[:, None] & mask[None], (B @ B.T) @ W, 0.0)
     needed = jnp.where(mask, -(B @ w + terms.b), 0.0)
     z = least_norm(A, needed)[0]
     if c > 1 and layout.d:
-        normal = (jnp.asarray(W) @ z).reshape(c, r)[:, 0]
+        normal = (W @ z).reshape(c, r)[:, 0]
         limits = terms.laws.static * jnp.where(is_bearing, 1.0, normal)
         scales = force_scales(limits, memory.states == STICKS, r)
         z = scales * least_norm(A * scales[None], needed)[0]
-    forces = jnp.asarray(W) @ z
+    forces = W @ z
     u_dot = terms.a0 + terms.X @ (w + B.T @ forces)
     return ContactForces((forces + known).reshape(c, r), u_dot)
 
@@ -742,11 +748,8 @@ def event_sizes(
     layout: ContactLayout, terms: ContactTerms, memory: ContactMemory, forces: Array, gap_sizes: Array
 ) -> tuple[Array, Array]:
     """The sizes of the terms of both `event_functions` of each contact (c,)."""
-    c, r = terms.v.shape
     closed, d = memory.states >= SLIDES, layout.d
-    needed = (jnp.abs(terms.B) @ jnp.abs(terms.w) + jnp.abs(terms.b)).reshape(c, r)
-    stiffness = jnp.sum(terms.B.reshape(c, r, -1) ** 2, axis=2)
-    sizes = needed / jnp.where(stiffness > 0, stiffness, 1.0) + jnp.abs(forces)
+    sizes = terms.a_size / jnp.where(terms.mobility > 0, terms.mobility, 1.0) + jnp.abs(forces)
     normal = jnp.where(jnp.asarray(layout.is_bearing), 0.0, jnp.where(closed, sizes[:, 0], gap_sizes))
     if not d:
         return normal, jnp.zeros_like(normal)

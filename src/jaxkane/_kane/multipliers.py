@@ -1,8 +1,8 @@
 """Systems whose constraints have multipliers instead of dependent speeds.
 
 Dependent speeds become singular where the named speeds do not determine them, although the mechanism is regular there:
-for example a chain of links between two fixed points, whose last two links are in line. With all speeds independent and
-a multiplier for each velocity residual, there is no such place:
+for example a chain of links between two fixed points, whose last two links are in line. If all
+speeds are independent and each velocity residual has a multiplier, the equations have a solution there too:
 
     M u_dot = f + C^T lambda,   c = C u + c0 = 0
 
@@ -12,11 +12,10 @@ A residual that depends linearly on the others is omitted where it does, so over
 from __future__ import annotations
 
 import functools
-import inspect
 from typing import Any
 
 from .._system.motion import Motion
-from .._system.system import System, has_outputs
+from .._system.system import System, call_with_states, has_outputs
 from .arguments import Row, check_is_system
 from .contact import has_contacts, has_multipliers
 from .description import DescriptionEvaluator, jvp
@@ -51,7 +50,7 @@ class _WithMultipliers(System):
         return self.inner.implied_constraints(t, q)
 
     def events(self, t, q, u, x=()):
-        return events_of_inner(self.inner, t, q, u, x)
+        return call_with_states(self.inner.events, t, q, u, x)
 
     def multiplier_residuals(self, t: Any, q: Row, u: Row) -> Row:
         evaluator, q, u = DescriptionEvaluator(self.inner), tuple(q), tuple(u)
@@ -64,12 +63,6 @@ class _WithMultipliers(System):
 
 for _name in ("coordinates", "dependent_coordinates", "inputs", "states", "units", "check_inertia"):
     setattr(_WithMultipliers, _name, property(lambda self, name=_name: getattr(self.inner, name)))
-
-
-def events_of_inner(inner: System, t: Any, q: Any, u: Any, x: Any) -> Any:
-    """The events of a system, whose method may have a fourth argument for the first-order states."""
-    takes_states = len(inspect.signature(inner.events).parameters) > 3
-    return inner.events(t, q, u, x) if takes_states else inner.events(t, q, u)  # type: ignore[call-arg]
 
 
 class _Outputs(System):

@@ -301,10 +301,7 @@ class _Problem(eqx.Module):
         # W = 1, and L_T = -mu n L_N while sliding
         ratios = jnp.where(slides, -friction, 0.0)[:, None] * slips[:, : rows - 1]
         ratios = jnp.concatenate([jnp.zeros_like(friction)[:, None], ratios], axis=1)
-        blocks = (
-            jnp.eye(rows, dtype=self.v.dtype)[None] + ratios[:, :, None] * np.eye(rows, dtype=self.v.dtype)[None, :1]
-        )
-        W = (jnp.eye(c, dtype=self.v.dtype)[:, None, :, None] * blocks[:, :, None, :]).reshape(c * rows, c * rows)
+        W = with_friction(ratios)
         G, mask = self.G.reshape(c * rows, c * rows), active.reshape(-1)
         # For the active rows:  G W z = v+ - v-
         A = jnp.where(mask[:, None] & mask[None], G @ W, 0.0)
@@ -349,6 +346,16 @@ class _Problem(eqx.Module):
                 is_opposite = jnp.sum(L[:, 1:] * v[:, 1:], axis=1) + force * slip <= force * limit
             conditions += [~sticks | is_held, ~slides | is_opposite | self.slip.is_known]
         return jnp.all(jnp.stack(conditions)) & jnp.all(jnp.isfinite(v))
+
+
+def with_friction(ratios: Array) -> Array:
+    """W (c r, c r) of L = W z. `ratios` (c, r): of each impulse to the normal impulse z_N of its contact, for friction
+    that is proportional to it; zero for other rows."""
+    c, r = ratios.shape
+    # NumPy's unit matrices: the program of a `ScalarFunction` has constants only.
+    blocks = np.eye(r, dtype=ratios.dtype)[None] + ratios[:, :, None] * np.eye(r, dtype=ratios.dtype)[None, :1]
+    W = np.eye(c, dtype=ratios.dtype)[:, None, :, None] * blocks[:, :, None, :]
+    return jnp.asarray(W).reshape(c * r, c * r)
 
 
 def force_scales(limits: Array, sticks: Array, rows: int) -> Array:

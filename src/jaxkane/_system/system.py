@@ -424,6 +424,21 @@ class System(eqx.Module, metaclass=SystemMeta):
         return {}
 
 
+def call_with_states(f: Callable[..., Any], t: Component, q: Any, u: Any, x: Any) -> Any:
+    """f(t, q, u), or f(t, q, u, x) if the function has a fourth argument for the first-order states."""
+    parameters = inspect.signature(f).parameters.values()
+    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    return f(t, q, u, x) if len(positional) > 3 else f(t, q, u)
+
+
+def with_class(system: System, kind: type) -> Any:
+    """A system of another class, with the same fields."""
+    copy = object.__new__(kind)
+    for field, value in vars(system).items():
+        object.__setattr__(copy, field, value)
+    return copy
+
+
 def has_outputs(system: System) -> bool:
     """Whether the system defines `outputs`. Their names are only known after `outputs` has been evaluated."""
     return type(system).outputs is not System.outputs

@@ -29,7 +29,6 @@ from .._kane.checks import check_system
 from .._kane.constraint_residuals import SINGULAR_ROUNDING, configuration_residual
 from .._kane.contact import has_contacts
 from .._kane.diagnosis import diagnosis
-from .._kane.multipliers import events_of_inner
 from .._kane.right_hand_side import has_outputs, output_names, outputs_at, rates, values_of
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Component, Numbers, solve, stack
@@ -37,7 +36,7 @@ from .._scalarjit.nan import nan_where
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.parameters import parameters_in
 from .._system.prints import concrete_numbers, text_of, wrapped
-from .._system.system import NamedVector, State, System
+from .._system.system import NamedVector, State, System, call_with_states
 from ._matrix_eigenvalues import Eig, eig, eigenvalues_text, eigvals
 from ._steady import (
     SteadyMotion,
@@ -321,7 +320,7 @@ class _WithSpeeds(System):
         return self.inner.implied_constraints(t, q)
 
     def events(self, t, q, u, x=()):
-        return events_of_inner(self.inner, t, q, self._in_order(u), x)
+        return call_with_states(self.inner.events, t, q, self._in_order(u), x)
 
 
 for _name in ("coordinates", "auxiliary_speeds", "dependent_coordinates", "inputs", "states", "units", "check_inertia"):

@@ -24,7 +24,7 @@ from .._integrate.trajectory import Trajectory
 from .._kane.constraint_residuals import configuration_residual, coordinate_units, projected
 from .._kane.contact import has_contacts
 from .._kane.right_hand_side import vector_field
-from .._system.system import System, packed_motion, unpacked
+from .._system.system import System, packed_motion, unpacked, with_class
 
 
 class OrbitArguments(NamedTuple):
@@ -360,10 +360,7 @@ def with_section(system: System, section: str, jumps: bool) -> System:
     if not section:
         return system
     kind: Any = type(system)
-    copy = object.__new__(_with_section(kind, section, jumps))
-    for field, value in vars(system).items():
-        object.__setattr__(copy, field, value)
-    return copy
+    return with_class(system, _with_section(kind, section, jumps))
 
 
 @functools.cache
