@@ -1,5 +1,7 @@
 """Systems that tests of several rooms use."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -358,3 +360,52 @@ class TwoCornerBlock(jk.System):
     def contacts(self, t, q, u, motion):
         law = {"restitution": self.restitution, "friction": self.friction}
         return {name: jk.Contact(motion[name], motion.N.y, **law) for name in ("left", "right")}
+
+
+class SliderCrank(jk.System):
+    """A crank, a rod and a slider on y = 0, closed by configuration constraints."""
+
+    coordinates, speeds = ("crank", "rod", "x"), ("crank_rate",)
+    dependent_coordinates, dependent_speeds = ("rod", "x"), ("rod_rate", "x_dot")
+
+    def configuration_constraints(self, t, q):
+        y = 0.15 * jnp.sin(q["crank"]) + 0.4 * jnp.sin(q["rod"])
+        return 0.15 * jnp.cos(q["crank"]) + 0.4 * jnp.cos(q["rod"]) - q["x"], y
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["crank"], u["crank_rate"], "A")
+        B = N.rotate(3, q["rod"], u["rod_rate"], "B")
+        pin = O.fixed(0.15 * A.x)
+        slider = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+        crank = jk.Body(0.6, (0.0, 0.0, 0.6 * 0.15**2 / 12), O.fixed(0.075 * A.x), A, name="crank")
+        rod = jk.Body(0.9, (0.0, 0.0, 0.9 * 0.4**2 / 12), pin.fixed(0.2 * B.x), B, name="rod")
+        return jk.Motion([crank, rod, jk.Body(0.5, 0.0, slider, name="slider")], points={"pin": pin})
+
+
+class SliderInGuides(jk.System):
+    """A slider crank whose slider has four corners between two guides (Flores and Glocker)."""
+
+    coordinates, speeds = ("crank", "rod", "slider"), ("crank_rate", "rod_rate", "slider_rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A, B, S = (N.rotate(3, x, rate) for x, rate in zip(q, u, strict=True))
+        pin = O.fixed(0.153 * A.x)
+        P = pin.fixed(0.306 * B.x)
+        crank = jk.Body(0.038, (0.0, 0.0, 7.4e-5), O.fixed(0.0765 * A.x), A, name="crank")
+        rod = jk.Body(0.038, (0.0, 0.0, 5.9e-4), pin.fixed(0.153 * B.x), B, name="rod")
+        places = itertools.product((0.025, -0.025), (-0.05, 0.05))
+        corners = {f"corner {i}": P.fixed(x * S.x + y * S.y) for i, (y, x) in enumerate(places)}
+        return jk.Motion([crank, rod, jk.Body(0.076, (0.0, 0.0, 2.7e-6), P, S, name="slider")], points=corners)
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def contacts(self, t, q, u, motion):
+        law, N = {"restitution": 0.4, "friction": 0.01}, motion.N
+        sides = {f"corner {i}": (-1.0 if i < 2 else 1.0) * N.y for i in range(4)}
+        return {
+            name: jk.Contact(motion[name], side, gap=0.026 + motion[name].position.dot(side), **law)
+            for name, side in sides.items()
+        }

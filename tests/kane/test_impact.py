@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import SliderCrank
 
 import jaxkane as jk
 from jaxkane import Scalar, parameter
@@ -170,32 +171,6 @@ def test_a_hoop_strikes_a_kerb():
     np.testing.assert_allclose(slope, -6.428571428571429, rtol=RTOL)
     # If the road holds the wheel, it stops.
     np.testing.assert_allclose(over_kerb(Hoop(), release=()).u, 0.0, atol=RTOL)
-
-
-class SliderCrank(jk.System):
-    """A crank, a rod and a slider on y = 0, closed by configuration constraints."""
-
-    coordinates, speeds = ("crank", "rod", "x"), ("crank_rate",)
-    dependent_coordinates, dependent_speeds = ("rod", "x"), ("rod_rate", "x_dot")
-
-    def ends(self, q):
-        return 0.15 * jnp.cos(q["crank"]) + 0.4 * jnp.cos(q["rod"]), 0.15 * jnp.sin(q["crank"]) + 0.4 * jnp.sin(
-            q["rod"]
-        )
-
-    def configuration_constraints(self, t, q):
-        x, y = self.ends(q)
-        return x - q["x"], y
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        A = N.rotate(3, q["crank"], u["crank_rate"], "A")
-        B = N.rotate(3, q["rod"], u["rod_rate"], "B")
-        pin = O.fixed(0.15 * A.x)
-        slider = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
-        crank = jk.Body(0.6, (0.0, 0.0, 0.6 * 0.15**2 / 12), O.fixed(0.075 * A.x), A, name="crank")
-        rod = jk.Body(0.9, (0.0, 0.0, 0.9 * 0.4**2 / 12), pin.fixed(0.2 * B.x), B, name="rod")
-        return jk.Motion([crank, rod, jk.Body(0.5, 0.0, slider, name="slider")], points={"pin": pin})
 
 
 def test_a_struck_slider_crank_stays_closed():

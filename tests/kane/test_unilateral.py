@@ -1,11 +1,10 @@
 """Impacts of unilateral contacts: published and exact impulses, closed forms, and the contact laws themselves."""
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import SliderInGuides
 from scipy.integrate import solve_ivp
 
 import jaxkane as jk
@@ -104,21 +103,8 @@ def test_balls_that_touch():
     assert result.unique
 
 
-class SliderCrank(jk.System):
-    """A slider crank whose slider moves between two guides (Flores and Glocker): corners at both of them."""
-
-    coordinates, speeds = ("crank", "rod", "slider"), ("crank_rate", "rod_rate", "slider_rate")
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        A, B, S = (N.rotate(3, x, rate) for x, rate in zip(q, u, strict=True))
-        pin = O.fixed(0.153 * A.x)
-        P = pin.fixed(0.306 * B.x)
-        crank = jk.Body(0.038, (0.0, 0.0, 7.4e-5), O.fixed(0.0765 * A.x), A, name="crank")
-        rod = jk.Body(0.038, (0.0, 0.0, 5.9e-4), pin.fixed(0.153 * B.x), B, name="rod")
-        places = itertools.product((0.025, -0.025), (-0.05, 0.05))
-        corners = {f"corner {i}": P.fixed(x * S.x + y * S.y) for i, (y, x) in enumerate(places)}
-        return jk.Motion([crank, rod, jk.Body(0.076, (0.0, 0.0, 2.7e-6), P, S, name="slider")], points=corners)
+class SliderCrank(SliderInGuides):
+    """All corners strike at once."""
 
     def read(self, t, q, u):
         motion, rows = self.motion(t, q, u), []
