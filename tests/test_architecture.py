@@ -22,7 +22,7 @@ SOURCE = Path(jk.__file__).parent
 # no file imports another that imports it, directly or by way of others.
 FLOORS = """
 _version _common _scalarjit rotations _system loads sensors _kane joints convert _integrate catalog sweep plot estimate
-fit data stability bicycles symbolic export _animate __main__
+_collocate fit collocation data stability bicycles symbolic export _animate __main__
 """.split()
 
 

@@ -69,6 +69,7 @@ _switch_off_wrong_fusions()
 if _typing.TYPE_CHECKING:
     from . import bicycles as bicycles
     from . import catalog as catalog
+    from . import collocation as collocation
     from . import convert as convert
     from . import data as data
     from . import estimate as estimate
@@ -83,7 +84,7 @@ if _typing.TYPE_CHECKING:
     from ._animate import Sketch as Sketch
     from ._animate import animate as animate
 
-_ROOMS = ("bicycles", "catalog", "convert", "data", "estimate", "export", "fit", "joints", "plot")
+_ROOMS = ("bicycles", "catalog", "collocation", "convert", "data", "estimate", "export", "fit", "joints", "plot")
 _ROOMS += ("stability", "sweep", "symbolic")
 _OF_ANIMATE = ("Animation", "Sketch", "animate")
 

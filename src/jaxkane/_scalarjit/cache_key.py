@@ -214,6 +214,24 @@ def _static(x: Any) -> tuple[Hashable, Callable[[], Any], list[Any]]:
     return (type(x), x), lambda: x, []
 
 
+def _key_with_functions(args: Any) -> tuple[list[Any], Any, list[Any], Hashable, list[Any]]:
+    """The arrays of arguments that may contain functions, their structure, the static leaves (see `_static`; None for
+    arrays), the key of their programs, and the owners of the key."""
+    leaves, structure = jax.tree.flatten(args)
+    arrays = [x for x in leaves if eqx.is_array(x)]
+    static = [None if eqx.is_array(x) else _static(x) for x in leaves]
+    names, types_of_arrays = tuple(x and x[0] for x in static), tuple(map(jax.typeof, arrays))
+    key = (structure, names, types_of_arrays, version_of(args), settings())
+    return arrays, structure, static, key, [owner for x in static if x for owner in x[2]]
+
+
+def kept(cache: Cache, args: Any, make: Callable[[], Any]) -> Any:
+    """A result that depends on the code and the types of `args`, but not on numbers; computed once and kept in
+    `cache`."""
+    *_, key, owners = _key_with_functions(args)
+    return cache.get(key, make, owners)
+
+
 def jit(f: Callable[..., Any]) -> Callable[..., Any]:
     """`equinox.filter_jit(f)` with a program for each key (see above), in the `Cache` that is its attribute
     `programs`."""
@@ -221,12 +239,7 @@ def jit(f: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(f)
     def call(*args: Any, **kwargs: Any) -> Any:
-        leaves, structure = jax.tree.flatten((args, kwargs))
-        arrays = [x for x in leaves if eqx.is_array(x)]
-        static = [None if eqx.is_array(x) else _static(x) for x in leaves]
-        names, types_of_arrays = tuple(x and x[0] for x in static), tuple(map(jax.typeof, arrays))
-        key = (structure, names, types_of_arrays, version_of(args, kwargs), settings())
-        owners = [owner for x in static if x for owner in x[2]]
+        arrays, structure, static, key, owners = _key_with_functions((args, kwargs))
         program = programs.get(key, lambda: _Compiled(f, structure, [x and x[1] for x in static]), owners)
         with explain_leaked_tracer(type(args[0]).__name__ if args else f.__name__):
             return program.run(arrays)

@@ -1,0 +1,1 @@
+"""Nonlinear programs whose functions are small and repeated, Lobatto methods, and the solvers of such programs."""

@@ -1,0 +1,308 @@
+"""Nonlinear programs: minimize a function of many variables with constraints.
+
+Each function is a sum of blocks. A block is a small function that is evaluated at many places, such as the equations of
+motion at the nodes of a mesh. Its Jacobian and its Hessian are therefore small matrices, evaluated in one batch, of
+which only the entries that may differ from zero are kept.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jaxtyping import Array
+
+from .._scalarjit.cache import Cache
+from .._scalarjit.cache_key import jit, kept
+from .._scalarjit.sparsity import patterns
+
+BlockFunction = Callable[[Any, Array], Array]
+
+
+class Block(NamedTuple):
+    """A function that is evaluated at B places.
+
+    - `function`: (data of a place, x (n,)) -> values (m,); an `eqx.Module`, whose arrays are not differentiated.
+    - `data`: a tree of arrays with a leading axis B.
+    - `columns` (B, n): the indices of the variables that are the `x` of each place.
+    - `size`: the number m of values.
+    """
+
+    function: Any
+    data: Any
+    columns: np.ndarray
+    size: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Pattern:
+    """Entries that may differ from zero: of the Jacobian (m, n), and of the lower triangle of the Hessian (n, n).
+
+    A dataclass, because it is one static argument of a compiled program.
+    """
+
+    rows: tuple[int, ...]
+    columns: tuple[int, ...]
+    hessian_rows: tuple[int, ...]
+    hessian_columns: tuple[int, ...]
+
+
+_PATTERNS = Cache()
+
+
+def _pattern(function: BlockFunction, data: Any, x: Array) -> Pattern:
+    leaves, structure = jax.tree.flatten(data)
+
+    def f(x: Array, *leaves: Any) -> Array:
+        return function(jax.tree.unflatten(structure, leaves), x)
+
+    first, second = patterns(f, [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in (x, *leaves)], 0)
+    places = (*np.nonzero(first), *np.nonzero(np.tril(second)))
+    return Pattern(*(tuple(i.tolist()) for i in places))
+
+
+def _padded(size: int) -> int:
+    """The next power of two. Other numbers of intervals then use the same compiled program."""
+    return 1 << max(0, (size - 1).bit_length())
+
+
+class EvaluatedBlock:
+    """A block with its pattern, and its values and derivatives at all places."""
+
+    def __init__(self, block: Block, dtype: Any = jnp.float64):
+        self.block, (self.B, n) = block, block.columns.shape
+        padded = _padded(self.B) - self.B
+
+        def with_padding(x: Any) -> np.ndarray:  # the last place is repeated
+            return np.concatenate([x, np.repeat(x[-1:], padded, axis=0)]) if padded else np.asarray(x)
+
+        self.data = jax.tree.map(lambda x: jnp.asarray(with_padding(np.asarray(x))), block.data)
+        self.columns = with_padding(block.columns)
+        one = jax.tree.map(lambda x: jnp.asarray(x[0]), block.data), jnp.zeros(n, dtype)
+        self.pattern = kept(_PATTERNS, (block.function, *one), lambda: _pattern(block.function, *one))
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Values (B, m)."""
+        return np.asarray(_values(self.block.function, self.data, x[self.columns]))[: self.B]
+
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        """The entries (B, e) of the pattern of the Jacobian."""
+        return np.asarray(_jacobian(self.block.function, self.pattern, self.data, x[self.columns]))[: self.B]
+
+    def hessian(self, x: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """The entries (B, e) of the Hessian of the values weighted by `weights` (B, m)."""
+        if not self.pattern.hessian_rows:
+            return np.zeros((self.B, 0))
+        padded = np.zeros((len(self.columns), self.block.size))
+        padded[: self.B] = weights
+        entries = _hessian(self.block.function, self.pattern, self.data, x[self.columns], padded)
+        return np.asarray(entries)[: self.B]
+
+
+@jit
+def _values(function: BlockFunction, data: Any, X: Array) -> Array:
+    return jax.vmap(function)(data, X)
+
+
+@jit
+def _jacobian(function: BlockFunction, pattern: Pattern, data: Any, X: Array) -> Array:
+    along = sorted({*pattern.columns})  # other columns are zero
+    place = np.array([along.index(c) for c in pattern.columns], int)
+    directions = np.eye(X.shape[1])[along]
+
+    def entries(data: Any, x: Array) -> Array:
+        columns = jax.vmap(lambda v: jax.jvp(lambda x: function(data, x), (x,), (v,))[1])(directions)
+        return columns[place, np.array(pattern.rows, int)]
+
+    return jax.vmap(entries)(data, X) if along else jnp.zeros((X.shape[0], 0))
+
+
+@jit
+def _hessian(function: BlockFunction, pattern: Pattern, data: Any, X: Array, weights: Array) -> Array:
+    along = sorted({*pattern.hessian_columns})
+    place = np.array([along.index(c) for c in pattern.hessian_columns], int)
+    directions = np.eye(X.shape[1])[along]
+
+    def entries(data: Any, x: Array, w: Array) -> Array:
+        slope = jax.grad(lambda x: jnp.vdot(w, function(data, x)))
+        columns = jax.vmap(lambda v: jax.jvp(slope, (x,), (v,))[1])(directions)
+        return columns[place, np.array(pattern.hessian_rows, int)]
+
+    return jax.vmap(entries)(data, X, weights)
+
+
+class Bounds(NamedTuple):
+    """Lower and upper bounds (n,), infinite without a bound."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+class NonlinearProgram:
+    """Minimize f(x) with bounds on x and on g(x):
+
+        f = sum_b w_b . G_b(x),  g = A x + sum_b S_b G_b(x)
+
+    G_b are the values of block b at all its places. Solvers see scaled numbers: x / x_scale, g / g_scale, f / f_scale.
+
+    **Arguments:**
+
+    - `blocks`: the blocks.
+    - `weights`: for each block, the factors w_b (B m,) of its values in the cost, or None.
+    - `constraints`: for each block, the sparse matrix S_b (n_g, B m) of its values in the constraints, or None.
+    - `linear`: the sparse matrix A (n_g, n).
+    - `x_bounds`, `g_bounds`: bounds of the variables (n,) and of the constraints (n_g,).
+    - `x_scale` (n,), `g_scale` (n_g,), `f_scale`: typical sizes.
+    """
+
+    def __init__(
+        self,
+        blocks: Sequence[EvaluatedBlock],
+        weights: Sequence[np.ndarray | None],
+        constraints: Sequence[Any],
+        linear: Any,
+        x_bounds: Bounds,
+        g_bounds: Bounds,
+        x_scale: np.ndarray,
+        g_scale: np.ndarray,
+        f_scale: float = 1.0,
+    ):
+        self.m, self.n = linear.shape
+        self.x_scale, self.g_scale, self.f_scale = x_scale, g_scale, f_scale
+        self.x_bounds, self.g_bounds = x_bounds, g_bounds
+        self._blocks = list(blocks)
+        sizes = [b.B * b.block.size for b in self._blocks]
+        self._weights = [np.zeros(k) if w is None else w for k, w in zip(sizes, weights, strict=True)]
+        self._S = [scipy.sparse.csr_matrix((self.m, k)) if S is None else S for k, S in zip(sizes, constraints)]
+        self._S = [scipy.sparse.csr_matrix(S) for S in self._S]
+        self._A = scipy.sparse.csr_matrix(linear)
+        self._memory: dict[Callable[..., Any], tuple[bytes, list[np.ndarray]]] = {}
+        self._map_jacobian()
+        self._map_hessian()
+
+    def _map_jacobian(self) -> None:
+        """Each entry of the Jacobian of g, and of the gradient of f, is a sum of entries of the blocks."""
+        A = self._A.tocoo()
+        rows, columns, sources, factors = [A.row], [A.col], [], []
+        self._gradient_maps, places = [], []
+        total = 0
+        for b, S, w in zip(self._blocks, self._S, self._weights, strict=True):
+            e = len(b.pattern.rows)
+            entry_rows = (np.arange(b.B)[:, None] * b.block.size + np.array(b.pattern.rows, int)).ravel()
+            entry_columns = b.columns[: b.B][:, np.array(b.pattern.columns, int)].ravel()
+            picks = scipy.sparse.csr_matrix(
+                (np.ones(b.B * e), (entry_rows, np.arange(b.B * e))), (b.B * b.block.size, b.B * e)
+            )
+            used = (S @ picks).tocoo()
+            rows.append(used.row)
+            columns.append(entry_columns[used.col])
+            sources.append(used.col + total)
+            factors.append(used.data)
+            self._gradient_maps.append(
+                scipy.sparse.csr_matrix((w[entry_rows], (entry_columns, np.arange(b.B * e))), (self.n, b.B * e))
+            )
+            places.append((total, total + b.B * e))
+            total += b.B * e
+        row, column = np.concatenate(rows).astype(np.int64), np.concatenate(columns).astype(np.int64)
+        keys, inverse = np.unique(column * self.m + row, return_inverse=True)
+        self.jacobian_structure = (keys % self.m if self.m else keys), (keys // self.m if self.m else keys)
+        scale = self.x_scale[self.jacobian_structure[1]] / self.g_scale[self.jacobian_structure[0]]
+        k = len(A.row)
+        self._jacobian_constant = np.bincount(inverse[:k], A.data, minlength=len(keys)) * scale
+        self._jacobian_map = scipy.sparse.csr_matrix(
+            (np.concatenate([*factors, []]) * scale[inverse[k:]], (inverse[k:], np.concatenate([*sources, []]))),
+            (len(keys), total),
+        )
+
+    def _map_hessian(self) -> None:
+        """Each entry of the lower triangle of the Hessian is a sum of entries of the blocks."""
+        rows, columns = [], []
+        for b in self._blocks:
+            place = b.columns[: b.B]
+            one, other = (
+                place[:, np.array(b.pattern.hessian_rows, int)],
+                place[:, np.array(b.pattern.hessian_columns, int)],
+            )
+            rows.append(np.maximum(one, other).ravel())
+            columns.append(np.minimum(one, other).ravel())
+        row, column = (np.concatenate([*x, []]).astype(np.int64) for x in (rows, columns))
+        keys, inverse = np.unique(column * self.n + row, return_inverse=True)
+        self.hessian_structure = keys % self.n, keys // self.n
+        scale = self.x_scale[self.hessian_structure[0]] * self.x_scale[self.hessian_structure[1]]
+        self._hessian_map = scipy.sparse.csr_matrix(
+            (scale[inverse], (inverse, np.arange(len(row)))), (len(keys), len(row))
+        )
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Lower bounds (n,) of the scaled variables."""
+        return self.x_bounds.lower / self.x_scale
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Upper bounds (n,) of the scaled variables."""
+        return self.x_bounds.upper / self.x_scale
+
+    @property
+    def g_lower(self) -> np.ndarray:
+        """Lower bounds (n_g,) of the scaled constraints."""
+        return self.g_bounds.lower / self.g_scale
+
+    @property
+    def g_upper(self) -> np.ndarray:
+        """Upper bounds (n_g,) of the scaled constraints."""
+        return self.g_bounds.upper / self.g_scale
+
+    def objective(self, z: np.ndarray) -> float:
+        """The scaled cost at scaled variables."""
+        values = self._remembered(EvaluatedBlock.values, z)
+        return float(sum(w @ v.ravel() for w, v in zip(self._weights, values, strict=True)) / self.f_scale)
+
+    def gradient(self, z: np.ndarray) -> np.ndarray:
+        """The derivatives (n,) of `objective`."""
+        entries = self._remembered(EvaluatedBlock.jacobian, z)
+        total = np.zeros(self.n)
+        for M, e in zip(self._gradient_maps, entries, strict=True):
+            total += M @ e.ravel()
+        return total * self.x_scale / self.f_scale
+
+    def constraints(self, z: np.ndarray) -> np.ndarray:
+        """The scaled constraints (n_g,)."""
+        g = self._A @ (z * self.x_scale)
+        for S, v in zip(self._S, self._remembered(EvaluatedBlock.values, z), strict=True):
+            g = g + S @ v.ravel()
+        return g / self.g_scale
+
+    def jacobian(self, z: np.ndarray) -> np.ndarray:
+        """The derivatives of `constraints`: the entries of `jacobian_structure`, by columns."""
+        entries = self._remembered(EvaluatedBlock.jacobian, z)
+        return self._jacobian_constant + self._jacobian_map @ np.concatenate([*(e.ravel() for e in entries), []])
+
+    def hessian(self, z: np.ndarray, multipliers: np.ndarray, objective_factor: float = 1.0) -> np.ndarray:
+        """The second derivatives of objective_factor * objective + multipliers . constraints: the entries of
+        `hessian_structure`, in the lower triangle, by columns."""
+        x, factors = z * self.x_scale, multipliers / self.g_scale
+        parts = []
+        for b, S, w in zip(self._blocks, self._S, self._weights, strict=True):
+            weights = S.T @ factors + (objective_factor / self.f_scale) * w
+            parts.append(b.hessian(x, weights.reshape(b.B, b.block.size)).ravel())
+        return self._hessian_map @ np.concatenate([*parts, []])
+
+    def violation(self, z: np.ndarray) -> float:
+        """The largest scaled violation of constraints and bounds."""
+        g = self.constraints(z)
+        pairs = ((self.g_lower - g, g - self.g_upper), (self.lower - z, z - self.upper))
+        return max(float(np.max(x, initial=0.0)) for pair in pairs for x in pair)
+
+    def _remembered(self, evaluate: Callable[[Any, np.ndarray], np.ndarray], z: np.ndarray) -> list[np.ndarray]:
+        """The results of all blocks. Solvers ask for the cost and for the constraints at the same point."""
+        key, known = z.tobytes(), self._memory.get(evaluate)
+        if known is None or known[0] != key:
+            x = z * self.x_scale
+            known = self._memory[evaluate] = key, [evaluate(b, x) for b in self._blocks]
+        return known[1]

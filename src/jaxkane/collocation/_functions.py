@@ -1,0 +1,241 @@
+"""The functions of a nonlinear program, each at one place: equations of motion, cost, constraints, ends and links."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._common.lookup import not_there
+from .._integrate.events import crossings, events_of
+from .._integrate.inputs import inputs_at
+from .._integrate.jumps import stages_of, state_after
+from .._kane.api import _dependent_speeds
+from .._kane.constraint_residuals import configuration_residual
+from .._kane.kanes_method import KaneEquations
+from .._kane.right_hand_side import outputs_at, values_of, vector_field
+from .._scalarjit.components import Component
+from .._system.system import System, explain_value_of_traced, has_outputs, names_of, packed, unpacked
+
+
+class Now:
+    """The argument `now` of costs and constraints: values at one time, by name.
+
+        now["roll"], now["yaw_rate"], now["steer_torque"], now["imu.ay"], now.system.mass
+
+    The names are those of coordinates, speeds, dependent speeds, first-order states, inputs and outputs.
+
+    Attributes:
+
+    - `t`: time [s].
+    - `system`: the system, with the current values of free parameters.
+    - `state`: the `State`.
+    """
+
+    def __init__(self, system: System, t: Component, y: Array, inputs: Mapping[str, Array]):
+        self.system, self.t, self.state = system, t, unpacked(system, y)
+        self._y, self._inputs = y, dict(inputs)
+        self._outputs: dict[str, Array] | None = None
+
+    def __getitem__(self, name: str) -> Array:
+        system, state = self.system, self.state
+        if name in self._inputs:
+            return self._inputs[name]
+        for names, values in ((system.coordinates, state.q), (system.speeds, state.u), (system.states, state.x)):
+            if name in names:
+                return values[names.index(name)]  # type: ignore[index]
+        if name in system.dependent_speeds:
+            u_dep = _dependent_speeds(system, self.t, state.q, state.u, {})
+            return u_dep[system.dependent_speeds.index(name)]
+        if has_outputs(system) and self._outputs is None:
+            values = values_of(system, state.x, self._inputs)
+            self._outputs = outputs_at(system, self.t, state.q, state.u, values)
+        if name in (self._outputs or {}):
+            return self._outputs[name]  # type: ignore[index]
+        known = [each for names in names_of(system) for each in names]
+        raise not_there(name, [*known, *self._inputs, *(self._outputs or {})], "`now`")
+
+    def __contains__(self, name: object) -> bool:
+        try:
+            self[name]  # type: ignore[index]
+        except KeyError:
+            return False
+        return True
+
+
+class Variables(eqx.Module):
+    """How the variables of a node become a time, a state and inputs.
+
+    The variables x are [state, controls, duration, parameters]. The last two are shared by all nodes and may be absent.
+
+    Attributes:
+
+    - `system`: the system. `signals`: its inputs other than the controls.
+    - `parameters`: the maps of the free parameters, or None.
+    - `duration`: the fixed duration [s], or None if it is a variable. `origin`: the time of the first node [s].
+    - `controls`: the names of the controls. `n_y`: the number of states.
+    """
+
+    system: System
+    signals: Any
+    parameters: Any
+    duration: Array | None
+    origin: Array
+    controls: tuple[str, ...] = eqx.field(static=True)
+    n_y: int = eqx.field(static=True)
+
+    @property
+    def n_z(self) -> int:
+        """The number of variables of one node."""
+        return self.n_y + len(self.controls)
+
+    def shared(self, x: Array) -> tuple[System, Array]:
+        """The system and the duration, from the shared variables."""
+        duration, rest = (x[0], x[1:]) if self.duration is None else (self.duration, x)
+        system = self.system if self.parameters is None else self.parameters.apply(self.system, rest)[0]
+        return system, duration
+
+    def at(self, node: Any, x: Array) -> tuple[System, Array, Array, Array, dict[str, Array]]:
+        """System, duration, time, packed state and inputs by name, at a node.
+
+        `node`: the fraction of the duration "s", and the values of sampled inputs by name.
+        """
+        y, w = x[: self.n_y], x[self.n_y : self.n_z]
+        system, duration = self.shared(x[self.n_z :])
+        t = self.origin + node["s"] * duration
+        inputs = {name: w[i] for i, name in enumerate(self.controls)} | node["inputs"]
+        if callable(self.signals) or self.signals:
+            inputs = inputs_at(system, self.signals, t, unpacked(system, y)) | inputs
+        inputs |= {name: jnp.zeros_like(t) for name in system.inputs if name not in inputs}
+        return system, duration, t, y, inputs
+
+    def now(self, node: Any, x: Array) -> Now:
+        """The values by name at a node."""
+        system, _, t, y, inputs = self.at(node, x)
+        return Now(system, t, y, inputs)
+
+
+class Dynamics(eqx.Module):
+    """duration * y_dot (n_y,): the rates with respect to the fraction of the duration."""
+
+    variables: Variables
+
+    def __call__(self, node: Any, x: Array) -> Float[Array, " n_y"]:
+        system, duration, t, y, inputs = self.variables.at(node, x)
+        return duration * vector_field(system, t, y, inputs)
+
+
+class Integrand(eqx.Module):
+    """duration * cost (1,)."""
+
+    variables: Variables
+    cost: Callable[[Any, Now], Any]
+
+    def __call__(self, node: Any, x: Array) -> Float[Array, " 1"]:
+        _, duration = self.variables.shared(x[self.variables.n_z :])
+        now = self.variables.now(node, x)
+        return jnp.reshape(duration * called("cost", self.cost, now.t, now), (1,))
+
+
+class Path(eqx.Module):
+    """The constraints along the motion (m,): values by name, then those of the function `path`."""
+
+    variables: Variables
+    names: tuple[str, ...] = eqx.field(static=True)
+    path: Callable[[Any, Now], Any] | None
+
+    def __call__(self, node: Any, x: Array) -> Float[Array, " m"]:
+        now = self.variables.now(node, x)
+        values = [now[name] for name in self.names]
+        if self.path is not None:
+            values += [_value(item) for item in named("path", called("path", self.path, now.t, now)).values()]
+        return jnp.stack(values)
+
+
+class Ends(eqx.Module):
+    """Values at both ends of a phase, from x = [first node, last node, shared variables].
+
+    The order is: final cost, conditions, values by name at the start, values by name at the end, h(q) at the start.
+    """
+
+    variables: Variables
+    final_cost: Callable[[Any, Now], Any] | None
+    conditions: Callable[[Now, Now, Any], Any] | None
+    start: tuple[str, ...] = eqx.field(static=True)
+    end: tuple[str, ...] = eqx.field(static=True)
+    has_constraints: bool = eqx.field(static=True)
+
+    def __call__(self, nodes: Any, x: Array) -> Float[Array, " m"]:
+        n, shared = self.variables.n_z, x[2 * self.variables.n_z :]
+        first = self.variables.now(nodes[0], jnp.concatenate([x[:n], shared]))
+        last = self.variables.now(nodes[1], jnp.concatenate([x[n : 2 * n], shared]))
+        _, duration = self.variables.shared(shared)
+        values = [] if self.final_cost is None else [called("final_cost", self.final_cost, last.t, last)]
+        if self.conditions is not None:
+            found = called("conditions", self.conditions, first, last, duration)
+            values += [_value(item) for item in named("conditions", found).values()]
+        values += [first[name] for name in self.start] + [last[name] for name in self.end]
+        if self.has_constraints:
+            values += [*configuration_residual(first.system, first.t, first.state.q)]
+        return jnp.stack([jnp.reshape(jnp.asarray(value, x.dtype), ()) for value in values])
+
+
+class Link(eqx.Module):
+    """What is zero between the end of one phase and the start of the next, from x = [last node, first node, shared].
+
+    `how` is None for a continuous state; the name of an event, whose function must be zero at the end, and whose jump
+    gives the next state; or a function (last, first) -> residuals by name. `shared` are the variables of both phases:
+    [duration of the one, duration of the other, parameters].
+    """
+
+    before: Variables
+    after: Variables
+    how: Any
+
+    def __call__(self, nodes: Any, x: Array) -> Float[Array, " m"]:
+        a, b = self.before.n_z, self.after.n_z
+        shared = x[a + b :]
+        one, other = (int(v.duration is None) for v in (self.before, self.after))
+        parameters = shared[one + other :]
+        x0 = jnp.concatenate([x[:a], shared[:one], parameters])
+        x1 = jnp.concatenate([x[a : a + b], shared[one : one + other], parameters])
+        last, first = self.before.now(nodes[0], x0), self.after.now(nodes[1], x1)
+        if callable(self.how):
+            values = [_value(item) for item in named("links", called("links", self.how, last, first)).values()]
+            return jnp.stack([jnp.reshape(jnp.asarray(value, x.dtype), ()) for value in values])
+        if self.how is None:
+            return packed(first.state) - packed(last.state)
+        system, y = last.system, packed(last.state)
+        events = events_of(system, last.t, last.state)
+        place = jnp.asarray(events.names.index(self.how), y.dtype)
+        after = state_after(system, last.t, y, place, stages_of(events))
+        return jnp.concatenate([event_value(self.how, last)[None], packed(first.state) - after])
+
+
+def event_value(name: str, now: Now) -> Array:
+    """The event function of an event of the system."""
+    state = now.state
+    kane = KaneEquations(now.system, now.t, state.q, state.u)
+    x = () if state.x is None else tuple(state.x)
+    event = crossings(now.system, kane.t, kane.q, kane.u_all, x, state.q.dtype)[name]
+    return jnp.asarray(event.value, state.q.dtype)
+
+
+def called(label: str, f: Callable[..., Any], *args: Any) -> Any:
+    with explain_value_of_traced(f"The function `{label}`"):
+        return f(*args)
+
+
+def named(label: str, values: Any) -> Mapping[str, Any]:
+    """**Raises:** `TypeError` unless the values are by name."""
+    if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
+        raise TypeError(f"The function `{label}` must return a dict of numbers by name, got {values!r}.")
+    return values
+
+
+def _value(item: Any) -> Any:
+    """The value of an item of a dict of constraints: a number, or (number, lower bound, upper bound)."""
+    return item[0] if isinstance(item, tuple) else item

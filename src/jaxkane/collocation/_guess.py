@@ -1,0 +1,200 @@
+"""Initial guesses of motions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._common.lookup import real_number, refuse_unknown
+from .._integrate.trajectory import Trajectory
+from .._kane.consistent_state import assemble
+from .._kane.right_hand_side import vector_field
+from .._system.system import units_of
+from ._problem import Condition, Problem, bounds_of
+from ._transcription import Motion, variables_of
+
+
+def guess_of(problem: Problem, guess: Any, s: np.ndarray, detour: np.ndarray | None = None) -> Motion:
+    """The guess of a motion at nodes.
+
+    **Arguments:**
+
+    - `problem`: the problem.
+    - `guess`: None, a `Trajectory`, or by name numbers, arrays (n,) of samples at even distances, or functions of time;
+        with "duration" a number.
+    - `s` (K,): the nodes, as fractions of the duration.
+    - `detour` (n_q, 3) or None: the amplitudes of sines that are added to the coordinates.
+
+    **Raises:** `ValueError` for unknown names and for values outside the bounds of the problem.
+    """
+    if isinstance(guess, Trajectory):
+        return _of_trajectory(problem, guess, s)
+    given = {} if guess is None else guess
+    if not isinstance(given, Mapping):
+        raise TypeError(
+            "solve: `guess` must be None, a Plan, a Trajectory, a dict by name, or a sequence of these; "
+            f"got {type(guess).__name__}."
+        )
+    names, controls = problem.names, tuple(problem.bounds_of_controls)
+    refuse_unknown(given, [*names, *controls, "duration"], f"solve: `guess`: {problem.title} has no", "it has")
+    duration = _duration(problem, given.get("duration"))
+    Y, W = _automatic(problem, s, duration)
+    if detour is not None:
+        k = np.arange(1, detour.shape[1] + 1)
+        Y[:, : len(detour)] += np.sin(np.pi * np.outer(s, k)) @ detour.T
+    for name, value in given.items():
+        if name != "duration":
+            target, i = (Y, names.index(name)) if name in names else (W, controls.index(name))
+            target[:, i] = _values(problem, name, value, s, duration)
+    return Motion(s, duration, *_clipped(problem, s, Y, W, given))
+
+
+def detours(problem: Problem, count: int, seed: int = 0) -> list[np.ndarray | None]:
+    """Amplitudes of sines (n_q, 3) for random guesses. The first one is None."""
+    rng, units = np.random.default_rng(seed), units_of(problem.system)
+    sizes = []
+    for name in problem.system.coordinates:
+        given = [problem.limits.get(name), *(problem.ends[label].get(name) for label in ("start", "end"))]
+        numbers = [b for v in given if v is not None for b in bounds_of(name, v) if math.isfinite(b)]
+        spread = max(numbers, default=0.0) - min(numbers, default=0.0)
+        is_angle = units.get(name, "") in ("", "rad")
+        sizes.append(1.0 if is_angle else spread)
+    every: list[np.ndarray | None] = [None]
+    for _ in range(count - 1):
+        every.append(
+            np.concatenate([rng.normal(size=(len(sizes), 1)) for _ in range(3)], axis=1) * np.array(sizes)[:, None]
+        )
+    return every
+
+
+def _duration(problem: Problem, given: Any) -> float:
+    low, high = problem.durations
+    if given is None:
+        return 0.5 * (low + high)
+    number = real_number(given, "solve: `guess` of 'duration'")
+    if not low <= number <= high:
+        raise ValueError(f"solve: `guess` of 'duration' is {number:.6g} s, but it must be from {low:g} to {high:g} s.")
+    return number
+
+
+def _middle(value: Condition | None, otherwise: float) -> float:
+    """The number, or a place between two bounds."""
+    if value is None:
+        return otherwise
+    low, high = bounds_of("the guess", value)
+    if math.isfinite(low) and math.isfinite(high):
+        return 0.5 * (low + high)
+    return min(max(otherwise, low), high)
+
+
+def _automatic(problem: Problem, s: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
+    """Straight lines from the start to the end. Coordinates without an end continue with their initial rates."""
+    system, names, limits = problem.system, problem.names, problem.limits
+    ends, controls = problem.ends, tuple(problem.bounds_of_controls)
+    numbers = [[_middle(ends[label].get(name), math.nan) for name in names] for label in ("start", "end")]
+    first, last = np.array(numbers)
+    inside = np.array([_middle(limits.get(name), 0.0) for name in names])
+    start = np.where(np.isnan(first), np.where(np.isnan(last), inside, last), first)
+    start = _assembled(problem, start, first)
+    W0 = np.array([min(max(0.0, limits[name][0]), limits[name][1]) for name in controls])
+    y_dot = _rates(problem, start, W0)
+    n_q = len(system.coordinates)
+    moving = start + duration * np.where(np.arange(len(names)) < n_q, y_dot, 0.0)
+    moving = np.where(np.isfinite(moving), moving, start)
+    end = np.where(np.isnan(last), np.where(np.isnan(first), start, moving), last)
+    Y = start + s[:, None] * (end - start)
+    return Y, np.tile(W0, (len(s), 1))
+
+
+def _assembled(problem: Problem, start: np.ndarray, given: np.ndarray) -> np.ndarray:
+    """The start with coordinates that satisfy the configuration constraints."""
+    system, n_q = problem.system, len(problem.system.coordinates)
+    if not problem.n_constraints or np.all(np.isfinite(given[:n_q])):
+        return start
+    known = {c: float(start[i]) for i, c in enumerate(system.coordinates) if np.isfinite(given[i])}
+    try:
+        q = np.asarray(assemble(system, known).q)
+    except ValueError:
+        return start  # the solver closes the loop
+    return np.concatenate([q, start[n_q:]])
+
+
+def _rates(problem: Problem, y: np.ndarray, w: np.ndarray) -> np.ndarray:
+    variables = variables_of(problem)
+    x = jnp.concatenate([jnp.asarray(y), jnp.asarray(w)])
+    tail = jnp.zeros(problem.has_free_duration + (0 if variables.parameters is None else variables.parameters.size))
+    sampled = {} if callable(problem.signals) else problem.signals
+    node = {"s": jnp.zeros(()), "inputs": {k: sampled[k](0.0) for k in sampled if k not in (variables.signals or {})}}
+    if callable(variables.signals):
+        node["inputs"] = {}
+    system, _, t, y_now, inputs = variables.at(node, jnp.concatenate([x, tail]))
+    return np.asarray(vector_field(system, t, y_now, inputs))
+
+
+def _values(problem: Problem, name: str, value: Any, s: np.ndarray, duration: float) -> np.ndarray:
+    label = f"solve: `guess` of {name!r}"
+    if callable(value):
+        found = np.array([real_number(value(t), label) for t in s * duration])
+    else:
+        array = np.asarray(value)
+        if array.dtype.kind not in "iuf" or array.ndim > 1 or array.size == 0:
+            raise ValueError(
+                f"{label} must be a number, an array (n,) of samples, or a function of time; got {value!r}."
+            )
+        found = np.interp(s, np.linspace(0, 1, array.size), array.ravel()) if array.size > 1 else np.full(len(s), array)
+    if not np.all(np.isfinite(found)):
+        raise ValueError(f"{label} contains values that are not finite.")
+    low, high = problem.limits.get(name, (-math.inf, math.inf))
+    slack = 1e-9 * max(abs(x) for x in (*found, 0.0, *(b for b in (low, high) if math.isfinite(b))))
+    for k, bounds in ((None, (low, high)), (0, problem.ends["start"].get(name)), (-1, problem.ends["end"].get(name))):
+        if bounds is None:
+            continue
+        a, b = bounds_of(label, bounds)
+        part = found if k is None else found[[k]]
+        wrong = (part < a - slack) | (part > b + slack)
+        if wrong.any():
+            where = (
+                f"{s[int(np.argmax(wrong))] * duration:.6g} s" if k is None else ("the start" if k == 0 else "the end")
+            )
+            raise ValueError(
+                f"{label} is {part[int(np.argmax(wrong))]:.6g} at {where}, but the problem requires "
+                f"{f'{a:g}' if a == b else f'{a:g} to {b:g}'}."
+            )
+    return found
+
+
+def _clipped(
+    problem: Problem, s: np.ndarray, Y: np.ndarray, W: np.ndarray, given: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """The guess within its bounds along the motion."""
+    limits = problem.limits
+    for rows, names in ((Y, problem.names), (W, tuple(problem.bounds_of_controls))):
+        for i, name in enumerate(names):
+            if name in limits and name not in given:
+                rows[:, i] = np.clip(rows[:, i], *limits[name])
+    return Y, W
+
+
+def _of_trajectory(problem: Problem, trajectory: Trajectory, s: np.ndarray) -> Motion:
+    """A simulation as a guess, stretched to the duration of the problem."""
+    t = np.asarray(trajectory.t)
+    if t.ndim != 1:
+        raise ValueError("solve: `guess` is a batch of trajectories. Pass one member of it.")
+    reached = np.isfinite(np.asarray(trajectory.q)).all(axis=1)
+    if reached.sum() < 2:
+        raise ValueError(f"solve: the trajectory in `guess` has fewer than two finite states: {trajectory.reason}.")
+    t = t[reached]
+    low, high = problem.durations
+    duration = min(max(float(t[-1] - t[0]), low), high)
+    at = t[0] + s * (t[-1] - t[0])
+
+    def sampled(names: Any) -> np.ndarray:
+        known = [np.asarray(trajectory[name])[reached] for name in names]
+        return np.array([np.interp(at, t, x) for x in known]).reshape(len(known), len(s)).T
+
+    Y, W = sampled(problem.names), sampled(tuple(problem.bounds_of_controls))
+    return Motion(s, duration, *_clipped(problem, s, Y, W, {}))

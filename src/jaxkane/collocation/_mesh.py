@@ -1,0 +1,162 @@
+"""Local errors of intervals, meshes that follow them, and polynomials between nodes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._collocate.lobatto import Lobatto
+from .._integrate.simulate import simulate
+from .._scalarjit.cache import Cache
+from .._scalarjit.cache_key import jit
+from .._scalarjit.components import Component
+from .._system.system import State, System, packed, unpacked, with_class
+from ._transcription import Layout, Motion
+
+
+class ControlPolynomial(eqx.Module):
+    """A control over time, as a function of (t, state): a polynomial in each interval of a mesh.
+
+    Attributes:
+
+    - `mesh` (N + 1,): the ends of the intervals [s].
+    - `coefficients` (N, s): of powers of the fraction of the interval, from the constant on.
+    """
+
+    mesh: Float[Array, " N_1"]
+    coefficients: Float[Array, "N s"]
+
+    def __call__(self, t: Component, state: Any = None) -> Array:
+        mesh = jnp.asarray(self.mesh)
+        at = jax.lax.stop_gradient(jnp.asarray(t, mesh.dtype))
+        i = jnp.clip(jnp.sum(mesh <= at, dtype=jnp.int32) - 1, 0, mesh.shape[0] - 2)
+        u = (t - mesh[i]) / (mesh[i + 1] - mesh[i])
+        value = jnp.zeros_like(u)
+        for k in range(self.coefficients.shape[1] - 1, -1, -1):
+            value = value * u + self.coefficients[i, k]
+        return value
+
+
+def coefficients_of(values: np.ndarray, method: Lobatto) -> np.ndarray:
+    """The coefficients (N, s, ...) of the polynomials through the values (K, ...) at the nodes of each interval."""
+    s = len(method.c)
+    N = (len(values) - 1) // (s - 1)
+    inside = values[(np.arange(N) * (s - 1))[:, None] + np.arange(s)]
+    powers = np.vander(method.c, s, increasing=True)
+    return np.moveaxis(np.tensordot(np.linalg.inv(powers), inside, axes=(1, 1)), 0, 1)
+
+
+def interpolated(motion: Motion, mesh: np.ndarray, method: Lobatto, s: np.ndarray) -> Motion:
+    """The polynomials of a motion at other nodes (n,)."""
+    i = np.clip(np.searchsorted(mesh, s, side="right") - 1, 0, len(mesh) - 2)
+    u = (s - mesh[i]) / (mesh[i + 1] - mesh[i])
+    powers = np.vander(u, len(method.c), increasing=True)
+
+    def at(values: np.ndarray) -> np.ndarray:
+        return np.einsum("nk,nki->ni", powers, coefficients_of(values, method)[i])
+
+    return Motion(s, motion.duration, at(motion.Y), at(motion.W))
+
+
+def local_errors(
+    layout: Layout, system: System, motion: Motion, method: Lobatto, scales: np.ndarray, tolerance: float
+) -> np.ndarray:
+    """The error (N,) of each interval at its end, relative to the sizes of the states.
+
+    Each interval is simulated from its own start with the polynomials of its controls. An interval whose simulation
+    fails has an infinite error.
+    """
+    mesh = float(layout.variables.origin) + layout.mesh * motion.duration
+    every, n_y = len(method.c) - 1, motion.Y.shape[1]
+    coefficients, starts = coefficients_of(motion.W, method), motion.Y[:-1:every]
+    times = np.stack([mesh[:-1], mesh[1:]], axis=1)
+    # The smallest state sets the absolute tolerance. Powers of ten, because each tolerance is a compiled program.
+    rtol = 10.0 ** math.floor(math.log10(max(1e-2 * tolerance, 1e-12)))
+    atol = 10.0 ** math.floor(math.log10(rtol * float(np.min(scales[:n_y]))))
+    reached = []
+    for i in range(0, len(times), _CHUNK):
+        place = np.minimum(np.arange(i, i + _CHUNK), len(times) - 1)
+        arguments = times[place], starts[place], coefficients[place]
+        reached.append(
+            _simulated(system, layout.problem.signals, layout.variables.controls, *arguments, rtol, atol)
+        )  # fmt: skip
+    ends = np.concatenate(reached)[: len(times)]
+    errors = np.max(np.abs(ends - motion.Y[every::every]) / scales[:n_y], axis=1)
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+_CHUNK = 64  # intervals that are simulated together, so that every mesh uses the same compiled program
+
+
+@jit
+def _simulated(
+    system: System,
+    signals: Any,
+    controls: Any,
+    times: Array,
+    starts: Array,
+    coefficients: Array,
+    rtol: float,
+    atol: float,
+) -> Array:
+    def one(ts: Array, y: Array, C: Array) -> Array:
+        polynomials = {name: ControlPolynomial(ts, C[None, :, i]) for i, name in enumerate(controls)}
+        inputs = with_controls(signals, polynomials)
+        return packed_end(system, y, ts, inputs, rtol, atol)
+
+    return jax.vmap(one)(times, starts, coefficients)
+
+
+def packed_end(system: System, y: Array, ts: Array, inputs: Any, rtol: float, atol: float) -> Array:
+    state = unpacked(without_events(system), y)
+    ride = simulate(without_events(system), state, ts, inputs, rtol=rtol, atol=atol, max_steps=4096)
+    return packed(State(ride.q[-1], ride.u[-1], ride.x[-1] if system.states else None))
+
+
+def without_events(system: System) -> System:
+    """The system without its events: a planned motion ends where the problem states it."""
+    own = type(system)
+    if own.events is System.events:
+        return system
+    return with_class(system, _EVENTLESS.get(own, lambda: _eventless(own)))
+
+
+_EVENTLESS = Cache()  # a class for each class, so that compiled programs are used again
+
+
+def _eventless(own: Any) -> Any:
+    changed = type(own)(own.__name__, (own,), {"events": System.events})
+    changed.__qualname__ = own.__qualname__
+    return changed
+
+
+def with_controls(signals: Any, polynomials: dict[str, Any]) -> Any:
+    """Other inputs together with controls, as `simulate` takes them."""
+    if not callable(signals):
+        return {**signals, **polynomials}
+
+    def every(t: Any, state: Any) -> dict[str, Any]:
+        return {**signals(t, state), **{name: f(t, state) for name, f in polynomials.items()}}
+
+    return every
+
+
+def refined(mesh: np.ndarray, errors: np.ndarray, tolerance: float, order: int) -> np.ndarray:
+    """A mesh whose intervals have about the same error, below the tolerance.
+
+    An interval of error e counts as (2 e / tolerance)^(1 / order) intervals of the new mesh, from a half to sixteen.
+    """
+    with np.errstate(over="ignore"):
+        parts = np.clip((2.0 * errors / tolerance) ** (1.0 / order), 0.5, 16.0)
+    parts = np.where(errors > tolerance, np.ceil(parts), np.minimum(parts, 1.0))
+    cumulative = np.concatenate([[0.0], np.cumsum(parts)])
+    N = math.ceil(cumulative[-1] - 1e-9)
+    new = np.interp(np.linspace(0.0, cumulative[-1], N + 1), cumulative, mesh)
+    new[0], new[-1] = mesh[0], mesh[-1]
+    return new

@@ -1,0 +1,350 @@
+"""The result of `solve`: a planned motion, how it was found, and its simulation."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jaxtyping import Array, Float
+
+from .._collocate.lobatto import Lobatto
+from .._integrate.simulate import simulate
+from .._integrate.status import Status
+from .._integrate.trajectory import Trajectory
+from .._kane.api import _dependent_speeds
+from .._kane.constraint_residuals import configuration_residual
+from .._kane.right_hand_side import outputs_at, values_of, vector_field
+from .._scalarjit.cache_key import jit
+from .._system.prints import wrapped
+from .._system.system import State, System, has_outputs, names_of, units_of, unpacked
+from ._mesh import ControlPolynomial, coefficients_of, interpolated, with_controls, without_events
+from ._problem import Problem
+from ._transcription import Motion
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """A planned motion: `plan["roll"]` is any coordinate, speed, state, input or output at the nodes.
+
+    A plan can be passed to `jaxkane.animate`, to the functions of `jaxkane.plot`, to `jaxkane.positions` and the like,
+    and as the `guess` of another problem.
+
+    Attributes:
+
+    - `problem`: the problem that was solved.
+    - `ok`: whether the solver found a local minimum and the local errors are below the tolerance.
+    - `reason`: the result in words.
+    - `cost`: the cost. `duration`: [s].
+    - `estimates`: the values of the free parameters by name. `system`: the system with these values.
+    - `trajectory`: the `Trajectory` at the nodes.
+    - `mesh` (N + 1,): the ends of the intervals [s].
+    - `errors` (N,): the local error of each interval, relative to the size of each state; None if it was not computed.
+    - `multipliers`: derivatives of the least cost by name; see `Multipliers`.
+    - `costs`: the cost on each mesh. `iterations`: the iterations of the solver, on all meshes.
+    - `violation`, `dual_residual`: the largest scaled violation of constraints, and of the conditions of a minimum.
+    - `unmet`: the constraints that are violated by more than the tolerance, by name, with the scaled violation.
+    - `active`: the names of bounds and inequality constraints that are active somewhere.
+    - `starts`: for several guesses, the cost and the result of each.
+    - `phases`: the plans of all phases; empty for a single problem.
+    """
+
+    problem: Problem
+    ok: bool
+    reason: str
+    cost: float
+    duration: float
+    estimates: dict[str, float]
+    system: System
+    trajectory: Trajectory
+    mesh: np.ndarray
+    errors: np.ndarray | None
+    multipliers: Multipliers
+    costs: tuple[float, ...]
+    iterations: int
+    violation: float
+    dual_residual: float
+    unmet: dict[str, float]
+    active: tuple[str, ...]
+    starts: tuple[tuple[float, str], ...] = ()
+    phases: tuple[Plan, ...] = ()
+    motion: Motion = dataclasses.field(repr=False, kw_only=True)
+    method: Lobatto = dataclasses.field(repr=False, kw_only=True)
+    scales: np.ndarray = dataclasses.field(repr=False, kw_only=True)
+
+    def __getitem__(self, name: str) -> Float[Array, " K"]:
+        return self.trajectory[name]
+
+    @property
+    def t(self) -> Float[Array, " K"]:
+        """Times (K,) of the nodes [s]."""
+        return self.trajectory.t
+
+    @property
+    def q(self) -> Float[Array, "K n_q"]:
+        """Coordinates (K, n_q) at the nodes."""
+        return self.trajectory.q
+
+    @property
+    def u(self) -> Float[Array, "K n_u"]:
+        """Independent speeds (K, n_u) at the nodes."""
+        return self.trajectory.u
+
+    @property
+    def x(self) -> Float[Array, "K n_x"]:
+        """First-order states (K, n_x) at the nodes."""
+        return self.trajectory.x
+
+    def state(self, i: int = -1) -> State:
+        """The state at the i-th node."""
+        return self.trajectory.state(i)
+
+    @property
+    def inputs(self) -> Any:
+        """The inputs as functions of (t, state), for `simulate`: `simulate(plan.system, plan.state(0), ts, plan.inputs)`.
+
+        Between the nodes, a control is a polynomial.
+        """
+        self._refuse_phases("inputs")
+        C = coefficients_of(self.motion.W, self.method)
+        controls = self.problem.bounds_of_controls
+        mesh = jnp.asarray(self.mesh)
+        polynomials = {name: ControlPolynomial(mesh, jnp.asarray(C[:, :, i])) for i, name in enumerate(controls)}
+        return with_controls(self.problem.signals, polynomials)
+
+    def at(self, ts: Any) -> dict[str, np.ndarray]:
+        """States and controls by name at other times, by the polynomials of the method.
+
+        **Arguments:**
+
+        - `ts` (n,): times from 0 to the duration [s].
+        """
+        self._refuse_phases("at")
+        s = np.asarray(ts, float) / self.duration
+        if s.ndim != 1 or not np.all((s >= -1e-12) & (s <= 1 + 1e-12)):
+            raise ValueError(f"Plan.at: `ts` must be an array (n,) of times from 0 to {self.duration:.6g} s.")
+        found = interpolated(self.motion, self.mesh / self.duration, self.method, np.clip(s, 0.0, 1.0))
+        names = (*self.problem.names, *self.problem.bounds_of_controls)
+        return dict(zip(names, np.concatenate([found.Y, found.W], axis=1).T, strict=True))
+
+    def replay(self, ts: Any = None, *, feedback: bool = False, rtol: float = 1e-8, atol: float = 1e-8) -> Trajectory:
+        """Simulate the whole plan from its first state with its inputs.
+
+        An unstable motion leaves the plan, because rounding errors grow. With `feedback`, a linear-quadratic regulator
+        along the plan corrects the controls.
+
+        **Arguments:**
+
+        - `ts` (n,): increasing times [s] from 0 on; by default the nodes.
+        - `feedback`: whether to stabilize the motion.
+        - `rtol`, `atol`: tolerances of the simulation.
+
+        **Returns:** a `Trajectory`. Its inputs contain the corrections of the feedback.
+        """
+        self._refuse_phases("replay")
+        ts = self.t if ts is None else ts
+        inputs = self._with_feedback() if feedback else self.inputs
+        system = without_events(self.system)
+        return simulate(
+            system, self.state(0), ts, inputs, rtol=rtol, atol=atol, discontinuities=self.mesh[1:-1], max_steps=100_000
+        )
+
+    def _with_feedback(self) -> Any:
+        regulator = Regulator(
+            jnp.asarray(self.mesh),
+            jnp.asarray(coefficients_of(self.motion.Y, self.method)),
+            jnp.asarray(coefficients_of(self.motion.W, self.method)),
+            jnp.asarray(_gains(self)),
+            self.problem.signals,
+            tuple(self.problem.bounds_of_controls),
+        )
+        return regulator
+
+    def deviation(self, ride: Trajectory) -> float:
+        """The largest deviation of a simulation from the plan, relative to the size of each state.
+
+        They are compared at the ends of intervals. Inside an interval the polynomials are less accurate.
+        """
+        Y = np.asarray(jnp.concatenate([ride.q, ride.u, ride.x], axis=1))
+        every = len(self.method.c) - 1
+        return float(np.max(np.abs(Y - self.motion.Y)[::every] / self.scales[: Y.shape[1]]))
+
+    def _refuse_phases(self, what: str) -> None:
+        if self.phases:
+            raise ValueError(f"Plan.{what}: the plan has {len(self.phases)} phases. Use plan.phases[0].{what}, ...")
+
+    def report(self) -> str:
+        """A report in words: the solution, its accuracy, active bounds, and its simulation."""
+        if self.phases:
+            parts = [f"phase {i}\n{plan.report()}" for i, plan in enumerate(self.phases)]
+            return "\n\n".join([repr(self), *parts])
+        lines = [repr(self)]
+        lines.append(f"violation {self.violation:.1e}, conditions of a minimum {self.dual_residual:.1e} (both scaled)")
+        if self.unmet:
+            worst = sorted(self.unmet.items(), key=lambda item: -item[1])[:8]
+            lines.append("not met: " + ", ".join(f"{name} (by {x:.1e})" for name, x in worst))
+        lines.append("active: " + (", ".join(self.active) or "no bounds"))
+        if len(self.costs) > 1:
+            lines.append(f"cost on the last two meshes: {self.costs[-2]:.10g}, {self.costs[-1]:.10g}")
+        if self.errors is not None:
+            lines.append(f"largest local error {np.max(self.errors):.1e} of the size of a state")
+        if self.problem.n_constraints:
+            h = np.asarray(_drift(self.system, self.trajectory.t, self.trajectory.q))
+            lines.append(f"configuration constraints: largest residual {np.max(np.abs(h)):.1e}")
+        lines.append(self._words_of_replay())
+        if self.starts:
+            lines.append("guesses: " + ", ".join(f"{cost:.8g} ({words})" for cost, words in self.starts))
+        return "\n".join(lines)
+
+    def _words_of_replay(self) -> str:
+        ride = self.replay()
+        off = self.deviation(ride) if ride.ok else np.inf
+        if off < 1e-3:
+            return f"simulated over the whole duration, it deviates by {off:.1e} of the size of a state"
+        ride = self.replay(feedback=True)
+        stabilized = self.deviation(ride) if ride.ok else np.inf
+        return (
+            f"simulated over the whole duration, it deviates by {off:.1e} of the size of a state: the motion is unstable "
+            f"or the mesh is coarse. With a stabilizing feedback it deviates by {stabilized:.1e}"
+        )
+
+    def __repr__(self) -> str:
+        result = f"cost {self.cost:.8g}, {self.duration:.6g} s" if np.isfinite(self.cost) else f"{self.duration:.6g} s"
+        text = f"Plan({type(self.system).__name__}: {self.reason}; {result}, {len(self.mesh) - 1} intervals, "
+        text += f"{self.iterations} iterations)"
+        if self.estimates:
+            units = units_of(self.system)
+            values = (f"{k} = {v:.6g} {units.get(k, '')}".strip() for k, v in self.estimates.items())
+            text = f"{text}\n{wrapped(', '.join(values))}"
+        return text
+
+
+class Multipliers(Mapping[str, Any]):
+    """Derivatives of the least cost, by the names of states, controls, conditions and path constraints.
+
+    - `multipliers["roll"]` (K,): by a shift of the bound of a state or control that is active at a node; 0 elsewhere.
+        At a fixed start, this is the derivative by the initial value.
+    - `multipliers["condition"]`: by a shift of the value of a condition, (K,) for a path constraint.
+    - `costate["roll"]` (N,): by a sudden change of a state within an interval.
+    """
+
+    def __init__(self, values: Mapping[str, Any], costate: Mapping[str, np.ndarray]):
+        self._values, self.costate = dict(values), dict(costate)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._values[name]
+
+    def __iter__(self) -> Any:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        return f"Multipliers({', '.join(self._values)})"
+
+
+class Regulator(eqx.Module):
+    """The controls of a plan, with feedback: w = w*(t) - K(t) (y - y*(t))."""
+
+    mesh: Float[Array, " N_1"]
+    Y: Float[Array, "N s n_y"]
+    W: Float[Array, "N s n_w"]
+    gains: Float[Array, "N n_w n_y"]
+    signals: Any
+    controls: tuple[str, ...] = eqx.field(static=True)
+
+    def __call__(self, t: Any, state: Any) -> dict[str, Any]:
+        at = jax.lax.stop_gradient(t)
+        i = jnp.clip(jnp.sum(self.mesh <= at, dtype=jnp.int32) - 1, 0, self.mesh.shape[0] - 2)
+        u = (t - self.mesh[i]) / (self.mesh[i + 1] - self.mesh[i])
+        powers = u ** jnp.arange(self.Y.shape[1])
+        x = () if state.x is None else (jnp.asarray(state.x),)
+        y = jnp.concatenate([jnp.asarray(state.q), jnp.asarray(state.u), *x])
+        w = powers @ self.W[i] - self.gains[i] @ (y - powers @ self.Y[i])
+        others = self.signals if isinstance(self.signals, dict) else self.signals(t, state)
+        others = {k: f(t, state) if callable(f) else f for k, f in others.items()}
+        return {**others, **{name: w[k] for k, name in enumerate(self.controls)}}
+
+
+def _gains(plan: Plan) -> np.ndarray:
+    """Gains (N, n_w, n_y) of the linear-quadratic regulator of the plan, by the Riccati recursion over its intervals.
+
+    A deviation costs as much as a control if both are as large as their sizes.
+    """
+    every = len(plan.method.c) - 1
+    mesh, Y, W = plan.mesh, plan.motion.Y[::every], plan.motion.W[::every]
+    A, B = (np.asarray(x) for x in _linear(plan.system, plan.problem.signals, tuple(plan.problem.bounds_of_controls),
+                                           jnp.asarray(mesh), Y, W))  # fmt: skip
+    n_y, n_w = Y.shape[1], W.shape[1]
+    Q, R = np.diag(plan.scales[:n_y] ** -2.0), np.diag(plan.scales[n_y:] ** -2.0)
+    P, gains = Q, np.zeros((len(mesh) - 1, n_w, n_y))
+    for i in range(len(mesh) - 2, -1, -1):
+        h = mesh[i + 1] - mesh[i]
+        block = np.zeros((n_y + n_w, n_y + n_w))
+        block[:n_y] = h * np.concatenate([A[i], B[i]], axis=1)
+        both = scipy.linalg.expm(block)[:n_y]
+        F, G = both[:, :n_y], both[:, n_y:]
+        gains[i] = np.linalg.solve(h * R + G.T @ P @ G, G.T @ P @ F)
+        P = h * Q + F.T @ P @ (F - G @ gains[i])
+        P = 0.5 * (P + P.T)
+    return gains
+
+
+@jit
+def _linear(system: System, signals: Any, controls: tuple[str, ...], ts: Array, Y: Array, W: Array) -> Any:
+    """d y_dot / d y and d y_dot / d w along a plan."""
+
+    def rates(y: Array, w: Array, t: Array) -> Array:
+        given = inputs_with(system, signals, controls, t, y, w)
+        return vector_field(system, t, y, given)
+
+    return jax.vmap(jax.jacfwd(rates, argnums=(0, 1)))(Y, W, ts)
+
+
+def inputs_with(system: System, signals: Any, controls: Sequence[str], t: Array, y: Array, w: Array) -> dict[str, Any]:
+    from .._integrate.inputs import inputs_at
+
+    given = inputs_at(system, signals, t, unpacked(system, y)) | {name: w[i] for i, name in enumerate(controls)}
+    return given | {name: jnp.zeros_like(t) for name in system.inputs if name not in given}
+
+
+@jit
+def _drift(system: System, t: Array, q: Array) -> Array:
+    return jax.vmap(lambda t, q: configuration_residual(system, t, q))(t, q)
+
+
+def trajectory_of(system: System, problem: Problem, motion: Motion, origin: float = 0.0) -> Trajectory:
+    """A motion as a `Trajectory` at its nodes."""
+    t = origin + motion.s * motion.duration
+    q, u, x, u_dep, inputs, outputs = _along(
+        system, problem.signals, tuple(problem.bounds_of_controls), jnp.asarray(t), motion.Y, motion.W
+    )
+    count = jnp.asarray(0)
+    end = State(q[-1], u[-1], x[-1] if system.states else None)
+    return Trajectory(
+        t=jnp.asarray(t), q=q, u=u, u_dep=u_dep, x=x, inputs=inputs, outputs=outputs,
+        status=jnp.asarray(int(Status.COMPLETED)), t_end=jnp.asarray(t[-1]),
+        stats={"steps": count, "accepted": count, "rejected": count}, names=names_of(system), events=(),
+        adjoint="none", units=tuple(units_of(system).items()), end=end,
+    )  # fmt: skip
+
+
+@jit
+def _along(system: System, signals: Any, controls: tuple[str, ...], ts: Array, Y: Array, W: Array) -> Any:
+    def at(t: Array, y: Array, w: Array) -> Any:
+        state = unpacked(system, y)
+        inputs = inputs_with(system, signals, controls, t, y, w)
+        u_dep = _dependent_speeds(system, t, state.q, state.u, {}) if system.dependent_speeds else jnp.zeros(0)
+        outputs = {}
+        if has_outputs(system):
+            outputs = outputs_at(system, t, state.q, state.u, values_of(system, state.x, inputs))
+        x = jnp.zeros(0) if state.x is None else state.x
+        return state.q, state.u, x, u_dep, inputs, outputs
+
+    return jax.vmap(at)(ts, Y, W)

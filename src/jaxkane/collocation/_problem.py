@@ -1,0 +1,353 @@
+"""Optimal control problems: what is given, what is free, what is minimized."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._common.lookup import as_names, real_number, refuse_unknown
+from .._integrate.inputs import as_signals, is_samples
+from .._kane.arguments import check_is_system, is_concrete, refuse_multipliers
+from .._kane.checks import check_system
+from .._kane.constraint_residuals import check_state, configuration_residual
+from .._kane.contact import has_contacts
+from .._kane.right_hand_side import output_names
+from .._system.parameters import in_batches
+from .._system.system import State, System, names_of
+from ..fit.problem.from_declarations import parameters_of
+from ..fit.problem.parameters import Parameters
+from ._functions import Now, named
+
+Bound = tuple[float, float]
+Condition = float | tuple[float | None, float | None]
+Values = Mapping[str, Condition] | State
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """Find the controls, and if wanted the duration and parameters, for which a motion has the least cost.
+
+        problem = jk.collocation.Problem(
+            bicycle, 3.0,
+            controls={"steer_torque": (-10.0, 10.0)},
+            cost=lambda t, now: now["steer_torque"] ** 2,
+            start=jk.assemble(bicycle, {}, {"rear_wheel_rate": -20.0}),
+            end={"y": 1.5, "roll": 0.0, "steer": 0.0, "yaw": 0.0, "roll_rate": 0.0, "steer_rate": 0.0},
+        )
+        plan = jk.collocation.solve(problem)
+
+    The time starts at 0. In costs and constraints, `now["roll"]` is any coordinate, speed, dependent speed, first-order
+    state, input or output, and `now.system` the system with the current parameters (see `Now`).
+
+    **Arguments:**
+
+    - `system`: a `System` without contacts.
+    - `duration`: the duration [s], or (least, greatest) if it is free.
+    - `controls`: the free inputs: a dict from names to (lower, upper) or None, or a sequence of names. A bound may be
+        None.
+    - `cost`: a function (t, now) -> number, whose integral over time is minimized.
+    - `final_cost`: a function (t, now) -> number at the end, which is added. For the shortest time, pass
+        `lambda t, now: t`.
+    - `start`, `end`: by name a number or (lower, upper), or a `State`. Names that are left out are free. Names of
+        dependent speeds and outputs are possible. An `end` that is a `State` leaves the dependent coordinates free,
+        because the configuration constraints determine them.
+    - `conditions`: a function (first, last, duration) -> dict by name of numbers that must be zero, or of
+        (number, lower, upper). An example is {"periodic": last["roll"] - first["roll"]}.
+    - `within`: by name (lower, upper), along the whole motion.
+    - `path`: a function (t, now) -> dict by name of numbers that must not be negative, or of (number, lower, upper),
+        along the whole motion.
+    - `free`: parameters of the system to optimize: names, `jk.fit.Free` or `jk.fit.Inertia`, as in `jk.fit.fit`.
+    - `inputs`: the other inputs, as in `simulate`: numbers, `Samples`, functions of (t, state). They must be
+        continuous.
+
+    **Raises:** `ValueError` and `TypeError` that name the argument.
+    """
+
+    system: System
+    duration: float | tuple[float, float]
+    _: dataclasses.KW_ONLY
+    controls: Mapping[str, tuple[float | None, float | None] | None] | Sequence[str]
+    cost: Callable[[Any, Now], Any] | None = None
+    final_cost: Callable[[Any, Now], Any] | None = None
+    start: Values | None = None
+    end: Values | None = None
+    conditions: Callable[[Now, Now, Any], Any] | None = None
+    within: Mapping[str, tuple[float | None, float | None]] | None = None
+    path: Callable[[Any, Now], Any] | None = None
+    free: Any = ()
+    inputs: Any = None
+
+    def __post_init__(self) -> None:
+        system = self.system
+        check_is_system(system)
+        self._check_system()
+        for name in ("cost", "final_cost", "conditions", "path"):
+            f = getattr(self, name)
+            if f is not None and not callable(f):
+                raise TypeError(f"Problem: `{name}` must be a function, got {f!r}.")
+        shortest, longest = self.durations
+        if not (0 <= shortest <= longest < math.inf and longest > 0):
+            raise ValueError(
+                f"Problem: `duration` must be a positive number of seconds, or (least, greatest) with "
+                f"0 <= least < greatest; got {self.duration!r}."
+            )
+        refuse_unknown(self.bounds_of_controls, system.inputs, f"Problem: {self.title} has no input", "it has")
+        if not callable(self.inputs):
+            both = [name for name in self.inputs or {} if name in self.bounds_of_controls]
+            if both:
+                raise ValueError(f"Problem: {both[0]!r} is in `controls` and in `inputs`. Omit it in one of them.")
+        self._check_names()
+        self.signals  # noqa: B018  raises an exception for wrong inputs
+        self.parameters  # noqa: B018  the same for parameters
+
+    @property
+    def title(self) -> str:
+        """The name of the system, for messages."""
+        return type(self.system).__name__
+
+    def _check_system(self) -> None:
+        if has_contacts(self.system):
+            raise ValueError(
+                f"Problem: {self.title} has contacts, which change their state at unknown times. Describe the motion "
+                "between two changes by a system without contacts, and link such phases (`Phases`)."
+            )
+        refuse_multipliers(self.system)
+        if in_batches(self.system):
+            raise ValueError(f"Problem: {self.title} is a batch. Pass one member of it.")
+        if not is_concrete(self.system):
+            raise TypeError(f"Problem: {self.title} is traced. Call this outside of jax.jit, vmap and grad.")
+        if jnp.result_type(float) != jnp.float64 or any(
+            x.dtype == jnp.float32 for x in jax.tree.leaves(self.system) if hasattr(x, "dtype")
+        ):
+            raise ValueError(
+                "Problem: collocation needs float64. Call jaxkane.configure() first, and create the system after it."
+            )
+        check_system(self.system, 0.0, None)
+
+    def _check_names(self) -> None:
+        known = [*self.names, *self.system.dependent_speeds, *self.bounds_of_controls, *output_names(self.system)]
+        for label in ("start", "end", "within"):
+            given = getattr(self, label)
+            if given is None or isinstance(given, State):
+                continue
+            if not isinstance(given, Mapping):
+                raise TypeError(f"Problem: `{label}` must be a dict by name, got {given!r}.")
+            refuse_unknown(given, known, f"Problem: `{label}`: {self.title} has no", "it has")
+            for name, value in given.items():
+                low, high = bounds_of(f"`{label}` of {name!r}", value)
+                outer = self.limits.get(name, (-math.inf, math.inf))
+                if low > outer[1] or high < outer[0]:
+                    raise ValueError(
+                        f"Problem: `{label}` of {name!r} is {value!r}, but its bounds along the motion are {outer}."
+                    )
+        self._check_start()
+
+    def _check_start(self) -> None:
+        """The configuration constraints determine the dependent coordinates at the start, and thereby at the end."""
+        n_q, n_h = len(self.system.coordinates), self.n_constraints
+        if isinstance(self.start, State):
+            check_state(self.system, 0.0, jnp.asarray(self.start.q))
+        for label in ("start", "end"):
+            values = self.ends[label]
+            fixed = [name for name in self.system.coordinates if name in values and _is_number(values[name])]
+            if label == "start" and len(fixed) == n_q and n_h:
+                if not isinstance(self.start, State):
+                    check_state(self.system, 0.0, jnp.array([float(values[c]) for c in self.system.coordinates]))
+            elif n_h and len(fixed) > n_q - n_h:
+                raise ValueError(
+                    f"Problem: `{label}` sets {', '.join(fixed)}, but only {n_q - n_h} coordinates are independent. "
+                    f"Leave out {', '.join(self.system.dependent_coordinates) or 'a dependent one'}: the configuration "
+                    "constraints determine the rest."
+                )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Coordinates, independent speeds and first-order states: the variables of a node, before the controls."""
+        coordinates, speeds, _, states = names_of(self.system)
+        return (*coordinates, *speeds, *states)
+
+    @property
+    def durations(self) -> Bound:
+        """The least and the greatest duration [s]."""
+        given = self.duration
+        if isinstance(given, (tuple, list)):
+            if len(given) != 2:
+                raise ValueError(f"Problem: `duration` must be a number or (least, greatest), got {given!r}.")
+            low, high = (real_number(x, "Problem: `duration`") for x in given)
+            return low, high
+        number = real_number(given, "Problem: `duration`")
+        return number, number
+
+    @property
+    def has_free_duration(self) -> bool:
+        return self.durations[0] < self.durations[1]
+
+    @property
+    def bounds_of_controls(self) -> dict[str, Bound]:
+        """Lower and upper bound of each control by name."""
+        given = self.controls
+        if isinstance(given, Mapping):
+            return {name: bounds_of(f"`controls` of {name!r}", b or (None, None)) for name, b in given.items()}
+        return {name: (-math.inf, math.inf) for name in as_names(given)}
+
+    @property
+    def limits(self) -> dict[str, Bound]:
+        """Bounds along the motion by name, of controls and of `within`."""
+        limits = self.bounds_of_controls
+        for name, value in (self.within or {}).items():
+            low, high = bounds_of(f"`within` of {name!r}", value)
+            first = limits.get(name, (-math.inf, math.inf))
+            limits[name] = max(low, first[0]), min(high, first[1])
+            if limits[name][0] > limits[name][1]:
+                raise ValueError(f"Problem: `within` and `controls` of {name!r} exclude each other.")
+        return limits
+
+    @property
+    def ends(self) -> dict[str, dict[str, Condition]]:
+        """`start` and `end` by name."""
+        found: dict[str, dict[str, Condition]] = {}
+        for label in ("start", "end"):
+            given = getattr(self, label)
+            if isinstance(given, State):
+                given = self._by_name(given, label)
+            found[label] = dict(given or {})
+        return found
+
+    def _by_name(self, state: State, label: str) -> dict[str, Condition]:
+        rows = zip(names_of(self.system)[:2] + names_of(self.system)[3:], (state.q, state.u, state.x), strict=True)
+        values: dict[str, Condition] = {}
+        for names, row in rows:
+            numbers = np.zeros(0) if row is None else np.asarray(row, float)
+            if numbers.shape != (len(names),):
+                raise ValueError(
+                    f"Problem: `{label}` is a State with {numbers.shape} numbers for {', '.join(names) or 'no states'}."
+                )
+            values |= dict(zip(names, numbers.tolist(), strict=True))
+        if label == "end" and self.n_constraints:
+            values = {k: v for k, v in values.items() if k not in self.system.dependent_coordinates}
+        return values
+
+    @property
+    def n_constraints(self) -> int:
+        """The number of residuals of the configuration constraints."""
+        q = jax.ShapeDtypeStruct((len(self.system.coordinates),), jnp.float64)
+        return jax.eval_shape(lambda q: configuration_residual(self.system, jnp.zeros(()), q), q).shape[0]
+
+    @property
+    def signals(self) -> Any:
+        """The inputs that are not controls, as `inputs_at` reads them."""
+        signals = as_signals(self.inputs, self.system.inputs, np.zeros(2), self.title)
+        for name, signal in {} if callable(signals) else signals.items():
+            if is_samples(signal) and signal.zero_order_hold:
+                raise ValueError(
+                    f"Problem: the input {name!r} is a zero-order hold, but collocation needs continuous inputs. Pass "
+                    "jaxkane.Samples(times, values) without zero_order_hold."
+                )
+        return signals
+
+    @property
+    def parameters(self) -> Parameters | None:
+        """The free parameters, or None."""
+        free = (self.free,) if isinstance(self.free, str) else self.free
+        if isinstance(free, (tuple, list)) and not free:
+            return None
+        return parameters_of(self.system, free)
+
+
+@dataclasses.dataclass(frozen=True)
+class Phases:
+    """Problems that are solved together, one after another in time.
+
+        swing = jk.collocation.Problem(walker, (0.3, 1.5), controls=..., cost=...)
+        gait = jk.collocation.Phases([swing], links=["heel_strike"])
+
+    With one link fewer than phases, the last phase ends freely. With as many links as phases, the last link leads from
+    the end of the last phase to the start of the first one, so the motion is periodic.
+
+    **Arguments:**
+
+    - `phases`: the problems. Their systems need the same coordinates, speeds and states, unless the links are
+        functions. All have the same `free`.
+    - `links`: for each pair of phases: None for a continuous state; the name of an event of the first system, whose
+        function must be zero at the end, and whose jump (`then`) gives the next state; or a function (last, first) ->
+        dict by name of numbers that must be zero.
+
+    **Raises:** `ValueError` and `TypeError` that name the phase or the link.
+    """
+
+    phases: Sequence[Problem]
+    links: Sequence[Any] = ()
+
+    def __post_init__(self) -> None:
+        phases, links = tuple(self.phases), tuple(self.links)
+        object.__setattr__(self, "phases", phases)
+        object.__setattr__(self, "links", links)
+        if not phases or not all(isinstance(phase, Problem) for phase in phases):
+            raise TypeError(f"Phases: `phases` must be a sequence of Problem, got {self.phases!r}.")
+        if len(links) not in (len(phases) - 1, len(phases)):
+            raise ValueError(
+                f"Phases: {len(phases)} phases need {len(phases) - 1} links, or {len(phases)} for a periodic motion; "
+                f"got {len(links)}."
+            )
+        for i, link in enumerate(links):
+            one, other = phases[i], phases[(i + 1) % len(phases)]
+            if not callable(link) and one.names != other.names:
+                raise ValueError(f"Phases: link {i}: the states have other names. Pass a function (last, first).")
+            if isinstance(link, str):
+                refuse_unknown([link], events_with_jumps(one.system), f"Phases: {one.title} has no jump", "it has")
+        names = [() if p.parameters is None else p.parameters.names for p in phases]
+        if len(set(names)) > 1:
+            raise ValueError("Phases: all phases need the same `free`, because they share their parameters.")
+
+
+def events_with_jumps(system: System) -> tuple[str, ...]:
+    from .._integrate.jumps import names_of_jumps
+
+    return names_of_jumps(system)
+
+
+def bounds_of(label: str, value: Any) -> Bound:
+    """Lower and upper bound, equal for a number.
+
+    **Raises:** `ValueError` if the lower bound is greater than the upper one, or not a number.
+    """
+    if isinstance(value, (tuple, list)):
+        if len(value) != 2:
+            raise ValueError(f"Problem: {label} must be a number or (lower, upper), got {value!r}.")
+        low, high = (
+            infinite if x is None else real_number(x, f"Problem: {label}")
+            for x, infinite in zip(value, (-math.inf, math.inf), strict=True)
+        )
+    else:
+        low = high = real_number(value, f"Problem: {label}")
+        if not math.isfinite(low):
+            raise ValueError(f"Problem: {label} is {value!r}. Pass a finite number, or leave the name out.")
+    if not low <= high:
+        raise ValueError(f"Problem: {label} is {value!r}: the lower bound is greater than the upper one, or is NaN.")
+    return low, high
+
+
+def _is_number(value: Any) -> bool:
+    return not isinstance(value, (tuple, list))
+
+
+def constraints_of(label: str, values: Any, is_equality: bool) -> dict[str, Bound]:
+    """The bounds of constraints by name, from what the user's function returned.
+
+    **Raises:** `ValueError` or `TypeError` for bounds that are not concrete numbers.
+    """
+    found = {}
+    for name, item in named(label, values).items():
+        if not isinstance(item, tuple):
+            found[name] = (0.0, 0.0 if is_equality else math.inf)
+            continue
+        if len(item) != 3:
+            raise ValueError(f"`{label}`: {name!r} must be a number or (number, lower, upper), got {item!r}.")
+        found[name] = bounds_of(f"`{label}`: the bounds of {name!r}", item[1:])
+    return found

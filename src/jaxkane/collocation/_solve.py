@@ -1,0 +1,413 @@
+"""`solve`: from a problem to a plan, with mesh refinement."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._collocate.lobatto import Lobatto, lobatto
+from .._collocate.program import NonlinearProgram
+from .._collocate.solvers import INTERRUPTED, Monitor, Solution, Solver, default_solver
+from .._common.lookup import positive_number
+from .._integrate.trajectory import Trajectory
+from ._guess import detours, guess_of
+from ._mesh import interpolated, local_errors, refined
+from ._plan import Multipliers, Plan, trajectory_of
+from ._problem import Phases, Problem
+from ._transcription import Motion, Transcription, nodes_of, system_at
+
+MAX_MESHES = 10
+
+
+def solve(
+    problem: Problem | Phases,
+    guess: Any = None,
+    *,
+    intervals: int = 50,
+    method: str = "hermite-simpson",
+    tolerance: float | None = 1e-6,
+    solver: Solver | None = None,
+    options: Mapping[str, Any] | None = None,
+    starts: int = 1,
+    seed: int = 0,
+    max_iterations: int = 500,
+    max_intervals: int = 2000,
+    progress: bool = False,
+) -> Plan:
+    """Find a motion of least cost by direct collocation.
+
+    The states are polynomials in each interval of a mesh, and satisfy the equations of motion at the collocation points
+    of a Lobatto IIIA method. The solver uses exact sparse first and second derivatives. Then each interval is simulated
+    from its own start. Intervals whose error is too large are divided, and the solution continues on the new mesh.
+
+    **Arguments:**
+
+    - `problem`: a `Problem`, or `Phases`.
+    - `guess`: None for straight lines between the values at both ends; a `Plan`; a `Trajectory`; or by name numbers,
+        arrays (n,) of samples at even distances, or functions of time, with the key "duration". A sequence of these is
+        tried one by one, and the best solution is returned. For `Phases`, a sequence has one guess for each phase.
+    - `intervals`: the number of intervals of the first mesh.
+    - `method`: "trapezoid" (order 2), "hermite-simpson" (order 4) or "lobatto" (order 6).
+    - `tolerance`: the largest local error of an interval, relative to the size of each state. None keeps the mesh.
+    - `solver`: a `Solver`; by default `Ipopt` if CasADi is installed, else `Cyipopt`, else `TrustConstr`.
+    - `options`: options of the solver by its own names.
+    - `starts`: the number of guesses: random deviations from `guess` are added to the coordinates.
+    - `seed`: the seed of these deviations.
+    - `max_iterations`: the largest number of iterations on a mesh.
+    - `max_intervals`: the largest number of intervals of a phase.
+    - `progress`: show the cost and the violation of each iteration.
+
+    **Returns:** a `Plan`. If no solution is found, `plan.ok` is False and `plan.reason` states why; the plan contains
+    the last or best iterate.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that make no sense, and if a function is not finite at the
+    guess.
+    """
+    phases = problem if isinstance(problem, Phases) else Phases([problem]) if isinstance(problem, Problem) else None
+    if phases is None:
+        raise TypeError(f"solve: the first argument must be a Problem or Phases, got {problem!r}.")
+    if isinstance(intervals, bool) or not isinstance(intervals, int) or not 1 <= intervals <= max_intervals:
+        raise ValueError(f"solve: `intervals` must be an integer from 1 to {max_intervals}, got {intervals!r}.")
+    if tolerance is not None:
+        tolerance = positive_number(tolerance, "solve: `tolerance`")
+    if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
+        raise ValueError(f"solve: `starts` must be a positive integer, got {starts!r}.")
+    search = _Search(
+        phases, lobatto(method), tolerance, default_solver() if solver is None else solver, options, max_iterations,
+        max_intervals, progress,
+    )  # fmt: skip
+    guesses = _guesses(problem, guess, starts, seed)
+    plans = []
+    for one in guesses:
+        plans.append(search.plan(intervals, one))
+        if plans[-1].reason == INTERRUPTED:
+            break
+    best = min(plans, key=lambda plan: (not plan.ok, plan.violation > 1e-6, plan.cost))
+    if len(guesses) == 1:
+        return best
+    return dataclasses.replace(best, starts=tuple((plan.cost, plan.reason) for plan in plans))
+
+
+def continuation(
+    make: Callable[[Any], Problem | Phases], values: Iterable[Any], guess: Any = None, **arguments: Any
+) -> list[Plan]:
+    """Solve a family of problems one after another. Each solution is the guess of the next problem.
+
+        plans = jk.collocation.continuation(lambda load: crane(load), np.linspace(1.0, 20.0, 5))
+
+    **Arguments:**
+
+    - `make`: a function from a value to a `Problem`.
+    - `values`: the values, in small steps.
+    - `guess`: the guess for the first problem.
+    - `arguments`: arguments of `solve`.
+
+    **Returns:** the plans. The list ends with the first one that is not `ok`.
+    """
+    plans: list[Plan] = []
+    for value in values:
+        plans.append(solve(make(value), guess, **arguments))
+        if not plans[-1].ok:
+            break
+        guess = list(plans[-1].phases) if plans[-1].phases else plans[-1]
+    return plans
+
+
+def _guesses(problem: Problem | Phases, guess: Any, starts: int, seed: int) -> list[list[tuple[Any, Any]]]:
+    """For each start, for each phase: the guess, and the detour that is added."""
+    problems = problem.phases if isinstance(problem, Phases) else (problem,)
+    if isinstance(problem, Phases):
+        if isinstance(guess, Plan):
+            guess = guess.phases or (guess,)
+        each = guess if isinstance(guess, (list, tuple)) else [guess] * len(problems)
+        if len(each) != len(problems):
+            raise ValueError(f"solve: `guess` has {len(each)} guesses for {len(problems)} phases.")
+        several = [list(each)]
+    else:
+        several = [[one] for one in guess] if isinstance(guess, (list, tuple)) else [[guess]]
+        if not several:
+            raise ValueError("solve: `guess` is an empty sequence.")
+    found = []
+    for each in several:
+        moved = [detours(p, starts, seed) for p in problems]
+        found += [[(g, moved[p][k]) for p, g in enumerate(each)] for k in range(starts)]
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class _Search:
+    """The arguments of `solve` that are the same for all guesses."""
+
+    phases: Phases
+    method: Lobatto
+    tolerance: float | None
+    solver: Solver
+    options: Mapping[str, Any] | None
+    max_iterations: int
+    max_intervals: int
+    progress: bool
+
+    def plan(self, intervals: int, guesses: Sequence[tuple[Any, Any]]) -> Plan:
+        problems = self.phases.phases
+        meshes = [_first_mesh(guess, intervals) for guess, _ in guesses]
+        nodes = [nodes_of(mesh, self.method) for mesh in meshes]
+        motions = [_guessed(p, g, s, detour) for p, (g, detour), s in zip(problems, guesses, nodes, strict=True)]
+        theta = _theta(problems[0], guesses[0][0])
+        costs: list[float] = []
+        iterations, is_warm = 0, isinstance(guesses[0][0], Plan)
+        while True:
+            transcription = Transcription(self.phases, meshes, self.method, motions, theta)
+            solution = self._solved(transcription, is_warm)
+            program, x = transcription.program, solution.z * transcription.x_scale
+            costs.append(program.objective(solution.z) * program.f_scale)
+            iterations += solution.iterations
+            motions, theta = transcription.motions(x), transcription.theta(x)
+            errors = None
+            if self.tolerance is not None and solution.ok:
+                errors = self._errors(transcription, x)
+            new = self._refined(meshes, errors)
+            if new is None or len(costs) == MAX_MESHES or max(len(m) for m in new) > self.max_intervals + 1:
+                return self._plan(transcription, solution, errors, costs, iterations, new is not None)
+            motions = [
+                interpolated(motion, mesh, self.method, nodes_of(finer, self.method))
+                for motion, mesh, finer in zip(motions, meshes, new, strict=True)
+            ]
+            meshes, is_warm = new, True
+
+    def _solved(self, transcription: Transcription, is_warm: bool) -> Solution:
+        program = transcription.program
+        monitor = Monitor(program, _show if self.progress else None)
+        try:
+            return self.solver(
+                program, transcription.z, monitor, is_warm=is_warm, max_iterations=self.max_iterations,
+                options=self.options,
+            )  # fmt: skip
+        finally:
+            if self.progress:
+                print(file=sys.stderr)
+
+    def _errors(self, transcription: Transcription, x: np.ndarray) -> list[np.ndarray]:
+        motions = transcription.motions(x)
+        found = []
+        for p, (layout, motion) in enumerate(zip(transcription.layouts, motions, strict=True)):
+            scales = transcription.x_scale[layout.node(0)]
+            found.append(
+                local_errors(layout, system_at(transcription, p, x), motion, self.method, scales, self.tolerance or 1.0)
+            )
+        return found
+
+    def _refined(self, meshes: Sequence[np.ndarray], errors: Sequence[np.ndarray] | None) -> list[np.ndarray] | None:
+        """New meshes, or None if the present ones are fine."""
+        if errors is None or self.tolerance is None or all(np.max(e) <= self.tolerance for e in errors):
+            return None
+        return [
+            refined(mesh, e, self.tolerance, self.method.order) if np.max(e) > self.tolerance else mesh
+            for mesh, e in zip(meshes, errors, strict=True)
+        ]
+
+    def _plan(
+        self,
+        transcription: Transcription,
+        solution: Solution,
+        errors: Sequence[np.ndarray] | None,
+        costs: Sequence[float],
+        iterations: int,
+        is_coarse: bool,
+    ) -> Plan:
+        program, x = transcription.program, solution.z * transcription.x_scale
+        ok, reason = solution.ok, solution.status
+        if ok and is_coarse:
+            worst = max(float(np.max(e)) for e in errors or ())
+            ok, reason = False, f"solved, but the local error is {worst:.1e} instead of {self.tolerance:g}"
+        residual = dual_residual(program, solution)
+        common = {
+            "ok": ok,
+            "reason": reason,
+            "cost": costs[-1],
+            "costs": tuple(costs),
+            "iterations": iterations,
+            "violation": program.violation(solution.z),
+            "dual_residual": residual,
+            "estimates": _estimates(transcription, x),
+        }
+        plans = [
+            self._plan_of_phase(transcription, solution, x, p, None if errors is None else errors[p], common)
+            for p in range(len(transcription.layouts))
+        ]
+        return plans[0] if len(plans) == 1 and not self.phases.links else _joined(plans)
+
+    def _plan_of_phase(
+        self, transcription: Transcription, solution: Solution, x: np.ndarray, p: int, errors: Any, common: Any
+    ) -> Plan:
+        layout, motion = transcription.layouts[p], transcription.motions(x)[p]
+        system = system_at(transcription, p, x)
+        return Plan(
+            problem=layout.problem,
+            duration=motion.duration,
+            system=system,
+            trajectory=trajectory_of(system, layout.problem, motion),
+            mesh=layout.mesh * motion.duration,
+            errors=errors,
+            multipliers=multipliers_of(transcription, solution, p),
+            unmet=unmet_of(transcription, solution, p),
+            active=active_of(transcription, solution, p),
+            motion=motion,
+            method=self.method,
+            scales=transcription.x_scale[layout.node(0)],
+            **common,
+        )
+
+
+def _first_mesh(guess: Any, intervals: int) -> np.ndarray:
+    if isinstance(guess, Plan) and not guess.phases and len(guess.mesh) > intervals:
+        return guess.mesh / guess.duration
+    return np.linspace(0.0, 1.0, intervals + 1)
+
+
+def _guessed(problem: Problem, guess: Any, s: np.ndarray, detour: Any) -> Motion:
+    if isinstance(guess, Plan) and guess.problem.names == problem.names:
+        if tuple(guess.problem.bounds_of_controls) == tuple(problem.bounds_of_controls):
+            found = interpolated(guess.motion, guess.mesh / guess.duration, guess.method, s)
+            low, high = problem.durations
+            return found._replace(duration=min(max(guess.duration, low), high))
+    return guess_of(problem, getattr(guess, "trajectory", guess), s, detour)
+
+
+def _theta(problem: Problem, guess: Any) -> np.ndarray:
+    """The free parameters of a plan, if it has the same ones; else their own initial guesses."""
+    parameters = problem.parameters
+    if parameters is None:
+        return np.zeros(0)
+    if isinstance(guess, Plan) and set(guess.estimates) == set(parameters.names):
+        return np.asarray(parameters.inverse(jnp.asarray([guess.estimates[name] for name in parameters.names])))
+    return np.zeros(parameters.size)
+
+
+def _estimates(transcription: Transcription, x: np.ndarray) -> dict[str, float]:
+    parameters = transcription.parameters
+    if parameters is None:
+        return {}
+    values = np.asarray(parameters.values(jnp.asarray(transcription.theta(x))))
+    return dict(zip(parameters.names, values.tolist(), strict=True))
+
+
+def lagrangian_gradient(program: NonlinearProgram, solution: Solution) -> np.ndarray:
+    """The derivatives (n,) of cost + multipliers . constraints by the scaled variables."""
+    rows, columns = program.jacobian_structure
+    products = program.jacobian(solution.z) * solution.multipliers[rows]
+    return program.gradient(solution.z) + np.bincount(columns, products, minlength=program.n)
+
+
+def dual_residual(program: NonlinearProgram, solution: Solution) -> float:
+    """The largest violation of the conditions of a minimum, of variables that are not fixed."""
+    residual = lagrangian_gradient(program, solution) + solution.bound_multipliers
+    return float(np.max(np.abs(residual[program.lower < program.upper]), initial=0.0))
+
+
+def multipliers_of(transcription: Transcription, solution: Solution, p: int) -> Multipliers:
+    """See `Multipliers`. The derivative of the cost by a bound is minus the multiplier of the bound."""
+    program, layout = transcription.program, transcription.layouts[p]
+    of_bounds = solution.bound_multipliers.copy()
+    fixed = program.lower >= program.upper
+    of_bounds[fixed] = -lagrangian_gradient(program, solution)[fixed]  # solvers omit fixed variables
+    by_variable = -of_bounds * program.f_scale / program.x_scale
+    by_constraint = -solution.multipliers * program.f_scale / program.g_scale
+    values: dict[str, Any] = {}
+    nodes = layout.node(np.arange(layout.K))
+    for i, name in enumerate((*layout.problem.names, *layout.variables.controls)):
+        values[name] = by_variable[nodes[:, i]]
+    if layout.duration is not None:
+        values["duration"] = float(by_variable[layout.duration])
+    costate = {}
+    for row in transcription.rows:
+        if row.phase == p and row.kind == "dynamics":
+            costate[row.name] = by_constraint[row.rows].sum(axis=1)
+        elif row.phase == p:
+            values[row.name] = by_constraint[row.rows] if row.rows.size > 1 else float(by_constraint[row.rows[0]])
+    return Multipliers(values, costate)
+
+
+def unmet_of(transcription: Transcription, solution: Solution, p: int, tolerance: float = 1e-6) -> dict[str, float]:
+    """The constraints and bounds that are violated, by name, with the largest scaled violation."""
+    program, layout = transcription.program, transcription.layouts[p]
+    g = program.constraints(solution.z)
+    of_rows = np.maximum(program.g_lower - g, g - program.g_upper)
+    of_variables = np.maximum(program.lower - solution.z, solution.z - program.upper)
+    found = {}
+    for row in transcription.rows:
+        if row.phase == p:
+            label = f"equations of motion of {row.name}" if row.kind == "dynamics" else row.name
+            found[label] = max(found.get(label, 0.0), float(np.max(of_rows[row.rows])))
+    nodes = layout.node(np.arange(layout.K))
+    for i, name in enumerate((*layout.problem.names, *layout.variables.controls)):
+        found[f"bounds of {name}"] = float(np.max(of_variables[nodes[:, i]]))
+    return {name: x for name, x in found.items() if not x <= tolerance}
+
+
+def active_of(transcription: Transcription, solution: Solution, p: int) -> tuple[str, ...]:
+    """The names of bounds and inequality constraints that are active somewhere, without values that are given."""
+    program, layout = transcription.program, transcription.layouts[p]
+    found = []
+
+    def is_active(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[bool, bool]:
+        free = lower < upper
+        return bool(np.any(free & (values - lower < 1e-6))), bool(np.any(free & (upper - values < 1e-6)))
+
+    nodes = layout.node(np.arange(layout.K))
+    groups = [(name, nodes[:, i]) for i, name in enumerate((*layout.problem.names, *layout.variables.controls))] + (
+        [] if layout.duration is None else [("duration", np.array([layout.duration]))]
+    )
+    for name, at in groups:
+        for side, active in zip(
+            ("lower", "upper"), is_active(solution.z[at], program.lower[at], program.upper[at]), strict=True
+        ):
+            if active:
+                found.append(f"{name} at its {side} bound")
+    g = program.constraints(solution.z)
+    for row in transcription.rows:
+        if row.phase == p and row.kind in ("path", "conditions"):
+            if any(is_active(g[row.rows], program.g_lower[row.rows], program.g_upper[row.rows])):
+                found.append(row.name)
+    return tuple(found)
+
+
+def _joined(plans: Sequence[Plan]) -> Plan:
+    """One plan for all phases, whose trajectory contains them one after another."""
+    first = plans[0]
+    trajectory = first.trajectory
+    if all(plan.trajectory.names == trajectory.names for plan in plans):
+        trajectory = _concatenated([plan.trajectory for plan in plans])
+    offsets = np.cumsum([0.0, *(plan.duration for plan in plans)])
+    mesh = np.concatenate([plan.mesh + offset for plan, offset in zip(plans, offsets)])
+    errors = None if first.errors is None else np.concatenate([plan.errors for plan in plans])  # type: ignore[misc]
+    unmet = {f"phase {i}: {k}": x for i, plan in enumerate(plans) for k, x in plan.unmet.items()}
+    active = tuple(f"phase {i}: {name}" for i, plan in enumerate(plans) for name in plan.active)
+    return dataclasses.replace(
+        first, duration=float(offsets[-1]), trajectory=trajectory, mesh=mesh, errors=errors, unmet=unmet, active=active,
+        phases=tuple(plans),
+    )  # fmt: skip
+
+
+def _concatenated(parts: Sequence[Trajectory]) -> Trajectory:
+    t, offset = [], 0.0
+    for part in parts:
+        t.append(part.t + offset)
+        offset += float(part.t[-1])
+    last = parts[-1]
+    rows = {name: jnp.concatenate([getattr(part, name) for part in parts]) for name in ("q", "u", "u_dep", "x")}
+    by_name = {
+        name: {k: jnp.concatenate([getattr(part, name)[k] for part in parts]) for k in getattr(last, name)}
+        for name in ("inputs", "outputs")
+    }
+    return dataclasses.replace(last, t=jnp.concatenate(t), t_end=jnp.asarray(offset), **rows, **by_name)
+
+
+def _show(iteration: int, cost: float, violation: float) -> None:
+    """One line that is overwritten in each iteration."""
+    text = f"\riteration {iteration}: cost {cost:.6g}, violation {violation:.1e}".ljust(72)
+    print(text, end="", file=sys.stderr, flush=True)

@@ -1,0 +1,520 @@
+"""From problems on meshes to one nonlinear program.
+
+The variables are the states and controls at all nodes, node by node and phase by phase, then the free durations, then
+the free parameters. With F = duration * y_dot, the equations of motion in an interval of the fraction s are
+
+    y_j - y_0 - (s_1 - s_0) sum_l A_jl F_l = 0    for each point j but the first (see `Lobatto`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+
+from .._collocate.lobatto import Lobatto
+from .._collocate.program import Block, Bounds, EvaluatedBlock, NonlinearProgram
+from .._integrate.inputs import is_samples
+from .._system.system import System, units_of
+from ._functions import Dynamics, Ends, Integrand, Link, Path, Variables, called, named
+from ._problem import Bound, Phases, Problem, bounds_of, constraints_of
+
+
+class Motion(NamedTuple):
+    """States and controls of a phase at nodes.
+
+    - `s` (K,): the nodes, as fractions of the duration.
+    - `duration`: [s].
+    - `Y` (K, n_y), `W` (K, n_w): packed states and controls.
+    """
+
+    s: np.ndarray
+    duration: float
+    Y: np.ndarray
+    W: np.ndarray
+
+
+class Row(NamedTuple):
+    """A group of constraints: its kind, a name, and the places of its first and last row."""
+
+    kind: str
+    phase: int
+    name: str
+    rows: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Where the variables of a phase are.
+
+    - `problem`, `variables`: the problem and how its nodes are read.
+    - `mesh` (N + 1,): the ends of the intervals, as fractions of the duration. `s` (K,): the nodes.
+    - `first`: the index of the first variable. `duration`: the index of the duration, or None.
+    - `parameters`: the indices of the parameters.
+    """
+
+    problem: Problem
+    variables: Variables
+    mesh: np.ndarray
+    s: np.ndarray
+    first: int
+    duration: int | None
+    parameters: np.ndarray
+
+    @property
+    def K(self) -> int:
+        return len(self.s)
+
+    @property
+    def shared(self) -> np.ndarray:
+        return np.concatenate([[] if self.duration is None else [self.duration], self.parameters]).astype(int)
+
+    def node(self, k: Any) -> np.ndarray:
+        """The indices (..., n_z) of the variables of nodes k (...,)."""
+        n_z = self.variables.n_z
+        return self.first + np.asarray(k)[..., None] * n_z + np.arange(n_z)
+
+    @property
+    def columns(self) -> np.ndarray:
+        """For each node, the variables (K, n) that its functions use."""
+        return np.concatenate([self.node(np.arange(self.K)), np.tile(self.shared, (self.K, 1))], axis=1)
+
+    def node_data(self, s: np.ndarray) -> dict[str, Any]:
+        """The data of nodes: their fractions, and the values of sampled inputs if their times are fixed."""
+        signals = {} if callable(self.problem.signals) else self.problem.signals
+        sampled = {k: x for k, x in signals.items() if is_samples(x)} if self.duration is None else {}
+        times = float(self.variables.origin) + s * self.problem.durations[0]
+        inputs = {name: np.asarray(jax.vmap(signal)(jnp.asarray(times))) for name, signal in sampled.items()}
+        return {"s": s, "inputs": inputs}
+
+
+def variables_of(problem: Problem, origin: float = 0.0) -> Variables:
+    """How the nodes of a problem are read."""
+    signals = problem.signals
+    if not problem.has_free_duration and not callable(signals):
+        signals = {name: x for name, x in signals.items() if not is_samples(x)}  # they are data of the nodes
+    return Variables(
+        system=problem.system,
+        signals=signals,
+        parameters=problem.parameters,
+        duration=None if problem.has_free_duration else jnp.asarray(problem.durations[0], float),
+        origin=jnp.asarray(origin, float),
+        controls=tuple(problem.bounds_of_controls),
+        n_y=len(problem.names),
+    )
+
+
+def nodes_of(mesh: np.ndarray, method: Lobatto) -> np.ndarray:
+    """The nodes (K,) of a mesh; neighbouring intervals share one."""
+    inner = mesh[:-1, None] + np.diff(mesh)[:, None] * method.c[:-1]
+    return np.append(inner.ravel(), mesh[-1])
+
+
+class Transcription:
+    """The nonlinear program of problems on meshes, around a guess.
+
+    **Arguments:**
+
+    - `phases`: the problems and their links.
+    - `meshes`: for each phase the ends (N + 1,) of its intervals.
+    - `method`: the method of collocation.
+    - `motions`: for each phase the guess at the nodes.
+    - `theta` (p,): the guess of the free parameters, in their search variables.
+
+    **Raises:** `ValueError` if a function is not finite at the guess, or a constraint has no derivative.
+    """
+
+    def __init__(
+        self,
+        phases: Phases,
+        meshes: Sequence[np.ndarray],
+        method: Lobatto,
+        motions: Sequence[Motion],
+        theta: np.ndarray,
+    ):
+        self.phases, self.method = phases, method
+        self.layouts = _layouts(phases.phases, meshes, method)
+        self.n = 1 + max(int(layout.columns.max()) for layout in self.layouts)
+        self.parameters = self.layouts[0].variables.parameters
+        self.x = np.zeros(self.n)
+        for layout, motion in zip(self.layouts, motions, strict=True):
+            self.x[layout.node(np.arange(layout.K))] = np.concatenate([motion.Y, motion.W], axis=1)
+            if layout.duration is not None:
+                self.x[layout.duration] = motion.duration
+        self.x[self.layouts[0].parameters] = theta
+        self._build()
+
+    def _build(self) -> None:
+        self.x_bounds = self._variable_bounds()
+        dynamics = [
+            EvaluatedBlock(Block(Dynamics(x.variables), x.node_data(x.s), x.columns, x.variables.n_y))
+            for x in self.layouts
+        ]
+        self._check_finite_dynamics(dynamics)
+        self.x_scale = self._scales(dynamics)
+        builder = _Builder(self.n)
+        for p, (layout, block) in enumerate(zip(self.layouts, dynamics, strict=True)):
+            builder.defects(p, layout, block, self.method, self.x_scale)
+        for p, layout in enumerate(self.layouts):
+            self._add_functions(builder, p, layout)
+        for i, how in enumerate(self.phases.links):
+            self._add_link(builder, i, how)
+        self.rows = builder.rows
+        self._check_functions(builder)
+        g_scale = builder.scales(self.x, self.x_scale)
+        arguments = builder.arguments()
+        self.program = NonlinearProgram(*arguments, self.x_bounds, builder.bounds, self.x_scale, g_scale)
+        self.program.f_scale = self._cost_scale()
+
+    @property
+    def z(self) -> np.ndarray:
+        """The guess (n,) in scaled variables."""
+        return self.x / self.x_scale
+
+    def motions(self, x: np.ndarray) -> list[Motion]:
+        """The motions of all phases at variables (n,)."""
+        found = []
+        for layout in self.layouts:
+            values = x[layout.node(np.arange(layout.K))]
+            duration = layout.problem.durations[0] if layout.duration is None else float(x[layout.duration])
+            n_y = layout.variables.n_y
+            found.append(Motion(layout.s, duration, values[:, :n_y], values[:, n_y:]))
+        return found
+
+    def theta(self, x: np.ndarray) -> np.ndarray:
+        return x[self.layouts[0].parameters]
+
+    def _variable_bounds(self) -> Bounds:
+        lower, upper = np.full(self.n, -math.inf), np.full(self.n, math.inf)
+        for layout in self.layouts:
+            problem = layout.problem
+            names = (*problem.names, *layout.variables.controls)
+            for name, (low, high) in problem.limits.items():
+                if name in names:
+                    at = layout.first + np.arange(layout.K) * layout.variables.n_z + names.index(name)
+                    lower[at], upper[at] = low, high
+            for label, k in (("start", 0), ("end", layout.K - 1)):
+                for name, value in problem.ends[label].items():
+                    if name in names:
+                        at = int(layout.node(k)[names.index(name)])
+                        low, high = bounds_of(name, value)
+                        lower[at], upper[at] = max(low, lower[at]), min(high, upper[at])
+            if layout.duration is not None:
+                lower[layout.duration], upper[layout.duration] = problem.durations
+        return Bounds(lower, upper)
+
+    def _check_finite_dynamics(self, blocks: Sequence[EvaluatedBlock]) -> None:
+        for layout, block in zip(self.layouts, blocks, strict=True):
+            values = block.values(self.x)
+            if np.all(np.isfinite(values)):
+                continue
+            k = int(np.argmin(np.all(np.isfinite(values), axis=1)))
+            names = [layout.problem.names[i] for i in np.nonzero(~np.isfinite(values[k]))[0]]
+            at = dict(zip(layout.problem.names, self.x[layout.node(k)].round(6).tolist()))
+            raise ValueError(
+                f"Problem: with the initial guess, the rates of {', '.join(names)} are not finite at "
+                f"{layout.s[k]:.3g} of the duration, where the state is {at}. Pass another guess: solve(problem, guess)."
+            )
+
+    def _scales(self, blocks: Sequence[EvaluatedBlock]) -> np.ndarray:
+        """Typical sizes (n,) of the variables: one for each name."""
+        scale = np.ones(self.n)
+        for layout, block in zip(self.layouts, blocks, strict=True):
+            values = scales_of(layout, block, self.x)
+            scale[layout.node(np.arange(layout.K))] = values
+            if layout.duration is not None:
+                scale[layout.duration] = max(self.x[layout.duration], 1e-3 * layout.problem.durations[1])
+        return scale
+
+    def _add_functions(self, builder: _Builder, p: int, layout: Layout) -> None:
+        problem, variables = layout.problem, layout.variables
+        data = layout.node_data(layout.s)
+        if problem.cost is not None:
+            weights = np.zeros(layout.K)
+            steps = np.diff(layout.mesh)
+            for j, b in enumerate(self.method.b):
+                np.add.at(weights, np.arange(len(steps)) * (len(self.method.b) - 1) + j, steps * b)
+            builder.cost(EvaluatedBlock(Block(Integrand(variables, problem.cost), data, layout.columns, 1)), weights)
+        along = {k: v for k, v in problem.limits.items() if k not in (*problem.names, *variables.controls)}
+        path = self._constraints(layout, "path", problem.path, 0) if problem.path is not None else {}
+        if along or path:
+            block = Block(Path(variables, tuple(along), problem.path), data, layout.columns, len(along) + len(path))
+            builder.constraints("path", p, EvaluatedBlock(block), [*along.items(), *path.items()])
+        self._add_ends(builder, p, layout)
+
+    def _add_ends(self, builder: _Builder, p: int, layout: Layout) -> None:
+        problem, variables = layout.problem, layout.variables
+        names = (*problem.names, *variables.controls)
+        by_name = {
+            label: {k: bounds_of(k, v) for k, v in problem.ends[label].items() if k not in names}
+            for label in ("start", "end")
+        }
+        conditions = self._constraints(layout, "conditions", problem.conditions, 0)
+        fixed = [c for c in problem.system.coordinates if not isinstance(problem.ends["start"].get(c, ()), tuple)]
+        n_h = 0 if len(fixed) == len(problem.system.coordinates) else problem.n_constraints
+        items = [(f"{name}", bounds) for name, bounds in conditions.items()]
+        items += [(f"{name} at the {label}", b) for label in ("start", "end") for name, b in by_name[label].items()]
+        items += [(f"configuration constraint {i}", (0.0, 0.0)) for i in range(n_h)]
+        has_cost = problem.final_cost is not None
+        if not items and not has_cost:
+            return
+        ends = Ends(
+            variables, problem.final_cost, problem.conditions, tuple(by_name["start"]), tuple(by_name["end"]), n_h > 0
+        )
+        places = np.array([0, layout.K - 1])
+        columns = np.concatenate([*layout.node(places), layout.shared])[None]
+        data = layout.node_data(layout.s[places])
+        data = tuple(jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], data) for i in (0, 1))
+        block = EvaluatedBlock(Block(ends, data, columns, has_cost + len(items)))
+        builder.constraints("conditions", p, block, items, has_cost=has_cost)
+
+    def _add_link(self, builder: _Builder, i: int, how: Any) -> None:
+        j = (i + 1) % len(self.layouts)
+        one, other = self.layouts[i], self.layouts[j]
+        link = Link(one.variables, other.variables, how)
+        data = (one.node_data(one.s[-1:]), other.node_data(other.s[:1]))
+        durations = [x.duration for x in (one, other) if x.duration is not None]
+        columns = np.concatenate([one.node(one.K - 1), other.node(0), durations, one.parameters]).astype(int)[None]
+        x = jax.ShapeDtypeStruct((columns.shape[1],), jnp.float64)
+        size = jax.eval_shape(link, jax.tree.map(lambda a: jnp.asarray(a)[0], data), x).shape[0]
+        names = [f"link {i}" if callable(how) else f"link {i}: {name}" for name in other.problem.names]
+        names = [f"link {i}: event {how!r}", *names] if isinstance(how, str) else names
+        names = [f"link {i}"] * size if callable(how) else names
+        builder.constraints(
+            "links", i, EvaluatedBlock(Block(link, data, columns, size)), [(n, (0.0, 0.0)) for n in names]
+        )
+
+    def _constraints(self, layout: Layout, label: str, f: Any, k: int) -> dict[str, Bound]:
+        """The bounds of the constraints that a function of the user returns, by name."""
+        if f is None:
+            return {}
+        found: dict[str, Bound] = {}
+        last = layout.K - 1
+
+        def record(x: Any) -> Any:
+            first = layout.variables.now(
+                jax.tree.map(lambda a: jnp.asarray(a)[0], layout.node_data(layout.s[:1])), x[0]
+            )
+            if label == "path":
+                values = called(label, f, first.t, first)
+            else:
+                end = jax.tree.map(lambda a: jnp.asarray(a)[0], layout.node_data(layout.s[-1:]))
+                duration = layout.variables.shared(x[0][layout.variables.n_z :])[1]
+                values = called(label, f, first, layout.variables.now(end, x[1]), duration)
+            found.update(constraints_of(label, values, is_equality=label != "path"))
+            return [item[0] if isinstance(item, tuple) else item for item in named(label, values).values()]
+
+        shapes = jax.eval_shape(record, self.x[layout.columns[[0, last]]])
+        for name, shape in zip(found, shapes, strict=True):
+            if getattr(shape, "shape", ()) != ():
+                raise ValueError(f"`{label}`: {name!r} must be one number, got the shape {shape.shape}.")
+        return found
+
+    def _check_functions(self, builder: _Builder) -> None:
+        for block, label in builder.user_blocks:
+            values = block.values(self.x)
+            if not np.all(np.isfinite(values)):
+                raise ValueError(
+                    f"Problem: `{label}` is not finite at the initial guess. Pass another guess: solve(problem, guess)."
+                )
+        for row in builder.rows:
+            if row.kind in ("path", "conditions") and not row.name.startswith("configuration"):
+                if not builder.has_derivative(row):
+                    raise ValueError(
+                        f"Problem: `{row.kind}`: the derivative of {row.name!r} is zero everywhere. Return a smooth "
+                        "signed number, not a truth value or a rounded one."
+                    )
+
+    def _cost_scale(self) -> float:
+        """The size of the cost at the guess, or one third of a scale away from it: at the guess it may be zero."""
+        shift = np.random.default_rng(0).uniform(-0.3, 0.3, self.n)
+        z = np.clip(self.z + shift, self.program.lower, self.program.upper)
+        sizes = [abs(self.program.objective(place)) for place in (self.z, z)]
+        finite = [size for size in sizes if math.isfinite(size) and size > 0]
+        return max(finite, default=1.0)
+
+
+class _Builder:
+    """Collects blocks, constraints and their bounds."""
+
+    def __init__(self, n: int) -> None:
+        self.n, self.m = n, 0
+        self.blocks: list[EvaluatedBlock] = []
+        self.weights: list[np.ndarray | None] = []
+        self.entries: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = []  # rows, places of values, factors
+        self.linear: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self.rows: list[Row] = []
+        self.user_blocks: list[tuple[EvaluatedBlock, str]] = []
+        self._lower: list[np.ndarray] = []
+        self._upper: list[np.ndarray] = []
+        self._scales: dict[int, np.ndarray] = {}
+
+    def _new_rows(self, k: int) -> np.ndarray:
+        self.m += k
+        return np.arange(self.m - k, self.m)
+
+    def defects(self, p: int, layout: Layout, block: EvaluatedBlock, method: Lobatto, x_scale: np.ndarray) -> None:
+        n_y, steps, s = layout.variables.n_y, np.diff(layout.mesh), len(method.c)
+        N = len(steps)
+        first = np.arange(N) * (s - 1)
+        rows = self._new_rows(N * (s - 1) * n_y).reshape(N, s - 1, n_y)
+        node = layout.node(np.arange(layout.K))[:, :n_y]
+        one = np.ones((N, s - 1, n_y))
+        inner = first[:, None] + np.arange(1, s)
+        self.linear.append((rows.ravel(), node[inner].ravel(), one.ravel()))
+        self.linear.append((rows.ravel(), np.broadcast_to(node[first][:, None], rows.shape).ravel(), -one.ravel()))
+        values = (first[:, None] + np.arange(s))[:, None, :, None] * n_y + np.arange(n_y)  # (N, 1, s, n_y)
+        factors = -steps[:, None, None, None] * method.A[None, :, :, None]
+        shape = (N, s - 1, s, n_y)
+        parts = (np.broadcast_to(x, shape).ravel() for x in (rows[:, :, None, :], values, factors))
+        self._add(block, None, tuple(parts))
+        self._bound(np.zeros(rows.size), np.zeros(rows.size))
+        for i, name in enumerate(layout.problem.names):
+            self.rows.append(Row("dynamics", p, name, rows[:, :, i]))
+            self._scales[len(self.rows) - 1] = x_scale[layout.node(0)[i]]
+
+    def cost(self, block: EvaluatedBlock, weights: np.ndarray) -> None:
+        self._add(block, weights, None)
+        self.user_blocks.append((block, "cost"))
+
+    def constraints(
+        self, kind: str, p: int, block: EvaluatedBlock, items: Sequence[tuple[str, Bound]], has_cost: bool = False
+    ) -> None:
+        """One row for each value of the block at each place; the first value may be a cost."""
+        B, m = block.B, len(items)
+        rows = self._new_rows(B * m).reshape(B, m)
+        values = np.arange(B)[:, None] * block.block.size + np.arange(m) + has_cost
+        weights = None
+        if has_cost:
+            weights = np.zeros(B * block.block.size)
+            weights[0] = 1.0
+        self._add(block, weights, (rows.ravel(), values.ravel(), np.ones(rows.size)))
+        self._bound(*(np.tile([bounds[i] for _, bounds in items], B) for i in (0, 1)))
+        self.user_blocks.append((block, "conditions` or `final_cost" if kind == "conditions" else kind))
+        for i, (name, _) in enumerate(items):
+            self.rows.append(Row(kind, p, name, rows[:, i]))
+
+    def _add(self, block: EvaluatedBlock, weights: Any, entries: Any) -> None:
+        self.blocks.append(block)
+        self.weights.append(weights)
+        self.entries.append(entries)
+
+    def _bound(self, lower: np.ndarray, upper: np.ndarray) -> None:
+        self._lower.append(np.asarray(lower, float))
+        self._upper.append(np.asarray(upper, float))
+
+    @property
+    def bounds(self) -> Bounds:
+        return Bounds(np.concatenate([*self._lower, []]), np.concatenate([*self._upper, []]))
+
+    def arguments(self) -> tuple[Any, ...]:
+        """Blocks, weights, matrices of constraints and the linear matrix, as `NonlinearProgram` takes them."""
+        matrices = []
+        for block, entries in zip(self.blocks, self.entries, strict=True):
+            shape = (self.m, block.B * block.block.size)
+            matrices.append(None if entries is None else _sparse(entries, shape))
+        rows, columns, factors = (np.concatenate(x) for x in zip(*self.linear, strict=True))
+        return self.blocks, self.weights, matrices, _sparse((rows, columns, factors), (self.m, self.n))
+
+    def _block_of(self, row: Row) -> Iterator[tuple[EvaluatedBlock, np.ndarray]]:
+        """The block that has the values of a group of constraints, and the places of these values in the block."""
+        for block, entries in zip(self.blocks, self.entries, strict=True):
+            if entries is not None:
+                inside = np.isin(entries[0], row.rows.ravel())
+                if inside.any():
+                    yield block, np.unique(entries[1][inside] % block.block.size)
+
+    def has_derivative(self, row: Row) -> bool:
+        return any(np.isin(block.pattern.rows, values).any() for block, values in self._block_of(row))
+
+    def scales(self, x: np.ndarray, x_scale: np.ndarray) -> np.ndarray:
+        """Typical sizes (m,) of constraints: their changes if the variables change by their scales."""
+        scale = np.ones(self.m)
+        for i, row in enumerate(self.rows):
+            if i in self._scales:
+                scale[row.rows.ravel()] = self._scales[i]
+                continue
+            for block, values in self._block_of(row):
+                entries = np.abs(block.jacobian(x)) * x_scale[block.columns[: block.B][:, list(block.pattern.columns)]]
+                own = entries[:, np.isin(block.pattern.rows, values)]
+                size = float(np.max(own, initial=0.0))
+                if math.isfinite(size) and size > 0:
+                    scale[row.rows.ravel()] = size
+        return scale
+
+
+def _sparse(entries: tuple[np.ndarray, np.ndarray, np.ndarray], shape: tuple[int, int]) -> Any:
+    rows, columns, factors = entries
+    return scipy.sparse.csr_matrix((factors, (rows, columns)), shape)
+
+
+def _layouts(problems: Sequence[Problem], meshes: Sequence[np.ndarray], method: Lobatto) -> list[Layout]:
+    variables = [variables_of(problem) for problem in problems]
+    nodes = [nodes_of(mesh, method) for mesh in meshes]
+    firsts = np.cumsum([0, *(len(s) * v.n_z for s, v in zip(nodes, variables, strict=True))])
+    next_one = int(firsts[-1])
+    durations: list[int | None] = []
+    for problem in problems:
+        durations.append(next_one if problem.has_free_duration else None)
+        next_one += problem.has_free_duration
+    parameters = variables[0].parameters
+    places = np.arange(next_one, next_one + (0 if parameters is None else parameters.size))
+    rows = zip(problems, variables, meshes, nodes, firsts[:-1].tolist(), durations, strict=True)
+    return [Layout(*row, places) for row in rows]
+
+
+def scales_of(layout: Layout, block: EvaluatedBlock, x: np.ndarray) -> np.ndarray:
+    """Typical sizes (n_z,) of the states and controls of a phase.
+
+    A size is the largest of the finite bounds, the values at the ends, and the guess. Where all of these are zero, an
+    angle has the size 0.3 rad. Any other variable has the size of the change that causes a typical rate in equations
+    whose sizes are known, so that sizes do not depend on units.
+    """
+    problem, variables = layout.problem, layout.variables
+    names = (*problem.names, *variables.controls)
+    units = units_of(problem.system)
+    values = x[layout.node(np.arange(layout.K))]
+    sizes = np.max(np.abs(values), axis=0)
+    limits = problem.limits
+    for i, name in enumerate(names):
+        given = [limits.get(name), *(problem.ends[label].get(name) for label in ("start", "end"))]
+        numbers = [abs(b) for v in given if v is not None for b in bounds_of(name, v) if math.isfinite(b)]
+        sizes[i] = max([sizes[i], *numbers])
+    for unit in {units.get(name, "") for name in names}:
+        same = np.array([units.get(name, "") == unit for name in names])
+        sizes[same & (sizes < 1e-8 * np.max(sizes[same]))] = 0.0  # rounding errors
+    angles = np.array([units.get(name, "") == "rad" for name in names])
+    sizes[angles & (sizes == 0)] = 0.3
+    # dF/dx at the nodes, where F is duration * y_dot
+    slopes = np.zeros((variables.n_y, len(names)))
+    entries = np.max(np.abs(block.jacobian(x)), axis=0, initial=0.0)
+    for row, column, slope in zip(block.pattern.rows, block.pattern.columns, entries, strict=True):
+        if column < len(names) and math.isfinite(slope):
+            slopes[row, column] = slope
+    changes = np.max(np.abs(block.values(x)), axis=0)  # over the whole duration, with the present rates
+    for _ in range(len(names)):
+        known = sizes[: variables.n_y] > 0
+        typical = np.maximum(changes, sizes[: variables.n_y])
+        new = sizes.copy()
+        for i in np.nonzero(sizes == 0)[0]:
+            usable = known & (slopes[:, i] > 0)
+            if usable.any():
+                new[i] = np.exp(np.mean(np.log(typical[usable] / slopes[usable, i])))
+        if np.array_equal(new, sizes):
+            break
+        sizes = new
+    return np.where(sizes > 0, sizes, 1.0)
+
+
+def system_at(transcription: Transcription, p: int, x: np.ndarray) -> System:
+    """The system of phase p with the values of its free parameters."""
+    system = transcription.layouts[p].problem.system
+    if transcription.parameters is None:
+        return system
+    return transcription.parameters.apply(system, jnp.asarray(transcription.theta(x)))[0]
