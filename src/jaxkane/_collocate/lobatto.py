@@ -1,7 +1,7 @@
 """Lobatto IIIA methods: collocation at points that contain both ends of an interval.
 
-Equations: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, section IV.5. The collocation points are the
-zeros of the derivative of a Legendre polynomial and the two ends. The coefficients are integrals of the Lagrange
+Equations: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, section IV.5. The collocation points are
+both ends and the zeros of the derivative of a Legendre polynomial. The coefficients are integrals of the Lagrange
 polynomials, so they are computed and not listed.
 """
 

@@ -180,14 +180,14 @@ class NonlinearProgram:
         self._weights = [np.zeros(k) if w is None else w for k, w in zip(sizes, weights, strict=True)]
         self._S = [scipy.sparse.csr_matrix((self.m, k)) if S is None else S for k, S in zip(sizes, constraints)]
         self._S = [scipy.sparse.csr_matrix(S) for S in self._S]
-        self._A = scipy.sparse.csr_matrix(linear)
+        self._A: Any = scipy.sparse.csr_matrix(linear)
         self._memory: dict[Callable[..., Any], tuple[bytes, list[np.ndarray]]] = {}
         self._map_jacobian()
         self._map_hessian()
 
     def _map_jacobian(self) -> None:
         """Each entry of the Jacobian of g, and of the gradient of f, is a sum of entries of the blocks."""
-        A = self._A.tocoo()
+        A = self._A.tocoo()  # pyright: ignore[reportAttributeAccessIssue]
         rows, columns, sources, factors = [A.row], [A.col], [], []
         self._gradient_maps, places = [], []
         total = 0
@@ -292,6 +292,16 @@ class NonlinearProgram:
             weights = S.T @ factors + (objective_factor / self.f_scale) * w
             parts.append(b.hessian(x, weights.reshape(b.B, b.block.size)).ravel())
         return self._hessian_map @ np.concatenate([*parts, []])
+
+    def in_jax(self, z: Array) -> tuple[Array, Array]:
+        """The scaled cost and constraints as one function of JAX, for tests of the derivatives."""
+        x = z * self.x_scale
+        cost, g = jnp.zeros(()), jnp.asarray(self._A.toarray()) @ x
+        for b, S, w in zip(self._blocks, self._S, self._weights, strict=True):
+            data = jax.tree.map(lambda a, n=b.B: a[:n], b.data)
+            values = jax.vmap(b.block.function)(data, x[b.columns[: b.B]]).ravel()
+            cost, g = cost + jnp.asarray(w) @ values, g + jnp.asarray(S.toarray()) @ values
+        return cost / self.f_scale, g / self.g_scale
 
     def violation(self, z: np.ndarray) -> float:
         """The largest scaled violation of constraints and bounds."""

@@ -335,7 +335,7 @@ class Cyipopt:
         max_iterations: int = 500,
         options: Mapping[str, Any] | None = None,
     ) -> Solution:
-        import cyipopt
+        import cyipopt  # pyright: ignore[reportMissingImports]
 
         latest = [z]
 
@@ -423,8 +423,8 @@ class TrustConstr:
             return every[:, free]
 
         none = np.zeros(program.m)
-        constraints = scipy.optimize.NonlinearConstraint(
-            lambda x: program.constraints(whole(x)), program.g_lower, program.g_upper, jac=jacobian,
+        constraints: Any = scipy.optimize.NonlinearConstraint(
+            lambda x: program.constraints(whole(x)), program.g_lower, program.g_upper, jac=jacobian,  # type: ignore[arg-type]
             hess=lambda x, v: symmetric(program.hessian(whole(x), v, 0.0)),
         )  # fmt: skip
         with monitor.interruptible():
@@ -435,7 +435,7 @@ class TrustConstr:
                 hess=lambda x: symmetric(program.hessian(whole(x), none)),
                 method="trust-constr",
                 constraints=[constraints] if program.m else [],
-                bounds=scipy.optimize.Bounds(program.lower[free], program.upper[free]),
+                bounds=list(zip(program.lower[free], program.upper[free], strict=True)),
                 callback=lambda x, _: monitor(whole(x)),
                 options={"maxiter": 10 * max_iterations, "gtol": 1e-9, "xtol": 1e-11} | dict(options or {}),
             )

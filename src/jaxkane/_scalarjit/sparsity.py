@@ -33,7 +33,8 @@ def patterns(f: Callable[..., Any], specs: Sequence[Any], place: int) -> tuple[n
     try:
         graph, (outputs,) = graph_of(program)
     except NotScalarError:
-        return np.ones((program.out_avals[0].size, n), bool), np.ones((n, n), bool)
+        results: Any = program.out_avals
+        return np.ones((results[0].size, n), bool), np.ones((n, n), bool)
     reads, second = _propagated(graph, outputs, place)
     first = np.array([[bool(reads[int(k)] >> i & 1) for i in range(n)] for k in outputs], bool).reshape(-1, n)
     both = np.array([[bool(second.get(i, 0) >> j & 1) for j in range(n)] for i in range(n)], bool).reshape(n, n)

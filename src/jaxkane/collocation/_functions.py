@@ -18,7 +18,7 @@ from .._kane.constraint_residuals import configuration_residual
 from .._kane.kanes_method import KaneEquations
 from .._kane.right_hand_side import outputs_at, values_of, vector_field
 from .._scalarjit.components import Component
-from .._system.system import System, explain_value_of_traced, has_outputs, names_of, packed, unpacked
+from .._system.system import System, explain_value_of_traced, has_outputs, names_of, unpacked
 
 
 class Now:
@@ -57,6 +57,25 @@ class Now:
             return self._outputs[name]  # type: ignore[index]
         known = [each for names in names_of(system) for each in names]
         raise not_there(name, [*known, *self._inputs, *(self._outputs or {})], "`now`")
+
+    def event(self, name: str) -> Array:
+        """The event function of an event of the system."""
+        state = self.state
+        kane = KaneEquations(self.system, self.t, state.q, state.u)
+        x = () if state.x is None else tuple(state.x)
+        events = crossings(self.system, kane.t, kane.q, kane.u_all, x, state.q.dtype)
+        if name not in events:
+            raise not_there(name, events, "the events of the system")
+        return jnp.asarray(events[name].value, state.q.dtype)
+
+    def after(self, name: str) -> Now:
+        """The values after the jump of an event of the system, with the same inputs."""
+        events = events_of(self.system, self.t, self.state)
+        if name not in events.names:
+            raise not_there(name, events.names, "the events of the system")
+        place = jnp.asarray(events.names.index(name), self._y.dtype)
+        y = state_after(self.system, self.t, self._y, place, stages_of(events))
+        return Now(self.system, self.t, y, self._inputs)
 
     def __contains__(self, name: object) -> bool:
         try:
@@ -187,41 +206,35 @@ class Link(eqx.Module):
     """What is zero between the end of one phase and the start of the next, from x = [last node, first node, shared].
 
     `how` is None for a continuous state; the name of an event, whose function must be zero at the end, and whose jump
-    gives the next state; or a function (last, first) -> residuals by name. `shared` are the variables of both phases:
-    [duration of the one, duration of the other, parameters].
+    gives the next state; or a function (last, first) -> residuals by name. `linked` are the names of the states that
+    are linked in the first two cases. `shared` are the variables of both phases: [duration of the one, duration of the
+    other, parameters]; if both are the same phase, the first two are one.
     """
 
     before: Variables
     after: Variables
     how: Any
+    linked: tuple[str, ...] = eqx.field(static=True)
+    is_one_phase: bool = eqx.field(static=True)
 
     def __call__(self, nodes: Any, x: Array) -> Float[Array, " m"]:
         a, b = self.before.n_z, self.after.n_z
         shared = x[a + b :]
-        one, other = (int(v.duration is None) for v in (self.before, self.after))
-        parameters = shared[one + other :]
-        x0 = jnp.concatenate([x[:a], shared[:one], parameters])
-        x1 = jnp.concatenate([x[a : a + b], shared[one : one + other], parameters])
+        one = int(self.before.duration is None)
+        skipped = 0 if self.is_one_phase else one
+        other = skipped + int(self.after.duration is None)
+        x0 = jnp.concatenate([x[:a], shared[:one], shared[other:]])
+        x1 = jnp.concatenate([x[a : a + b], shared[skipped:other], shared[other:]])
         last, first = self.before.now(nodes[0], x0), self.after.now(nodes[1], x1)
         if callable(self.how):
-            values = [_value(item) for item in named("links", called("links", self.how, last, first)).values()]
-            return jnp.stack([jnp.reshape(jnp.asarray(value, x.dtype), ()) for value in values])
-        if self.how is None:
-            return packed(first.state) - packed(last.state)
-        system, y = last.system, packed(last.state)
-        events = events_of(system, last.t, last.state)
-        place = jnp.asarray(events.names.index(self.how), y.dtype)
-        after = state_after(system, last.t, y, place, stages_of(events))
-        return jnp.concatenate([event_value(self.how, last)[None], packed(first.state) - after])
-
-
-def event_value(name: str, now: Now) -> Array:
-    """The event function of an event of the system."""
-    state = now.state
-    kane = KaneEquations(now.system, now.t, state.q, state.u)
-    x = () if state.x is None else tuple(state.x)
-    event = crossings(now.system, kane.t, kane.q, kane.u_all, x, state.q.dtype)[name]
-    return jnp.asarray(event.value, state.q.dtype)
+            found = named("links", called("links", self.how, last, first))
+            values = [_value(item) for item in found.values()]
+        elif self.how is None:
+            values = [first[name] - last[name] for name in self.linked]
+        else:
+            after = last.after(self.how)
+            values = [last.event(self.how), *(first[name] - after[name] for name in self.linked)]
+        return jnp.stack([jnp.reshape(jnp.asarray(value, x.dtype), ()) for value in values])
 
 
 def called(label: str, f: Callable[..., Any], *args: Any) -> Any:

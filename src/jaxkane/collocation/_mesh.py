@@ -12,11 +12,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._collocate.lobatto import Lobatto
+from .._collocate.program import Block, EvaluatedBlock
 from .._integrate.simulate import simulate
 from .._scalarjit.cache import Cache
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Component
 from .._system.system import State, System, packed, unpacked, with_class
+from ._functions import Integrand
 from ._transcription import Layout, Motion
 
 
@@ -124,7 +126,8 @@ def without_events(system: System) -> System:
     own = type(system)
     if own.events is System.events:
         return system
-    return with_class(system, _EVENTLESS.get(own, lambda: _eventless(own)))
+    key: Any = own
+    return with_class(system, _EVENTLESS.get(key, lambda: _eventless(own)))
 
 
 _EVENTLESS = Cache()  # a class for each class, so that compiled programs are used again
@@ -142,21 +145,58 @@ def with_controls(signals: Any, polynomials: dict[str, Any]) -> Any:
         return {**signals, **polynomials}
 
     def every(t: Any, state: Any) -> dict[str, Any]:
-        return {**signals(t, state), **{name: f(t, state) for name, f in polynomials.items()}}
+        others: Any = signals(t, state)
+        return {**others, **{name: f(t, state) for name, f in polynomials.items()}}
 
     return every
 
 
 def refined(mesh: np.ndarray, errors: np.ndarray, tolerance: float, order: int) -> np.ndarray:
-    """A mesh whose intervals have about the same error, below the tolerance.
+    """A finer mesh where errors are too large, and a coarser one where they are far below the tolerance.
 
-    An interval of error e counts as (2 e / tolerance)^(1 / order) intervals of the new mesh, from a half to sixteen.
+    An interval of error e is divided into (e / tolerance)^(1 / order) parts, at most eight. Two neighbours become one
+    interval if a tenth of the tolerance is not reached by its expected error, which grows with length^(order + 1).
     """
     with np.errstate(over="ignore"):
-        parts = np.clip((2.0 * errors / tolerance) ** (1.0 / order), 0.5, 16.0)
-    parts = np.where(errors > tolerance, np.ceil(parts), np.minimum(parts, 1.0))
-    cumulative = np.concatenate([[0.0], np.cumsum(parts)])
-    N = math.ceil(cumulative[-1] - 1e-9)
-    new = np.interp(np.linspace(0.0, cumulative[-1], N + 1), cumulative, mesh)
-    new[0], new[-1] = mesh[0], mesh[-1]
-    return new
+        parts = np.clip(np.ceil((errors / tolerance) ** (1.0 / order)), 1, 8).astype(int)
+    new, i = [mesh[0]], 0
+    roots = np.minimum(errors, 1.0) ** (1.0 / (order + 1))
+    while i < len(errors):
+        has_next = i + 1 < len(errors) and parts[i] == parts[i + 1] == 1
+        if has_next and (roots[i] + roots[i + 1]) ** (order + 1) < 0.1 * tolerance:
+            new.append(mesh[i + 2])
+            i += 2
+            continue
+        new.extend(np.linspace(mesh[i], mesh[i + 1], parts[i] + 1)[1:])
+        i += 1
+    return np.array(new)
+
+
+def quadrature_errors(layout: Layout, x: np.ndarray, motion: Motion, method: Lobatto) -> np.ndarray:
+    """The error (N,) of the integral of the cost over each interval, against a quadrature with twice as many points.
+
+    **Arguments:**
+
+    - `layout`, `motion`: a phase and its motion.
+    - `x` (n,): the variables of the nonlinear program.
+    """
+    cost = layout.problem.cost
+    if cost is None:
+        return np.zeros(len(layout.mesh) - 1)
+    points, weights = np.polynomial.legendre.leggauss(2 * len(method.c))
+    steps = np.diff(layout.mesh)
+    inside = (layout.mesh[:-1, None] + steps[:, None] * (points + 1) / 2).ravel()
+    fine = interpolated(motion, layout.mesh, method, inside)
+
+    def values(s: np.ndarray, motion: Motion) -> np.ndarray:
+        shared = np.tile(x[layout.shared], (len(s), 1))
+        rows = np.concatenate([motion.Y, motion.W, shared], axis=1)
+        columns = np.arange(rows.size).reshape(rows.shape)
+        block = Block(Integrand(layout.variables, cost), layout.node_data(s), columns, 1)
+        return EvaluatedBlock(block).values(rows.ravel()).ravel()
+
+    at_nodes, every = values(layout.s, motion), len(method.c) - 1
+    inside_nodes = (np.arange(len(steps)) * every)[:, None] + np.arange(every + 1)
+    coarse = at_nodes[inside_nodes] @ method.b
+    exact = values(inside, fine).reshape(len(steps), -1) @ (weights / 2)
+    return np.abs(exact - coarse) * steps

@@ -106,9 +106,9 @@ class Plan:
 
     @property
     def inputs(self) -> Any:
-        """The inputs as functions of (t, state), for `simulate`: `simulate(plan.system, plan.state(0), ts, plan.inputs)`.
+        """The inputs as functions of (t, state), for `simulate`. Between the nodes, a control is a polynomial.
 
-        Between the nodes, a control is a polynomial.
+        jk.simulate(plan.system, plan.state(0), ts, plan.inputs)
         """
         self._refuse_phases("inputs")
         C = coefficients_of(self.motion.W, self.method)
@@ -209,8 +209,8 @@ class Plan:
         ride = self.replay(feedback=True)
         stabilized = self.deviation(ride) if ride.ok else np.inf
         return (
-            f"simulated over the whole duration, it deviates by {off:.1e} of the size of a state: the motion is unstable "
-            f"or the mesh is coarse. With a stabilizing feedback it deviates by {stabilized:.1e}"
+            f"simulated over the whole duration, it deviates by {off:.1e} of the size of a state: the motion is "
+            f"unstable or the mesh is coarse. With a stabilizing feedback it deviates by {stabilized:.1e}"
         )
 
     def __repr__(self) -> str:

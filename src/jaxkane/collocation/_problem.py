@@ -158,7 +158,9 @@ class Problem:
             fixed = [name for name in self.system.coordinates if name in values and _is_number(values[name])]
             if label == "start" and len(fixed) == n_q and n_h:
                 if not isinstance(self.start, State):
-                    check_state(self.system, 0.0, jnp.array([float(values[c]) for c in self.system.coordinates]))
+                    check_state(
+                        self.system, 0.0, jnp.array([bounds_of(c, values[c])[0] for c in self.system.coordinates])
+                    )
             elif n_h and len(fixed) > n_q - n_h:
                 raise ValueError(
                     f"Problem: `{label}` sets {', '.join(fixed)}, but only {n_q - n_h} coordinates are independent. "
@@ -242,7 +244,7 @@ class Problem:
     @property
     def signals(self) -> Any:
         """The inputs that are not controls, as `inputs_at` reads them."""
-        signals = as_signals(self.inputs, self.system.inputs, np.zeros(2), self.title)
+        signals = as_signals(self.inputs, self.system.inputs, jnp.zeros(2), self.title)
         for name, signal in {} if callable(signals) else signals.items():
             if is_samples(signal) and signal.zero_order_hold:
                 raise ValueError(

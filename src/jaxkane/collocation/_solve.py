@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,7 +17,7 @@ from .._collocate.solvers import INTERRUPTED, Monitor, Solution, Solver, default
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
 from ._guess import detours, guess_of
-from ._mesh import interpolated, local_errors, refined
+from ._mesh import interpolated, local_errors, quadrature_errors, refined
 from ._plan import Multipliers, Plan, trajectory_of
 from ._problem import Phases, Problem
 from ._transcription import Motion, Transcription, nodes_of, system_at
@@ -118,6 +119,46 @@ def continuation(
     return plans
 
 
+def check_derivatives(
+    problem: Problem | Phases, guess: Any = None, *, intervals: int = 2, method: str = "hermite-simpson", seed: int = 0
+) -> dict[str, float]:
+    """Compare the sparse derivatives with dense ones by JAX, on a small mesh near the guess.
+
+    **Arguments:** those of `solve`.
+
+    **Returns:** the largest deviation of "gradient", "jacobian" and "hessian", relative to the largest entry.
+    """
+    phases = problem if isinstance(problem, Phases) else Phases([problem])
+    found = lobatto(method)
+    mesh = np.linspace(0.0, 1.0, intervals + 1)
+    motions = [guess_of(p, getattr(guess, "trajectory", guess), nodes_of(mesh, found)) for p in phases.phases]
+    theta = np.zeros(0 if phases.phases[0].parameters is None else phases.phases[0].parameters.size)
+    program = (transcription := Transcription(phases, [mesh] * len(motions), found, motions, theta)).program
+    rng = np.random.default_rng(seed)
+    z = np.clip(transcription.z + 0.1 * rng.normal(size=program.n), program.lower, program.upper)
+    weights = rng.normal(size=program.m)
+
+    def lagrangian(z: Any) -> Any:
+        cost, g = program.in_jax(z)
+        return cost + jnp.asarray(weights) @ g
+
+    gradient, jacobian = jax.jit(jax.jacfwd(program.in_jax))(jnp.asarray(z))
+    hessian = np.asarray(jax.jit(jax.hessian(lagrangian))(jnp.asarray(z)))
+    own = np.zeros((program.m, program.n))
+    own[program.jacobian_structure] = program.jacobian(z)
+    lower = np.zeros((program.n, program.n))
+    lower[program.hessian_structure] = program.hessian(z, weights)
+    pairs = {
+        "gradient": (program.gradient(z), np.asarray(gradient)),
+        "jacobian": (own, np.asarray(jacobian)),
+        "hessian": (lower + np.tril(lower, -1).T, hessian),
+    }
+    return {
+        k: float(np.max(np.abs(a - b), initial=0.0) / max(np.max(np.abs(b), initial=0.0), 1e-300))
+        for k, (a, b) in pairs.items()
+    }
+
+
 def _guesses(problem: Problem | Phases, guess: Any, starts: int, seed: int) -> list[list[tuple[Any, Any]]]:
     """For each start, for each phase: the guess, and the detour that is added."""
     problems = problem.phases if isinstance(problem, Phases) else (problem,)
@@ -192,13 +233,14 @@ class _Search:
                 print(file=sys.stderr)
 
     def _errors(self, transcription: Transcription, x: np.ndarray) -> list[np.ndarray]:
-        motions = transcription.motions(x)
+        """The error of each interval: of states, relative to their sizes, and of the cost, relative to the whole."""
+        program = transcription.program
+        size = program.f_scale * max(abs(program.objective(x / transcription.x_scale)), 1e-3)
         found = []
-        for p, (layout, motion) in enumerate(zip(transcription.layouts, motions, strict=True)):
-            scales = transcription.x_scale[layout.node(0)]
-            found.append(
-                local_errors(layout, system_at(transcription, p, x), motion, self.method, scales, self.tolerance or 1.0)
-            )
+        for p, (layout, motion) in enumerate(zip(transcription.layouts, transcription.motions(x), strict=True)):
+            scales, system = transcription.x_scale[layout.node(0)], system_at(transcription, p, x)
+            errors = local_errors(layout, system, motion, self.method, scales, self.tolerance or 1.0)
+            found.append(np.maximum(errors, quadrature_errors(layout, x, motion, self.method) / size))
         return found
 
     def _refined(self, meshes: Sequence[np.ndarray], errors: Sequence[np.ndarray] | None) -> list[np.ndarray] | None:

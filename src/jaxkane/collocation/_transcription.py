@@ -164,12 +164,11 @@ class Transcription:
         for p, layout in enumerate(self.layouts):
             self._add_functions(builder, p, layout)
         for i, how in enumerate(self.phases.links):
-            self._add_link(builder, i, how)
+            self._add_link(builder, i, how, dynamics)
         self.rows = builder.rows
         self._check_functions(builder)
         g_scale = builder.scales(self.x, self.x_scale)
-        arguments = builder.arguments()
-        self.program = NonlinearProgram(*arguments, self.x_bounds, builder.bounds, self.x_scale, g_scale)
+        self.program = NonlinearProgram(*builder.arguments(), self.x_bounds, builder.bounds, self.x_scale, g_scale)
         self.program.f_scale = self._cost_scale()
 
     @property
@@ -219,7 +218,7 @@ class Transcription:
             at = dict(zip(layout.problem.names, self.x[layout.node(k)].round(6).tolist()))
             raise ValueError(
                 f"Problem: with the initial guess, the rates of {', '.join(names)} are not finite at "
-                f"{layout.s[k]:.3g} of the duration, where the state is {at}. Pass another guess: solve(problem, guess)."
+                f"{layout.s[k]:.3g} of the duration, where the state is {at}. Pass another guess to solve."
             )
 
     def _scales(self, blocks: Sequence[EvaluatedBlock]) -> np.ndarray:
@@ -274,21 +273,36 @@ class Transcription:
         block = EvaluatedBlock(Block(ends, data, columns, has_cost + len(items)))
         builder.constraints("conditions", p, block, items, has_cost=has_cost)
 
-    def _add_link(self, builder: _Builder, i: int, how: Any) -> None:
+    def _add_link(self, builder: _Builder, i: int, how: Any, dynamics: Sequence[EvaluatedBlock]) -> None:
         j = (i + 1) % len(self.layouts)
         one, other = self.layouts[i], self.layouts[j]
-        link = Link(one.variables, other.variables, how)
+        linked = other.problem.names
+        if j <= i:  # the motion is periodic, except for coordinates that no rate depends on
+            used = {c for block in dynamics for c in block.pattern.columns}
+            n_q = len(other.problem.system.coordinates)
+            linked = tuple(name for k, name in enumerate(linked) if k >= n_q or k in used)
+        link = Link(one.variables, other.variables, how, linked, one is other)
         data = (one.node_data(one.s[-1:]), other.node_data(other.s[:1]))
-        durations = [x.duration for x in (one, other) if x.duration is not None]
-        columns = np.concatenate([one.node(one.K - 1), other.node(0), durations, one.parameters]).astype(int)[None]
-        x = jax.ShapeDtypeStruct((columns.shape[1],), jnp.float64)
-        size = jax.eval_shape(link, jax.tree.map(lambda a: jnp.asarray(a)[0], data), x).shape[0]
-        names = [f"link {i}" if callable(how) else f"link {i}: {name}" for name in other.problem.names]
-        names = [f"link {i}: event {how!r}", *names] if isinstance(how, str) else names
-        names = [f"link {i}"] * size if callable(how) else names
-        builder.constraints(
-            "links", i, EvaluatedBlock(Block(link, data, columns, size)), [(n, (0.0, 0.0)) for n in names]
-        )
+        durations = dict.fromkeys(x.duration for x in (one, other) if x.duration is not None)
+        columns = np.concatenate([one.node(one.K - 1), other.node(0), [*durations], one.parameters]).astype(int)[None]
+        if callable(how):
+            names = [*self._names_of_link(link, data, columns)]
+        else:
+            names = [f"link {i}: {name}" for name in ([how] if how is not None else []) + [*linked]]
+        block = EvaluatedBlock(Block(link, data, columns, len(names)))
+        builder.constraints("links", i, block, [(name, (0.0, 0.0)) for name in names])
+
+    def _names_of_link(self, link: Link, data: Any, columns: np.ndarray) -> list[str]:
+        found: list[str] = []
+
+        def recorded(last: Any, first: Any) -> Any:
+            values = named("links", called("links", link.how, last, first))
+            found.extend(values)
+            return values
+
+        node = jax.tree.map(lambda a: jnp.asarray(a)[0], data)
+        jax.eval_shape(dataclasses.replace(link, how=recorded), node, jnp.asarray(self.x[columns[0]]))
+        return found
 
     def _constraints(self, layout: Layout, label: str, f: Any, k: int) -> dict[str, Bound]:
         """The bounds of the constraints that a function of the user returns, by name."""
@@ -413,7 +427,7 @@ class _Builder:
     def bounds(self) -> Bounds:
         return Bounds(np.concatenate([*self._lower, []]), np.concatenate([*self._upper, []]))
 
-    def arguments(self) -> tuple[Any, ...]:
+    def arguments(self) -> tuple[Any, Any, Any, Any]:
         """Blocks, weights, matrices of constraints and the linear matrix, as `NonlinearProgram` takes them."""
         matrices = []
         for block, entries in zip(self.blocks, self.entries, strict=True):
@@ -465,8 +479,8 @@ def _layouts(problems: Sequence[Problem], meshes: Sequence[np.ndarray], method: 
         next_one += problem.has_free_duration
     parameters = variables[0].parameters
     places = np.arange(next_one, next_one + (0 if parameters is None else parameters.size))
-    rows = zip(problems, variables, meshes, nodes, firsts[:-1].tolist(), durations, strict=True)
-    return [Layout(*row, places) for row in rows]
+    rows: Any = zip(problems, variables, meshes, nodes, firsts[:-1].tolist(), durations, strict=True)
+    return [Layout(p, v, mesh, s, first, duration, places) for p, v, mesh, s, first, duration in rows]
 
 
 def scales_of(layout: Layout, block: EvaluatedBlock, x: np.ndarray) -> np.ndarray:
