@@ -312,11 +312,13 @@ def _first_mesh(guess: Any, intervals: int) -> np.ndarray:
 
 
 def _guessed(problem: Problem, guess: Any, s: np.ndarray, detour: Any) -> Motion:
-    if isinstance(guess, Plan) and guess.problem.names == problem.names:
-        if tuple(guess.problem.bounds_of_controls) == tuple(problem.bounds_of_controls):
-            found = interpolated(guess.motion, guess.mesh / guess.duration, guess.method, s)
-            low, high = problem.durations
-            return found._replace(duration=min(max(guess.duration, low), high))
+    def names(p: Problem) -> tuple[str, ...]:
+        return (*p.names, *p.bounds_of_controls)
+
+    if isinstance(guess, Plan) and names(guess.problem) == names(problem):
+        found = interpolated(guess.motion, guess.mesh / guess.duration, guess.method, s)
+        low, high = problem.durations
+        return found._replace(duration=min(max(guess.duration, low), high))
     return guess_of(problem, getattr(guess, "trajectory", guess), s, detour)
 
 
@@ -412,9 +414,9 @@ def active_of(transcription: Transcription, solution: Solution, p: int) -> tuple
                 found.append(f"{name} at its {side} bound")
     g = program.constraints(solution.z)
     for row in transcription.rows:
-        if row.phase == p and row.kind in ("path", "conditions"):
-            if any(is_active(g[row.rows], program.g_lower[row.rows], program.g_upper[row.rows])):
-                found.append(row.name)
+        is_own = row.phase == p and row.kind in ("path", "conditions")
+        if is_own and any(is_active(g[row.rows], program.g_lower[row.rows], program.g_upper[row.rows])):
+            found.append(row.name)
     return tuple(found)
 
 

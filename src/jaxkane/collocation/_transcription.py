@@ -338,12 +338,11 @@ class Transcription:
                     f"Problem: `{label}` is not finite at the initial guess. Pass another guess: solve(problem, guess)."
                 )
         for row in builder.rows:
-            if row.kind in ("path", "conditions") and not row.name.startswith("configuration"):
-                if not builder.has_derivative(row):
-                    raise ValueError(
-                        f"Problem: `{row.kind}`: the derivative of {row.name!r} is zero everywhere. Return a smooth "
-                        "signed number, not a truth value or a rounded one."
-                    )
+            if row.kind in ("path", "conditions", "links") and not builder.has_derivative(row):
+                raise ValueError(
+                    f"Problem: `{row.kind}`: the derivative of {row.name!r} is zero everywhere. Return a smooth signed "
+                    "number, not a truth value or a rounded one."
+                )
 
     def _cost_scale(self) -> float:
         """The size of the cost at the guess, or one third of a scale away from it: at the guess it may be zero."""
