@@ -187,7 +187,7 @@ class NonlinearProgram:
 
     def _map_jacobian(self) -> None:
         """Each entry of the Jacobian of g, and of the gradient of f, is a sum of entries of the blocks."""
-        A = self._A.tocoo()  # pyright: ignore[reportAttributeAccessIssue]
+        A = scipy.sparse.coo_matrix(self._A)
         rows, columns, sources, factors = [A.row], [A.col], [], []
         self._gradient_maps, places = [], []
         total = 0
