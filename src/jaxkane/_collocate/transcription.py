@@ -77,6 +77,7 @@ class PhaseProblem(Protocol):
     def n_local(self) -> int: ...
     @property
     def n_constraints(self) -> int: ...
+    def variables(self) -> Variables: ...
 
 
 class Motion(NamedTuple):
@@ -138,6 +139,13 @@ class Layout:
         """For each node, the variables (K, n) that its functions use."""
         return np.concatenate([self.node(np.arange(self.K)), np.tile(self.shared, (self.K, 1))], axis=1)
 
+    def quadrature(self, method: Lobatto) -> np.ndarray:
+        """The weights (K,) of the nodes in an integral over the fraction of the duration."""
+        weights, steps, every = np.zeros(self.K), np.diff(self.mesh), len(method.c) - 1
+        for j, b in enumerate(method.b):
+            np.add.at(weights, np.arange(len(steps)) * every + j, steps * b)
+        return weights
+
     def node_data(self, s: np.ndarray) -> dict[str, Any]:
         """The data of nodes: their fractions, and the values of sampled inputs if their times are fixed."""
         signals = {} if callable(self.problem.signals) else self.problem.signals
@@ -147,7 +155,7 @@ class Layout:
         return {"s": s, "inputs": inputs}
 
 
-def variables_of(problem: PhaseProblem, origin: float = 0.0) -> Variables:
+def variables_of(problem: PhaseProblem) -> Variables:
     """How the nodes of a problem are read."""
     signals = problem.signals
     if not problem.has_free_duration and not callable(signals):
@@ -157,7 +165,7 @@ def variables_of(problem: PhaseProblem, origin: float = 0.0) -> Variables:
         signals=signals,
         parameters=problem.parameters,
         duration=None if problem.has_free_duration else jnp.asarray(problem.durations[0], float),
-        origin=jnp.asarray(origin, float),
+        origin=jnp.zeros(()),
         controls=tuple(problem.bounds_of_controls),
         n_y=len(problem.names),
     )
@@ -214,9 +222,9 @@ class Transcription:
         ]
         self._check_finite_dynamics(dynamics)
         self.x_scale = self._scales(dynamics)
-        builder = Builder(self.n)
+        builder = Builder(self.n, self.method)
         for p, (layout, block) in enumerate(zip(self.layouts, dynamics, strict=True)):
-            builder.defects(p, layout, block, self.method, self.x_scale)
+            builder.defects(p, layout, block, self.x_scale)
         for p, layout in enumerate(self.layouts):
             self._add_functions(builder, p, layout)
         for i, how in enumerate(self.links):
@@ -298,11 +306,8 @@ class Transcription:
         problem, variables = layout.problem, layout.variables
         data = layout.node_data(layout.s)
         if problem.cost is not None:
-            weights = np.zeros(layout.K)
-            steps = np.diff(layout.mesh)
-            for j, b in enumerate(self.method.b):
-                np.add.at(weights, np.arange(len(steps)) * (len(self.method.b) - 1) + j, steps * b)
-            builder.cost(EvaluatedBlock(Block(Integrand(variables, problem.cost), data, layout.columns, 1)), weights)
+            block = EvaluatedBlock(Block(Integrand(variables, problem.cost), data, layout.columns, 1))
+            builder.cost(block, layout.quadrature(self.method))
         along = {k: v for k, v in problem.limits.items() if k not in (*problem.names, *variables.controls)}
         path = self._constraints(layout, "path", problem.path, 0) if problem.path is not None else {}
         if along or path:
@@ -419,8 +424,8 @@ class Transcription:
 class Builder:
     """Collects blocks, constraints and their bounds."""
 
-    def __init__(self, n: int) -> None:
-        self.n, self.m = n, 0
+    def __init__(self, n: int, method: Lobatto) -> None:
+        self.n, self.m, self.method = n, 0, method
         self.blocks: list[EvaluatedBlock] = []
         self.weights: list[np.ndarray | None] = []
         self.entries: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = []  # rows, places of values, factors
@@ -435,7 +440,8 @@ class Builder:
         self.m += k
         return np.arange(self.m - k, self.m)
 
-    def defects(self, p: int, layout: Layout, block: EvaluatedBlock, method: Lobatto, x_scale: np.ndarray) -> None:
+    def defects(self, p: int, layout: Layout, block: EvaluatedBlock, x_scale: np.ndarray) -> None:
+        method = self.method
         n_y, steps, s = layout.variables.n_y, np.diff(layout.mesh), len(method.c)
         N = len(steps)
         first = np.arange(N) * (s - 1)
@@ -531,7 +537,7 @@ def _sparse(entries: tuple[np.ndarray, np.ndarray, np.ndarray], shape: tuple[int
 
 
 def _layouts(problems: Sequence[PhaseProblem], meshes: Sequence[np.ndarray], method: Lobatto) -> list[Layout]:
-    variables = [variables_of(problem) for problem in problems]
+    variables = [problem.variables() for problem in problems]
     nodes = [nodes_of(mesh, method) for mesh in meshes]
     firsts = np.cumsum([0, *(len(s) * v.n_z for s, v in zip(nodes, variables, strict=True))])
     next_one = int(firsts[-1])
