@@ -239,6 +239,11 @@ class Problem:
         return variables_of(self)
 
     @property
+    def is_piecewise(self) -> bool:
+        """Whether controls are constant in each interval."""
+        return False
+
+    @property
     def n_local(self) -> int:
         """The number of parameters that belong to this phase alone."""
         return 0
