@@ -29,7 +29,7 @@ from .api import (
     kinetic_energy,
     partial_velocities,
 )
-from .arguments import as_row, check_is_system, is_concrete
+from .arguments import as_row, check_is_system, is_concrete, refuse_multipliers
 from .checks import check_system
 from .description import DescriptionEvaluator
 from .kanes_method import motion_rates_by_matrix
@@ -115,6 +115,7 @@ class Formulas:
 
     def __init__(self, system: System, dtype: str = "float64", more: Mapping[str, Function] | None = None):
         check_is_system(system)
+        refuse_multipliers(system)
         self.system, self.name, self.dtype = system, type(system).__name__, str(jnp.dtype(dtype))
         self.functions = {**FUNCTIONS, **(more or {})}
         if self.dtype not in ("float64", "float32"):
