@@ -5,6 +5,7 @@ All are written from the graph of scalars from which native kernels are written,
 
 from ._filter import ExportedFilter as ExportedFilter
 from ._filter import c_filter as c_filter
+from ._fmu import fmu as fmu
 from ._programs import casadi as casadi
 from ._programs import stablehlo as stablehlo
 from ._source import ExportedFiles as ExportedFiles
