@@ -128,6 +128,8 @@ def _checked(system: System, path: str | Path, fmi: str, kinds: tuple[str, ...],
         raise TypeError(f"{name} is traced. Call this function outside of jax.jit, vmap and grad.")
     if batched := in_batches(system):
         raise ValueError(f"{name} is a batch: {', '.join(batched)} has additional leading axes. Pass one member of it.")
+    if not system.coordinates and not system.states:
+        raise ValueError(f"{name} has no coordinates and no first-order states, so an FMU would have no states.")
     if has_contacts(system):
         raise ValueError(
             f"{name}: an FMU cannot represent contacts: {', '.join(layout_of(system).names)}. Replace them by spring "
@@ -145,11 +147,12 @@ def _checked(system: System, path: str | Path, fmi: str, kinds: tuple[str, ...],
 
 def _model(system: System, path: Path, step: float, state: State | None) -> FMUModel:
     (name,) = identifiers([path.stem], C_WORDS)
+    if not isinstance(state, (State, type(None))):
+        raise TypeError(f"fmu: `state` must be a jaxkane.State, got {state!r}.")
     try:
-        given = ({}, {}) if state is None else (state.q, state.u, state.x)
-        start = assemble(system, *given)
-    except (ValueError, TypeError) as error:
-        raise type(error)(f"fmu: the start values: {error} Pass other values as `state`.") from error
+        start = assemble(system, {}, {}) if state is None else assemble(system, state.q, state.u, state.x)
+    except ValueError as error:
+        raise ValueError(f"fmu: there are no start values. {error} Pass other values as `state`.") from error
     with jax.enable_x64(True):
         return FMUModel(system, start, name, step)
 
@@ -181,8 +184,9 @@ def _compiled(source: str, name: str) -> tuple[bytes | None, str]:
         except OSError as error:
             return None, f"The C compiler {compilers[0][0]!r} cannot be run: {error.strerror}."
         if run.returncode or not target.exists():
-            lines = [line for line in run.stderr.splitlines() if "error" in line] or run.stderr.splitlines() or [""]
-            return None, f"The C compiler {compilers[0][0]!r} failed: {lines[0].strip()}."
+            lines = [line for line in run.stderr.splitlines() if "error" in line] or run.stderr.splitlines()
+            reason = f": {lines[0].strip()}" if lines else f" (status {run.returncode})"
+            return None, f"The C compiler {compilers[0][0]!r} failed{reason}."
         return target.read_bytes(), ""
 
 

@@ -41,7 +41,8 @@ enum { CREATED, INITIALIZING, EVENT_MODE, CONTINUOUS, STEPPING, TERMINATED };
 /* All that changes. It has no pointers, so a copy of its bytes restores it. */
 typedef struct {
     double t, p[SIZE(N_P)], w[SIZE(N_W)], y[SIZE(N_Y)];
-    int side[SIZE(N_E)]; /* side of zero from which each event function comes: 1 or -1 */
+    int side[SIZE(N_E)];     /* side of zero from which each event function comes: 1 or -1 */
+    double slack[SIZE(N_E)]; /* how far beyond zero a function may be before it counts as crossed */
     int mode;
     int ended_by;         /* the event that ended the simulation, or -1 */
     double first_jump;    /* start of the time span in which jumps are counted [s] */
@@ -187,37 +188,9 @@ static bool is_possible(int j, const double *condition) {
     return condition_of[j] < 0 || condition[condition_of[j]] > 0.0;
 }
 
-/* Stores the side of zero of each event function. At zero, an event with a direction is still ahead, unless its
-   condition is not met; one without direction has occurred. `done`: events that just occurred. A function that its own
-   jump does not change has passed zero. */
-static int set_sides(instance *m, const bool *done, const double *rates_before) {
-    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)];
-    int j;
-    if (N_E == 0) return OK;
-    events_of(m->now.t, m->now.y, m->now.w, m->now.p, g, g_dot, condition);
-    for (j = 0; j < N_E; j++) {
-        const bool is_zero = fabs(g[j]) <= fabs(g_dot[j]) * rounding(m->now.t);
-        const bool is_ahead = directions[j] * g_dot[j] > 0.0;
-        m->now.side[j] = g[j] > 0.0 ? 1 : -1;
-        if (!is_zero) continue;
-        m->now.side[j] = directions[j] ? -directions[j] : g_dot[j] < 0.0 ? -1 : 1;
-        if (is_ahead && !is_possible(j, condition)) {
-            m->now.side[j] = directions[j];
-        } else if (is_ahead && done && done[j]) {
-            if (fabs(g_dot[j] - rates_before[j]) > sqrt(DBL_EPSILON) * fabs(rates_before[j])) {
-                report(m, ERROR, "t = %.17g: the jump at the event '%s' does not change the direction in which its "
-                       "function crosses zero, so the event would occur again at once.", m->now.t, event_names[j]);
-                return ERROR;
-            }
-            m->now.side[j] = directions[j];
-        }
-    }
-    return OK;
-}
-
-/* Whether an event function has crossed zero in the direction of its event. */
+/* Whether the function of an event has crossed zero in the direction of the event. */
 static bool has_crossed(const model_state *s, int j, double g) {
-    return s->side[j] * g < 0.0 && (directions[j] == 0 || directions[j] == -s->side[j]);
+    return s->side[j] * g < -s->slack[j] && (directions[j] == 0 || directions[j] == -s->side[j]);
 }
 
 /* Whether an event occurs now: its function has crossed zero, or crosses it within a rounding error. */
@@ -227,14 +200,84 @@ static bool is_due(const model_state *s, int j, const double *g, const double *g
         && (has_crossed(s, j, g[j]) || (comes && fabs(g[j]) <= fabs(g_dot[j]) * rounding(s->t)));
 }
 
+/* What a jump does to the function of its event: MOVES it away from zero, or leaves it at zero, from where it goes BACK
+   or is PASSED through zero, without another jump. */
+enum { NOTHING, MOVES, BACK, PASSED };
+
+/* Stores the side of zero of each event function. At zero, an event with a direction is still ahead, unless its
+   condition is not met; one without direction has occurred. `effects`: of the jumps that just occurred. */
+static void set_sides(model_state *s, const int *effects) {
+    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
+    int j;
+    if (N_E == 0) return;
+    events_of(s->t, s->y, s->w, s->p, g, g_dot, condition);
+    for (j = 0; j < N_E; j++) {
+        const bool is_zero = fabs(g[j]) <= fabs(g_dot[j]) * rounding(s->t);
+        const bool is_ahead = directions[j] * g_dot[j] > 0.0;
+        const int previous = s->side[j];
+        s->side[j] = g[j] > 0.0 ? 1 : -1;
+        if (is_zero && directions[j]) s->side[j] = is_ahead && !is_possible(j, condition) ? directions[j] : -directions[j];
+        else if (is_zero) s->side[j] = g_dot[j] < 0.0 ? -1 : 1;
+        if (effects && effects[j] == PASSED) s->side[j] = -previous;
+        if (effects && effects[j] == BACK) s->side[j] = previous;
+        /* A function that goes back may still be beyond zero. Without this slack, a ball whose bounces are shorter than
+           the importer's tolerance falls through the floor. */
+        s->slack[j] = effects && effects[j] == BACK ? 2.0 * fmax(0.0, -previous * g[j]) : 0.0;
+    }
+}
+
+/* The effect of a jump at the event j, from the states before and after it; -1 if the event would occur again. */
+static int effect_of(const model_state *s, int j, double t, const double *y, const double *after) {
+    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0}, g_before, rate_before, rate;
+    events_of(t, y, s->w, s->p, g, g_dot, condition);
+    g_before = g[j];
+    rate_before = g_dot[j];
+    events_of(t, after, s->w, s->p, g, g_dot, condition);
+    rate = g_dot[j];
+    if (fabs(g[j] - g_before) > (fabs(rate_before) + fabs(rate)) * rounding(t)) return MOVES;
+    if (s->side[j] * rate >= 0.0) return BACK;
+    /* Functions of the time, for example, cross zero at the same rate after the jump. */
+    if (fabs(rate - rate_before) <= sqrt(DBL_EPSILON) * fabs(rate_before) || !is_possible(j, condition)) return PASSED;
+    return -1;
+}
+
+/* Whether the function of an event returns to its side after a jump, by its speed and acceleration. A ball with a
+   restitution of zero does not, and a ball whose bounces are shorter than the importer's tolerance does not. */
+static bool returns(const model_state *s, int j) {
+    double g[SIZE(N_E)], g_dot[SIZE(N_E)], later[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
+    double rate[SIZE(N_Y)], y[SIZE(N_Y)], depth, speed, acceleration;
+    const double dt = 1e-3 * STEP;
+    int i;
+    events_of(s->t, s->y, s->w, s->p, g, g_dot, condition);
+    depth = -s->side[j] * g[j];
+    speed = s->side[j] * g_dot[j];
+    rate_of(s->t, s->y, s->w, s->p, rate);
+    for (i = 0; i < N_Y; i++) y[i] = s->y[i] + dt * rate[i];
+    events_of(s->t + dt, y, s->w, s->p, g, later, condition);
+    acceleration = s->side[j] * (later[j] - g_dot[j]) / dt;
+    if (depth < 0.0 || (speed >= 0.0 && acceleration >= 0.0)) return true;
+    return speed > 0.0 && speed * speed > -2.0 * acceleration * depth;
+}
+
+/* The time from now to the crossing of an event function, to first order; 0 if the function is not nearly linear. */
+static double time_to_crossing(const model_state *s, int j, double g, double g_dot, const double *rate) {
+    double y[SIZE(N_Y)], at_g[SIZE(N_E)], at_g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
+    const double shift = -g / g_dot;
+    int i;
+    if (!(fabs(shift) <= STEP)) return 0.0;
+    for (i = 0; i < N_Y; i++) y[i] = s->y[i] + shift * rate[i];
+    events_of(s->t + shift, y, s->w, s->p, at_g, at_g_dot, condition);
+    return at_g_dot[j] * g_dot > 0.0 ? shift : 0.0;
+}
+
 /* The jump of an event. An importer stops a little after the crossing. So the state is continued to the time of the
-   crossing, t - g/g_dot, jumps there, and is continued to the present time; the error is quadratic in the difference. */
-static int jump(instance *m, int j, double g, double g_dot) {
-    double rate[SIZE(N_Y)], y[SIZE(N_Y)], after[SIZE(N_Y)], change[SIZE(N_M)];
-    double shift = g_dot != 0.0 && isfinite(g / g_dot) && fabs(g / g_dot) <= STEP ? -g / g_dot : 0.0;
-    const double at = m->now.t + shift;
+   crossing, jumps there, and is continued to the present time. The error is quadratic in the difference. */
+static int jump(instance *m, int j, double g, double g_dot, int *effect) {
+    double rate[SIZE(N_Y)], y[SIZE(N_Y)], after[SIZE(N_Y)], change[SIZE(N_M)], shift, at;
     int i;
     rate_of(m->now.t, m->now.y, m->now.w, m->now.p, rate);
+    shift = time_to_crossing(&m->now, j, g, g_dot, rate);
+    at = m->now.t + shift;
     for (i = 0; i < N_Y; i++) y[i] = m->now.y[i] + shift * rate[i];
     jump_of(j, at, y, m->now.w, m->now.p, after);
     if (!is_finite(after, N_Y) || (N_H > 0 && !(correction(&m->now, at, after, change) <= 1e-6))) {
@@ -242,8 +285,14 @@ static int jump(instance *m, int j, double g, double g_dot) {
                "constraint.", at, event_names[j]);
         return ERROR;
     }
+    *effect = effect_of(&m->now, j, at, y, after);
     rate_of(at, after, m->now.w, m->now.p, rate);
     for (i = 0; i < N_Y; i++) m->now.y[i] = after[i] - shift * rate[i];
+    if (*effect < 0 || (*effect == BACK && !returns(&m->now, j))) {
+        report(m, ERROR, "t = %.17g: after the jump at the event '%s', its function crosses zero again at once. "
+               "The jumps accumulate at this time.", at, event_names[j]);
+        return ERROR;
+    }
     if (m->now.n_jumps == 0 || m->now.t - m->now.first_jump > STEP) {
         m->now.first_jump = m->now.t;
         m->now.n_jumps = 0;
@@ -259,15 +308,15 @@ static int jump(instance *m, int j, double g, double g_dot) {
 /* All events that occur now, in alphabetical order. An event is skipped if an earlier one has changed the direction in
    which its function crosses zero. */
 static int perform_events(instance *m, bool *changed) {
-    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)], before[SIZE(N_E)];
-    bool due[SIZE(N_E)], done[SIZE(N_E)];
-    int j;
+    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
+    bool due[SIZE(N_E)];
+    int effects[SIZE(N_E)], j;
     *changed = false;
     if (N_E == 0 || m->now.ended_by >= 0) return OK;
     events_of(m->now.t, m->now.y, m->now.w, m->now.p, g, g_dot, condition);
     for (j = 0; j < N_E; j++) {
         due[j] = is_due(&m->now, j, g, g_dot, condition);
-        done[j] = false;
+        effects[j] = NOTHING;
     }
     for (j = 0; j < N_E; j++) {
         if (!due[j] || (*changed && !(m->now.side[j] * g_dot[j] < 0.0))) continue;
@@ -275,12 +324,12 @@ static int perform_events(instance *m, bool *changed) {
             m->now.ended_by = j;
             return OK;
         }
-        before[j] = g_dot[j];
-        if (jump(m, j, g[j], g_dot[j]) != OK) return ERROR;
-        *changed = done[j] = true;
+        if (jump(m, j, g[j], g_dot[j], &effects[j]) != OK) return ERROR;
+        *changed = true;
         events_of(m->now.t, m->now.y, m->now.w, m->now.p, g, g_dot, condition);
     }
-    return set_sides(m, done, before);
+    set_sides(&m->now, effects);
+    return OK;
 }
 
 /* ---- Integration, for co-simulation ---- */
@@ -300,7 +349,7 @@ static void advance(const model_state *s, double h, double *y) {
 
 /* The length [s] of the step after which an event function crosses zero, by Newton's method between bounds. */
 static double length_to_crossing(const model_state *s, int j, double h) {
-    double y[SIZE(N_Y)], g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)], low = 0.0, high = h, place = h;
+    double y[SIZE(N_Y)], g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0}, low = 0.0, high = h, place = h;
     int k;
     for (k = 0; k < 100; k++) {
         double next;
@@ -319,7 +368,7 @@ static double length_to_crossing(const model_state *s, int j, double h) {
 /* The time from now to the first event within a step from now, which ends at y1; infinity if there is none, and
    negative if the dependent speeds become singular. */
 static double first_event(const model_state *s, double h, const double *y1, int *which) {
-    double before[SIZE(N_E)], g[SIZE(N_E)], g_dot[SIZE(N_E)], at_start[SIZE(N_C)], at_end[SIZE(N_C)], first = INFINITY;
+    double before[SIZE(N_E)], g[SIZE(N_E)], g_dot[SIZE(N_E)], at_start[SIZE(N_C)] = {0.0}, at_end[SIZE(N_C)] = {0.0}, first = INFINITY;
     int j;
     *which = 0;
     if (N_E == 0) return first;
@@ -340,12 +389,14 @@ static double first_event(const model_state *s, double h, const double *y1, int 
 
 /* Updates the sides after a step without an event. */
 static void follow_sides(model_state *s) {
-    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)];
+    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
     int j;
     if (N_E == 0) return;
     events_of(s->t, s->y, s->w, s->p, g, g_dot, condition);
-    for (j = 0; j < N_E; j++)
-        if (g[j] != 0.0) s->side[j] = g[j] > 0.0 ? 1 : -1;
+    for (j = 0; j < N_E; j++) {
+        if (s->side[j] * g[j] < -s->slack[j]) s->side[j] = -s->side[j];
+        if (s->side[j] * g[j] > 0.0) s->slack[j] = 0.0;
+    }
 }
 
 /* One step to time `end`, divided at events. It stops at an event that ends the simulation. */
@@ -372,7 +423,10 @@ static int step_to(instance *m, double end) {
         passed = -m->now.side[which];
         if (first > h) follow_sides(&m->now);
         else if (perform_events(m, &changed) != OK) return ERROR;
-        else if (!changed && m->now.ended_by < 0) m->now.side[which] = passed; /* the condition of the event is not met */
+        else if (!changed && m->now.ended_by < 0) {
+            m->now.side[which] = passed; /* the condition of the event is not met */
+            m->now.slack[which] = 0.0;
+        }
     }
     return OK;
 }
@@ -423,7 +477,7 @@ static int initialize(instance *m) {
         report(m, ERROR, "The rates of the states are not finite at the start values.");
         return ERROR;
     }
-    if (set_sides(m, NULL, NULL) != OK) return ERROR;
+    set_sides(&m->now, NULL);
     m->now.mode = m->co_simulation ? STEPPING : EVENT_MODE;
     return m->co_simulation ? perform_events(m, &changed) : OK;
 }
@@ -431,12 +485,12 @@ static int initialize(instance *m) {
 /* Signs of event functions, with a hysteresis of a rounding error: after a jump, a function that is zero has the sign of
    its side. */
 static void indicators(const model_state *s, double *z) {
-    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)];
+    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
     int j;
     if (N_E > 0) events_of(s->t, s->y, s->w, s->p, g, g_dot, condition);
     for (j = 0; j < N_E; j++) {
         const double width = isfinite(g_dot[j]) ? fabs(g_dot[j]) * rounding(s->t) : 0.0;
-        z[j] = g[j] + s->side[j] * (width + DBL_MIN);
+        z[j] = g[j] + s->side[j] * (width + s->slack[j] + DBL_MIN);
     }
 }
 
@@ -449,7 +503,7 @@ static int get_rates(instance *m, double *rate) {
 
 static int get_numbers(instance *m, const uint32_t *references, size_t n, double *values) {
     const model_state *s = &m->now;
-    double rate[SIZE(N_Y)], sensed[SIZE(N_S)], z[SIZE(N_E)];
+    double rate[SIZE(N_Y)] = {0.0}, sensed[SIZE(N_S)] = {0.0}, z[SIZE(N_E)] = {0.0};
     bool has_rates = false, has_sensed = false, has_indicators = false;
     size_t i;
     if (m->now.mode == INITIALIZING && assemble(m) != OK) return ERROR;
@@ -509,7 +563,7 @@ static int get_directional(instance *m, const uint32_t *unknowns, size_t n_unkno
                            size_t n_knowns, const double *seed, double *values) {
     const model_state *s = &m->now;
     double dt = 0.0, dp[SIZE(N_P)] = {0.0}, dw[SIZE(N_W)] = {0.0}, dy[SIZE(N_Y)] = {0.0};
-    double rate[SIZE(N_Y)], sensed[SIZE(N_S)], g[SIZE(N_E)];
+    double rate[SIZE(N_Y)] = {0.0}, sensed[SIZE(N_S)] = {0.0}, g[SIZE(N_E)] = {0.0};
     size_t i;
     for (i = 0; i < n_knowns; i++) {
         const int64_t r = knowns[i];
