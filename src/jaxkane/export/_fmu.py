@@ -1,4 +1,4 @@
-"""Export a system as a functional mock-up unit (FMU), which simulation programs import. Compiles, and writes the file."""
+"""Export a system as a functional mock-up unit (FMU), which simulation programs import. Compiles it and writes it."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def fmu(
     | coordinates, independent speeds, first-order states | continuous states, which are outputs |
     | dependent speeds, outputs | outputs |
     | inputs | inputs |
-    | parameters | tunable parameters, with units and bounds; fixed ones if the configuration constraints depend on them |
+    | parameters | tunable parameters with bounds; fixed parameters if configuration constraints depend on them |
     | events without `then`, det C_dep = 0 | end of the simulation |
     | events with `then` | jumps of the states |
 
@@ -96,8 +96,8 @@ def fmu(
         if not sources:
             raise RuntimeError(f"fmu: {why_not} Install a C compiler, or pass sources=True to export the C source.")
         warnings.warn(
-            f"jaxkane.export.fmu: {why_not} {path.name} contains only C source. Only programs that compile it can import "
-            "it. Install a C compiler and export it again to add a binary.",
+            f"jaxkane.export.fmu: {why_not} {path.name} contains only C source, which not all programs can import. "
+            "Install a C compiler and export it again to add a binary.",
             stacklevel=2,
         )
     files: dict[str, str | bytes] = {"modelDescription.xml": model_description(model, fmi, kinds, token, sources)}

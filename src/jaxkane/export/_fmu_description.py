@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from .._version import __version__
-from ._fmu_model import FMUModel, Variable
+from ._fmu_model import LOCAL, FMUModel, Variable
 
 KINDS = {"model exchange": "ModelExchange", "co-simulation": "CoSimulation"}
 
@@ -33,19 +33,19 @@ def model_description(model: FMUModel, fmi: str, kinds: Sequence[str], token: st
     root.set("generationTool", f"jaxkane {__version__}")
     root.set("variableNamingConvention", "structured" if all(map(_is_structured, variables)) else "flat")
     if is_2 and "model exchange" in kinds:
-        root.set("numberOfEventIndicators", str(len(model.crossings.names)))
+        root.set("numberOfEventIndicators", str(len(model.g)))
     for kind, tag in KINDS.items():
         if kind in kinds:
-            element = ElementTree.SubElement(root, tag, modelIdentifier=model.name, **_capabilities(kind, fmi))
+            element = ElementTree.SubElement(root, tag, {"modelIdentifier": model.name} | _capabilities(kind, fmi))
             if is_2 and has_sources:
                 files = ElementTree.SubElement(element, "SourceFiles")
                 ElementTree.SubElement(files, "File", name=f"{model.name}.c")
     _units(root, variables)
     ElementTree.SubElement(root, "DefaultExperiment", startTime="0", stepSize=_number(model.step))
     listed = ElementTree.SubElement(root, "ModelVariables")
-    can_jump = any(model.crossings.jumps)
+    states = {x.derivative for x in variables} if any(model.events.stages) else set()
     for i, x in enumerate(variables):
-        _variable(listed, i, x, fmi, i in {y.derivative for y in variables} and can_jump)
+        _variable(listed, i, x, fmi, can_jump=i in states)
     _structure(ElementTree.SubElement(root, "ModelStructure"), variables, fmi)
     return _text(root)
 
@@ -80,14 +80,15 @@ def _capabilities(kind: str, fmi: str) -> dict[str, str]:
     return dict.fromkeys(names, "true")
 
 
-def _variable(parent: ElementTree.Element, place: int, x: Variable, fmi: str, is_reinitialized: bool) -> None:
-    common = {"name": x.name, "valueReference": str(place), "causality": x.causality, "variability": x.variability}
-    common |= {"initial": x.initial} if x.initial else {}
+def _variable(parent: ElementTree.Element, place: int, x: Variable, fmi: str, can_jump: bool) -> None:
+    common = {"name": x.name, "valueReference": str(place)}
+    common |= {"causality": x.role.causality, "variability": x.role.variability}
+    common |= {"initial": x.role.initial} if x.role.initial else {}
     common |= {"description": x.description} if x.description else {}
     of_number = {"unit": x.unit} if x.unit else {}
     of_number |= {"start": _number(x.start)} if x.start is not None else {}
     of_number |= {key: _number(b) for key, b in zip(("min", "max"), x.bounds, strict=True) if np.isfinite(b)}
-    of_number |= {"reinit": "true"} if is_reinitialized else {}
+    of_number |= {"reinit": "true"} if can_jump else {}
     if fmi == "2.0":  # places are counted from 1
         of_number |= {"derivative": str(x.derivative + 1)} if x.derivative is not None else {}
         ElementTree.SubElement(ElementTree.SubElement(parent, "ScalarVariable", common), "Real", of_number)
@@ -97,35 +98,36 @@ def _variable(parent: ElementTree.Element, place: int, x: Variable, fmi: str, is
 
 
 def _structure(parent: ElementTree.Element, variables: Sequence[Variable], fmi: str) -> None:
-    """Which variables are outputs, rates and event functions, and on which inputs, states and times they depend."""
+    """Which variables are outputs, rates and event functions, and on which states, inputs and times they depend."""
+    places = range(len(variables))
+    outputs = [i for i in places if variables[i].role.causality == "output"]
+    rates = [i for i in places if variables[i].derivative is not None]
     groups = {
-        "Output": [i for i, x in enumerate(variables) if x.causality == "output"],
-        "ContinuousStateDerivative": [i for i, x in enumerate(variables) if x.derivative is not None],
-        "InitialUnknown": [
-            i
-            for i, x in enumerate(variables)
-            if x.initial in ("approx", "calculated") and (x.causality == "output" or x.derivative is not None)
-        ],
-        "EventIndicator": [
-            i for i, x in enumerate(variables) if x.causality == "local" and x.derivative is None
-        ],
-    }  # fmt: skip
-    in_2 = {"Output": "Outputs", "ContinuousStateDerivative": "Derivatives", "InitialUnknown": "InitialUnknowns"}
-    for tag, places in groups.items():
-        if fmi == "2.0":
-            if not places or tag not in in_2:
-                continue
-            element, tag = ElementTree.SubElement(parent, in_2[tag]), "Unknown"
-        else:
-            element = parent
-        for i in places:
-            attributes = {"index": str(i + 1)} if fmi == "2.0" else {"valueReference": str(i)}
+        "Output": outputs,
+        "ContinuousStateDerivative": rates,
+        "InitialUnknown": [i for i in sorted(outputs + rates) if variables[i].role.initial != "exact"],
+        "EventIndicator": [i for i in places if variables[i].role == LOCAL and i not in rates],
+    }
+    if fmi == "2.0":  # it has lists of unknowns, with places that are counted from 1, and none of event indicators
+        names = {"Output": "Outputs", "ContinuousStateDerivative": "Derivatives", "InitialUnknown": "InitialUnknowns"}
+        for tag, name in names.items():
+            if groups[tag]:
+                element = ElementTree.SubElement(parent, name)
+                for i in groups[tag]:
+                    read = {} if tag == "InitialUnknown" else _dependencies(variables[i], i, first=1)
+                    ElementTree.SubElement(element, "Unknown", {"index": str(i + 1)} | read)
+        return
+    for tag, group in groups.items():
+        for i in group:
             # At the start, unknowns also depend on parameters and start values. Without a list, they depend on all.
-            if "InitialUnknown" not in (tag, element.tag.removesuffix("s")):
-                own = variables[i].dependencies
-                read = (i,) if own is None else own  # a state depends on itself
-                attributes["dependencies"] = " ".join(str(k + (fmi == "2.0")) for k in read)
-            ElementTree.SubElement(element, tag, attributes)
+            read = {} if tag == "InitialUnknown" else _dependencies(variables[i], i, first=0)
+            ElementTree.SubElement(parent, tag, {"valueReference": str(i)} | read)
+
+
+def _dependencies(x: Variable, place: int, first: int) -> dict[str, str]:
+    """The attribute with the places of the variables that determine a variable. A state determines itself."""
+    places = (place,) if x.dependencies is None else x.dependencies
+    return {"dependencies": " ".join(str(i + first) for i in places)}
 
 
 # Units of one letter or name as powers of SI base units.

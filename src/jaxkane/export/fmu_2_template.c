@@ -33,7 +33,8 @@ EXPORT const char *FULL(fmi2GetVersion)(void) { return "2.0"; }
 EXPORT void *FULL(fmi2Instantiate)(const char *name, int kind, const char *token, const char *resources,
                                    const callbacks2 *functions, int visible, int logging) {
     (void)resources, (void)visible, (void)logging;
-    return create(name, token, kind == 1, functions ? functions->environment : NULL, functions ? (function_type)functions->logger : NULL);
+    if (!functions) return create(name, token, kind == 1, NULL, NULL);
+    return create(name, token, kind == 1, functions->environment, (function_type)functions->logger);
 }
 EXPORT void FULL(fmi2FreeInstance)(instance *m) { destroy(m); }
 

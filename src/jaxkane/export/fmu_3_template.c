@@ -17,8 +17,8 @@ static void send(const instance *m, int status, const char *text) {
 
 EXPORT const char *FULL(fmi3GetVersion)(void) { return "3.0"; }
 
-EXPORT void *FULL(fmi3InstantiateModelExchange)(const char *name, const char *token, const char *resources, bool visible,
-                                                bool logging, void *environment, logger3 log) {
+EXPORT void *FULL(fmi3InstantiateModelExchange)(const char *name, const char *token, const char *resources,
+                                                bool visible, bool logging, void *environment, logger3 log) {
     (void)resources, (void)visible, (void)logging;
     return create(name, token, false, environment, (function_type)log);
 }
@@ -157,8 +157,9 @@ FUNCTION(fmi3GetDirectionalDerivative)(instance *m, const reference3 *unknowns, 
     if (check_size(m, n_seed, n_knowns) != OK || check_size(m, n_values, n_unknowns) != OK) return ERROR;
     return get_directional(m, unknowns, n_unknowns, knowns, n_knowns, seed, values);
 }
-FUNCTION(fmi3GetAdjointDerivative)(instance *m, const reference3 *unknowns, size_t n_unknowns, const reference3 *knowns,
-                                   size_t n_knowns, const double *seed, size_t n_seed, double *values, size_t n_values) {
+FUNCTION(fmi3GetAdjointDerivative)(instance *m, const reference3 *unknowns, size_t n_unknowns,
+                                   const reference3 *knowns, size_t n_knowns, const double *seed, size_t n_seed,
+                                   double *values, size_t n_values) {
     (void)unknowns, (void)n_unknowns, (void)knowns, (void)n_knowns, (void)seed, (void)n_seed, (void)values;
     return refuse(m, n_values);
 }
