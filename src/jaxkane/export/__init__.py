@@ -1,4 +1,4 @@
-"""Equations as C, NumPy source, a CasADi function or StableHLO. Does not simulate.
+"""Equations as C, NumPy source, a CasADi function, StableHLO or an FMU. Does not simulate.
 
 All are written from the graph of scalars from which native kernels are written, so each formula is defined only once.
 """
