@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mechanisms import Bead, Bob, BouncingBall, Odd
+from mechanisms import Bead, Bob, BouncingBall, Odd, SliderCrank
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
@@ -85,6 +85,26 @@ class Ball(jk.System):
         bounce = {"v": -self.restitution * u["v"], "bounces": x["bounces"] + 1.0}
         wall = jk.falling(q["h"] - 0.2, then={"v": 0.0}, when=-1.0 - 0.0 * q["h"])
         return {"end": t - self.duration, "floor": jk.falling(q["h"], then=bounce), "wall": wall}
+
+
+class Clock(jk.System):
+    """It counts events that depend only on the time. Two of them occur together."""
+
+    coordinates, speeds, states = ("x",), ("v",), ("waves", "at", "twice")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x))])
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return {}
+
+    def events(self, t, q, u, x):
+        return {
+            "at": jk.rising(t - 0.3, then={"at": x["at"] + 1.0}),
+            "twice": jk.falling(0.6 - 2.0 * t, then={"twice": x["twice"] + 1.0}),
+            "waves": jk.rising(jnp.sin(20.0 * t), then={"waves": x["waves"] + 1.0}),
+        }
 
 
 STATES = {
@@ -352,6 +372,14 @@ def test_events_jump_and_end_the_simulation(fmi, kind, fmu_of):
 
 @needs_compiler
 @pytest.mark.parametrize("kind", KINDS)
+def test_events_of_the_time_occur_once(kind, fmu_of):
+    """Also at the start, and at a communication point. The sine rises through zero at 0, 0.314, 0.628 and 0.942 s."""
+    last = fmpy.simulate_fmu(fmu_of(Clock(), "3.0"), fmi_type=kind, stop_time=1.0, output_interval=0.1)[-1]
+    assert [last[name] for name in ("waves", "at", "twice")] == [4.0, 1.0, 1.0]
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("restitution", [0.0, 0.5])
 def test_a_ball_does_not_fall_through_the_floor(kind, restitution, fmu_of):
     """Its bounces become shorter than any tolerance, at (1 + 2 e / (1 - e)) sqrt(2 h / g) = 0.45 and 1.35 s."""
@@ -393,6 +421,10 @@ def test_start_values_satisfy_the_constraints(fmi, fmu_of):
             unit.set({"length": 1.0})
     with Unit(fmu_of(Bob(), fmi)) as unit, pytest.raises(CallFailed):
         unit.start({"x": 3.0})  # longer than the pendulum
+    with Unit(fmu_of(SliderCrank(), fmi)) as unit:
+        unit.start({"crank": 1.0, "rod": 0.1, "x": 1.0})
+        rod = -np.arcsin(0.15 * np.sin(1.0) / 0.4)
+        assert unit.get("rod", "x") == pytest.approx((rod, 0.15 * np.cos(1.0) + 0.4 * np.cos(rod)), abs=atol)
 
 
 @needs_compiler

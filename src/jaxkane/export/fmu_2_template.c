@@ -70,10 +70,7 @@ NO_VARIABLES(Boolean, int)
 NO_VARIABLES(String, char *)
 
 FUNCTION(fmi2GetFMUstate)(instance *m, void **copy) { return copy_state(m, copy); }
-FUNCTION(fmi2SetFMUstate)(instance *m, void *copy) {
-    memcpy(&m->now, copy, sizeof(model_state));
-    return OK;
-}
+FUNCTION(fmi2SetFMUstate)(instance *m, void *copy) { return restore_state(m, copy); }
 FUNCTION(fmi2FreeFMUstate)(instance *m, void **copy) {
     (void)m;
     free(*copy);
@@ -105,7 +102,7 @@ FUNCTION(fmi2GetDirectionalDerivative)(instance *m, const reference2 *unknowns, 
 FUNCTION(fmi2EnterEventMode)(instance *m) { return enter_mode(m, EVENT_MODE, m->now.mode == CONTINUOUS); }
 FUNCTION(fmi2NewDiscreteStates)(instance *m, event_info2 *info) {
     bool changed;
-    const int status = perform_events(m, &changed);
+    const int status = perform_events(m, -1, &changed);
     memset(info, 0, sizeof *info);
     info->terminates = m->now.ended_by >= 0;
     info->values_changed = changed;

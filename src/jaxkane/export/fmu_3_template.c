@@ -126,10 +126,7 @@ FUNCTION(fmi3GetVariableDependencies)(instance *m, reference3 r, size_t *places,
 }
 
 FUNCTION(fmi3GetFMUState)(instance *m, void **copy) { return copy_state(m, copy); }
-FUNCTION(fmi3SetFMUState)(instance *m, void *copy) {
-    memcpy(&m->now, copy, sizeof(model_state));
-    return OK;
-}
+FUNCTION(fmi3SetFMUState)(instance *m, void *copy) { return restore_state(m, copy); }
 FUNCTION(fmi3FreeFMUState)(instance *m, void **copy) {
     (void)m;
     free(*copy);
@@ -173,7 +170,7 @@ FUNCTION(fmi3EvaluateDiscreteStates)(instance *m) {
 }
 FUNCTION(fmi3UpdateDiscreteStates)(instance *m, bool *needs_update, bool *terminates, bool *nominals_changed,
                                    bool *values_changed, bool *has_next_time, double *next_time) {
-    const int status = perform_events(m, values_changed);
+    const int status = perform_events(m, -1, values_changed);
     *needs_update = *nominals_changed = *has_next_time = false;
     *terminates = m->now.ended_by >= 0;
     *next_time = 0.0;

@@ -24,8 +24,9 @@ static bool is_due(const model_state *s, int j, const double *g, const double *g
    or is PASSED through zero, without another jump. */
 enum { NOTHING, MOVES, BACK, PASSED };
 
-/* Stores the side of zero of each event function. At zero, an event with a direction is still ahead, unless its
-   condition is not met; one without direction has occurred. `effects`: of the jumps that just occurred. */
+/* Stores the side of zero of each event function, at the start and after jumps. At zero, an event with a direction is
+   still ahead, unless its condition is not met; one without direction has occurred. `effects`: of the jumps that just
+   occurred. */
 static void set_sides(model_state *s, const int *effects) {
     double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
     int j;
@@ -34,15 +35,28 @@ static void set_sides(model_state *s, const int *effects) {
     for (j = 0; j < N_E; j++) {
         const bool is_zero = fabs(g[j]) <= fabs(g_dot[j]) * rounding(s->t);
         const bool is_ahead = directions[j] * g_dot[j] > 0.0;
-        const int previous = s->side[j];
+        const int previous = s->side[j], effect = effects ? effects[j] : NOTHING;
         s->side[j] = g[j] > 0.0 ? 1 : -1;
         if (is_zero && directions[j] == 0) s->side[j] = g_dot[j] < 0.0 ? -1 : 1;
         else if (is_zero) s->side[j] = is_ahead && !is_possible(j, condition) ? directions[j] : -directions[j];
-        if (effects && effects[j] == PASSED) s->side[j] = -previous;
-        if (effects && effects[j] == BACK) s->side[j] = previous;
-        /* A function that goes back may still be beyond zero. Without this slack, a ball whose bounces are shorter than
-           the importer's tolerance falls through the floor. */
-        s->slack[j] = effects && effects[j] == BACK ? 2.0 * fmax(0.0, -previous * g[j]) : 0.0;
+        if (effect == PASSED) s->side[j] = -previous;
+        if (effect == BACK) s->side[j] = previous;
+        /* Within a rounding error, the function may not be on this side yet. Without this slack, a ball whose bounces
+           are shorter than the importer's tolerance falls through the floor. */
+        s->slack[j] = effect == PASSED || effect == BACK ? 2.0 * fmax(0.0, -s->side[j] * g[j]) : 0.0;
+    }
+}
+
+/* Updates the sides where no jump has occurred. A function that is zero stays on its side, so that an event that has
+   occurred does not occur again. */
+static void follow_sides(model_state *s) {
+    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
+    int j;
+    if (N_E == 0) return;
+    events_of(s->t, s->y, s->w, s->p, g, g_dot, condition);
+    for (j = 0; j < N_E; j++) {
+        if (s->side[j] * g[j] < -s->slack[j]) s->side[j] = -s->side[j];
+        if (s->side[j] * g[j] > 0.0) s->slack[j] = 0.0;
     }
 }
 
@@ -126,8 +140,8 @@ static int jump(instance *m, int j, double g, double g_dot, int *effect) {
 }
 
 /* All events that occur now, in alphabetical order. An event is skipped if an earlier one has changed the direction in
-   which its function crosses zero. */
-static int perform_events(instance *m, bool *changed) {
+   which its function crosses zero. `found`: an event that occurs now except for rounding errors, or -1. */
+static int perform_events(instance *m, int found, bool *changed) {
     double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
     bool due[SIZE(N_E)];
     int effects[SIZE(N_E)], j;
@@ -135,7 +149,7 @@ static int perform_events(instance *m, bool *changed) {
     if (N_E == 0 || m->now.ended_by >= 0) return OK;
     events_of(m->now.t, m->now.y, m->now.w, m->now.p, g, g_dot, condition);
     for (j = 0; j < N_E; j++) {
-        due[j] = is_due(&m->now, j, g, g_dot, condition);
+        due[j] = is_due(&m->now, j, g, g_dot, condition) || (j == found && is_possible(j, condition));
         effects[j] = NOTHING;
     }
     for (j = 0; j < N_E; j++) {
@@ -148,7 +162,8 @@ static int perform_events(instance *m, bool *changed) {
         *changed = true;
         events_of(m->now.t, m->now.y, m->now.w, m->now.p, g, g_dot, condition);
     }
-    set_sides(&m->now, effects);
+    if (*changed) set_sides(&m->now, effects);
+    else follow_sides(&m->now);
     return OK;
 }
 
@@ -198,8 +213,8 @@ static double first_event(const model_state *s, double h, const double *y1, int 
     events_of(s->t + h, y1, s->w, s->p, g, g_dot, at_end);
     for (j = 0; j < N_E; j++) {
         double length;
-        /* Numerical steps turn back where det C_dep reaches zero, so a change of its sign cannot be relied on. Stop where
-           it would reach zero in the next step. */
+        /* Numerical steps turn back where det C_dep reaches zero, so its sign does not change. Stop where it would
+           reach zero in the next step. */
         if (j == SINGULAR && 2.0 * s->side[j] * g[j] < s->side[j] * before[j]) return -1.0;
         if (!has_crossed(s, j, g[j]) || !(is_possible(j, at_start) || is_possible(j, at_end))) continue;
         length = length_to_crossing(s, j, h);
@@ -207,18 +222,6 @@ static double first_event(const model_state *s, double h, const double *y1, int 
         first = fmin(first, length);
     }
     return first;
-}
-
-/* Updates the sides after a step without an event. */
-static void follow_sides(model_state *s) {
-    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
-    int j;
-    if (N_E == 0) return;
-    events_of(s->t, s->y, s->w, s->p, g, g_dot, condition);
-    for (j = 0; j < N_E; j++) {
-        if (s->side[j] * g[j] < -s->slack[j]) s->side[j] = -s->side[j];
-        if (s->side[j] * g[j] > 0.0) s->slack[j] = 0.0;
-    }
 }
 
 /* One step to time `end`, divided at events. It stops at an event that ends the simulation. */
@@ -244,7 +247,7 @@ static int step_to(instance *m, double end) {
         m->now.t = first < h ? m->now.t + first : end;
         passed = -m->now.side[which];
         if (first > h) follow_sides(&m->now);
-        else if (perform_events(m, &changed) != OK) return ERROR;
+        else if (perform_events(m, which, &changed) != OK) return ERROR;
         else if (!changed && m->now.ended_by < 0) {
             m->now.side[which] = passed; /* the condition of the event is not met */
             m->now.slack[which] = 0.0;
@@ -258,14 +261,14 @@ static int step_by(instance *m, double t, double length) {
     const double tolerance = 1e-9 * fmax(1.0, fabs(t));
     bool changed;
     int64_t i, n;
-    if (m->now.mode != STEPPING || !(length >= 0.0) || !isfinite(length) || !(fabs(t - m->now.t) <= tolerance)) {
+    if (m->now.mode != STEPPING || !(length >= 0.0 && length < 1e15 * STEP) || !(fabs(t - m->now.t) <= tolerance)) {
         report(m, ERROR, "A communication step of %g s from t = %.17g is not possible: the FMU is at t = %.17g%s.",
                length, t, m->now.t, m->now.mode == STEPPING ? "" : " and is not initialized");
         return ERROR;
     }
     if (m->now.ended_by >= 0) return OK;
     m->now.t = t; /* the importer's time, so that rounding errors do not accumulate */
-    if (perform_events(m, &changed) != OK) return ERROR; /* parameters may have changed */
+    if (perform_events(m, -1, &changed) != OK) return ERROR; /* parameters may have changed */
     n = (int64_t)ceil(length / STEP * (1.0 - 1e-9));
     for (i = 1; i <= n && m->now.ended_by < 0; i++)
         if (step_to(m, i == n ? t + length : t + length * (double)i / (double)n) != OK) return ERROR;

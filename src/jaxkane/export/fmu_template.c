@@ -207,10 +207,10 @@ static int initialize(instance *m) {
     }
     set_sides(&m->now, NULL);
     m->now.mode = m->co_simulation ? STEPPING : EVENT_MODE;
-    return m->co_simulation ? perform_events(m, &changed) : OK;
+    return m->co_simulation ? perform_events(m, -1, &changed) : OK;
 }
 
-/* Event functions with a hysteresis of a rounding error, so that a function that is zero after a jump has the sign of its
+/* Event functions with a hysteresis of a rounding error: a function that is zero after a jump has the sign of its
    side. */
 static void indicators(const model_state *s, double *z) {
     double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
@@ -321,6 +321,15 @@ static int copy_state(instance *m, void **copy) {
         return ERROR;
     }
     memcpy(*copy, &m->now, sizeof(model_state));
+    return OK;
+}
+
+static int restore_state(instance *m, const void *copy) {
+    if (!copy) {
+        report(m, ERROR, "There is no state to restore.");
+        return ERROR;
+    }
+    memcpy(&m->now, copy, sizeof(model_state));
     return OK;
 }
 
