@@ -193,6 +193,21 @@ def test_fmpy_finds_no_problem(name, fmi, fmu_of):
 
 
 @needs_compiler
+@pytest.mark.parametrize(
+    ("fmi", "kind"), [("2.0", "co-simulation"), ("3.0", "co-simulation"), ("3.0", "model exchange")]
+)
+def test_an_fmu_of_one_kind(fmi, kind, tmp_path):
+    path = str(jk.export.fmu(Ball(), tmp_path / "ball.fmu", fmi=fmi, kind=kind, state=STATES["Ball"], sources=False))
+    assert validate_fmu(path) == []
+    description = fmpy.read_model_description(path)
+    assert (description.coSimulation is None, description.modelExchange is None) == (
+        kind != "co-simulation", kind == "co-simulation"
+    )  # fmt: skip
+    assert len(description.eventIndicators) == (3 if kind == "model exchange" else 0)
+    assert fmpy.simulate_fmu(path, stop_time=0.1)["h"][-1] == pytest.approx(1.0 - 9.81 * 0.1**2 / 2, abs=1e-5)
+
+
+@needs_compiler
 def test_the_source_compiles_without_warnings(fmu_of, tmp_path):
     for name, system in {"Driven": Driven(), "Bob": Bob(), "Ball": Ball()}.items():
         for fmi in VERSIONS:

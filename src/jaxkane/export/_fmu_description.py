@@ -46,7 +46,7 @@ def model_description(model: FMUModel, fmi: str, kinds: Sequence[str], token: st
     states = {x.derivative for x in variables} if any(model.events.stages) else set()
     for i, x in enumerate(variables):
         _variable(listed, i, x, fmi, can_jump=i in states)
-    _structure(ElementTree.SubElement(root, "ModelStructure"), variables, fmi)
+    _structure(ElementTree.SubElement(root, "ModelStructure"), variables, fmi, "model exchange" in kinds)
     return _text(root)
 
 
@@ -97,7 +97,7 @@ def _variable(parent: ElementTree.Element, place: int, x: Variable, fmi: str, ca
         ElementTree.SubElement(parent, "Float64", common | of_number)
 
 
-def _structure(parent: ElementTree.Element, variables: Sequence[Variable], fmi: str) -> None:
+def _structure(parent: ElementTree.Element, variables: Sequence[Variable], fmi: str, has_indicators: bool) -> None:
     """Which variables are outputs, rates and event functions, and on which states, inputs and times they depend."""
     places = range(len(variables))
     outputs = [i for i in places if variables[i].role.causality == "output"]
@@ -106,7 +106,7 @@ def _structure(parent: ElementTree.Element, variables: Sequence[Variable], fmi: 
         "Output": outputs,
         "ContinuousStateDerivative": rates,
         "InitialUnknown": [i for i in sorted(outputs + rates) if variables[i].role.initial != "exact"],
-        "EventIndicator": [i for i in places if variables[i].role == LOCAL and i not in rates],
+        "EventIndicator": [i for i in places if variables[i].role == LOCAL and i not in rates and has_indicators],
     }
     if fmi == "2.0":  # it has lists of unknowns, with places that are counted from 1, and none of event indicators
         names = {"Output": "Outputs", "ContinuousStateDerivative": "Derivatives", "InitialUnknown": "InitialUnknowns"}
