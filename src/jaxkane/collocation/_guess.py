@@ -9,13 +9,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from .._collocate.functions import Condition, bounds_of
+from .._collocate.transcription import Motion, variables_of
 from .._common.lookup import real_number, refuse_unknown
 from .._integrate.trajectory import Trajectory
 from .._kane.consistent_state import assemble
 from .._kane.right_hand_side import vector_field
 from .._system.system import units_of
-from ._problem import Condition, Problem, bounds_of
-from ._transcription import Motion, variables_of
+from ._problem import Problem
 
 
 def guess_of(problem: Problem, guess: Any, s: np.ndarray, detour: np.ndarray | None = None) -> Motion:

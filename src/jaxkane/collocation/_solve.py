@@ -15,13 +15,13 @@ import numpy as np
 from .._collocate.lobatto import Lobatto, lobatto
 from .._collocate.program import NonlinearProgram
 from .._collocate.solvers import INTERRUPTED, Monitor, Solution, Solver, default_solver
+from .._collocate.transcription import Motion, Transcription, nodes_of, system_at
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
 from ._guess import detours, guess_of
 from ._mesh import interpolated, local_errors, quadrature_errors, refined
 from ._plan import Multipliers, Plan, trajectory_of
 from ._problem import Phases, Problem
-from ._transcription import Motion, Transcription, nodes_of, system_at
 
 MAX_MESHES = 10
 
@@ -140,7 +140,9 @@ def check_derivatives(
     mesh = np.linspace(0.0, 1.0, intervals + 1)
     motions = [guess_of(p, getattr(guess, "trajectory", guess), nodes_of(mesh, found)) for p in phases.phases]
     theta = np.zeros(0 if phases.phases[0].parameters is None else phases.phases[0].parameters.size)
-    program = (transcription := Transcription(phases, [mesh] * len(motions), found, motions, theta)).program
+    program = (
+        transcription := Transcription(phases.phases, phases.links, [mesh] * len(motions), found, motions, theta)
+    ).program
     rng = np.random.default_rng(seed)
     z = np.clip(transcription.z + 0.1 * rng.normal(size=program.n), program.lower, program.upper)
     weights = rng.normal(size=program.m)
@@ -168,7 +170,8 @@ def check_derivatives(
 
 def _integer(name: str, value: Any, least: int, most: int | None = None) -> int:
     """**Raises:** `ValueError` unless the value is an integer within the bounds."""
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least or value > (most or value):
+    is_integer = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if not is_integer or int(value) < least or (most is not None and int(value) > most):
         bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
         raise ValueError(f"solve: `{name}` must be an integer {bounds}, got {value!r}.")
     return int(value)
@@ -217,7 +220,7 @@ class _Search:
         costs: list[float] = []
         iterations, is_warm = 0, isinstance(guesses[0][0], Plan)
         sizes = [_sizes(p, guess) for p, (guess, _) in zip(problems, guesses, strict=True)]
-        transcription = Transcription(self.phases, meshes, self.method, motions, theta, sizes)
+        transcription = self._transcribed(meshes, motions, theta, sizes)
         sizes = transcription.sizes
         while True:
             solution = self._solved(transcription, is_warm)
@@ -239,13 +242,17 @@ class _Search:
                 for motion, mesh, finer in zip(motions, meshes, new, strict=True)
             ]
             try:
-                transcription = Transcription(self.phases, new, self.method, motions, theta, sizes)
+                transcription = self._transcribed(new, motions, theta, sizes)
             except (KeyboardInterrupt, ValueError) as error:  # a function may not be finite at a new node
                 stopped = isinstance(error, KeyboardInterrupt)
                 reason = INTERRUPTED if stopped else f"solved, but not on a finer mesh: {error}"
                 solution = dataclasses.replace(solution, ok=False, status=reason)
                 return self._plan(transcription, solution, errors, costs, iterations, False)
             meshes, is_warm = new, True
+
+    def _transcribed(self, meshes: Any, motions: Any, theta: np.ndarray, sizes: Any) -> Transcription:
+        phases, links = self.phases.phases, self.phases.links
+        return Transcription(phases, links, meshes, self.method, motions, theta, sizes=sizes)
 
     def _solved(self, transcription: Transcription, is_warm: bool) -> Solution:
         program = transcription.program
@@ -316,10 +323,10 @@ class _Search:
         layout, motion = transcription.layouts[p], transcription.motions(x)[p]
         system = system_at(transcription, p, x)
         return Plan(
-            problem=layout.problem,
+            problem=self.phases.phases[p],
             duration=motion.duration,
             system=system,
-            trajectory=trajectory_of(system, layout.problem, motion),
+            trajectory=trajectory_of(system, self.phases.phases[p], motion),
             mesh=layout.mesh * motion.duration,
             errors=errors,
             multipliers=multipliers_of(transcription, solution, p),

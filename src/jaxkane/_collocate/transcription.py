@@ -10,20 +10,73 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
-from .._collocate.lobatto import Lobatto
-from .._collocate.program import Block, Bounds, EvaluatedBlock, NonlinearProgram
 from .._integrate.inputs import is_samples
 from .._system.system import System, names_of, units_of
-from ._functions import Dynamics, Ends, Integrand, Link, Path, Variables, called, named
-from ._problem import Bound, Phases, Problem, bounds_of, constraints_of
+from .functions import (
+    Bound,
+    Condition,
+    Dynamics,
+    Ends,
+    Integrand,
+    Link,
+    Path,
+    Variables,
+    bounds_of,
+    called,
+    constraints_of,
+    named,
+)
+from .lobatto import Lobatto
+from .program import Block, Bounds, EvaluatedBlock, NonlinearProgram
+
+
+class PhaseProblem(Protocol):
+    """What a phase of a motion is: see `jaxkane.collocation.Problem` for the meaning of each attribute.
+
+    `parameters` has the method `apply` and the attribute `size`; its last `n_local` numbers belong to this phase alone,
+    the others are shared by all phases. `ends` and `limits` are bounds by name.
+    """
+
+    @property
+    def cost(self) -> Any: ...
+    @property
+    def final_cost(self) -> Any: ...
+    @property
+    def conditions(self) -> Any: ...
+    @property
+    def path(self) -> Any: ...
+    @property
+    def system(self) -> System: ...
+    @property
+    def title(self) -> str: ...
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def durations(self) -> Bound: ...
+    @property
+    def has_free_duration(self) -> bool: ...
+    @property
+    def bounds_of_controls(self) -> dict[str, Bound]: ...
+    @property
+    def limits(self) -> dict[str, Bound]: ...
+    @property
+    def ends(self) -> Mapping[str, Mapping[str, Condition]]: ...
+    @property
+    def signals(self) -> Any: ...
+    @property
+    def parameters(self) -> Any: ...
+    @property
+    def n_local(self) -> int: ...
+    @property
+    def n_constraints(self) -> int: ...
 
 
 class Motion(NamedTuple):
@@ -59,7 +112,7 @@ class Layout:
     - `parameters`: the indices of the parameters.
     """
 
-    problem: Problem
+    problem: PhaseProblem
     variables: Variables
     mesh: np.ndarray
     s: np.ndarray
@@ -94,7 +147,7 @@ class Layout:
         return {"s": s, "inputs": inputs}
 
 
-def variables_of(problem: Problem, origin: float = 0.0) -> Variables:
+def variables_of(problem: PhaseProblem, origin: float = 0.0) -> Variables:
     """How the nodes of a problem are read."""
     signals = problem.signals
     if not problem.has_free_duration and not callable(signals):
@@ -121,11 +174,12 @@ class Transcription:
 
     **Arguments:**
 
-    - `phases`: the problems and their links.
+    - `phases`, `links`: the phases and what links them.
     - `meshes`: for each phase the ends (N + 1,) of its intervals.
     - `method`: the method of collocation.
     - `motions`: for each phase the guess at the nodes.
     - `theta` (p,): the guess of the free parameters, in their search variables.
+    - `objectives`: a function of the builder and the layouts, which adds to the cost.
     - `sizes`: for each phase the sizes (n_z,) of states and controls on a coarser mesh, or None.
 
     **Raises:** `ValueError` if a function is not finite at the guess, or a constraint has no derivative.
@@ -133,16 +187,18 @@ class Transcription:
 
     def __init__(
         self,
-        phases: Phases,
+        phases: Sequence[PhaseProblem],
+        links: Sequence[Any],
         meshes: Sequence[np.ndarray],
         method: Lobatto,
         motions: Sequence[Motion],
         theta: np.ndarray,
+        objectives: Callable[[Builder, Sequence[Layout]], None] | None = None,
         sizes: Sequence[np.ndarray | None] | None = None,
     ):
-        self.phases, self.method = phases, method
-        self._known_sizes = [None] * len(phases.phases) if sizes is None else sizes
-        self.layouts = _layouts(phases.phases, meshes, method)
+        self.links, self.method, self._objectives = links, method, objectives
+        self._known_sizes = [None] * len(phases) if sizes is None else sizes
+        self.layouts = _layouts(phases, meshes, method)
         self.n = 1 + max(int(layout.columns.max()) for layout in self.layouts)
         self.parameters = self.layouts[0].variables.parameters
         self.x = np.zeros(self.n)
@@ -150,7 +206,7 @@ class Transcription:
             self.x[layout.node(np.arange(layout.K))] = np.concatenate([motion.Y, motion.W], axis=1)
             if layout.duration is not None:
                 self.x[layout.duration] = motion.duration
-        self.x[self.layouts[0].parameters] = theta
+        self.x[self._shared_parameters] = theta
         self._build()
 
     def _build(self) -> None:
@@ -161,13 +217,15 @@ class Transcription:
         ]
         self._check_finite_dynamics(dynamics)
         self.x_scale = self._scales(dynamics)
-        builder = _Builder(self.n)
+        builder = Builder(self.n)
         for p, (layout, block) in enumerate(zip(self.layouts, dynamics, strict=True)):
             builder.defects(p, layout, block, self.method, self.x_scale)
         for p, layout in enumerate(self.layouts):
             self._add_functions(builder, p, layout)
-        for i, how in enumerate(self.phases.links):
+        for i, how in enumerate(self.links):
             self._add_link(builder, i, how, dynamics)
+        if self._objectives is not None:
+            self._objectives(builder, self.layouts)
         self.rows = builder.rows
         self._check_functions(builder)
         g_scale = builder.scales(self.x, self.x_scale)
@@ -184,6 +242,11 @@ class Transcription:
         """The guess (n,) in scaled variables."""
         return self.x / self.x_scale
 
+    @property
+    def _shared_parameters(self) -> np.ndarray:
+        layout = self.layouts[0]
+        return layout.parameters[: len(layout.parameters) - layout.problem.n_local]
+
     def motions(self, x: np.ndarray) -> list[Motion]:
         """The motions of all phases at variables (n,)."""
         found = []
@@ -195,7 +258,7 @@ class Transcription:
         return found
 
     def theta(self, x: np.ndarray) -> np.ndarray:
-        return x[self.layouts[0].parameters]
+        return x[self._shared_parameters]
 
     def _variable_bounds(self) -> Bounds:
         lower, upper = np.full(self.n, -math.inf), np.full(self.n, math.inf)
@@ -243,7 +306,7 @@ class Transcription:
                 scale[layout.duration] = max(self.x[layout.duration], 1e-3 * layout.problem.durations[1])
         return scale
 
-    def _add_functions(self, builder: _Builder, p: int, layout: Layout) -> None:
+    def _add_functions(self, builder: Builder, p: int, layout: Layout) -> None:
         problem, variables = layout.problem, layout.variables
         data = layout.node_data(layout.s)
         if problem.cost is not None:
@@ -259,7 +322,7 @@ class Transcription:
             builder.constraints("path", p, EvaluatedBlock(block), [*along.items(), *path.items()])
         self._add_ends(builder, p, layout)
 
-    def _add_ends(self, builder: _Builder, p: int, layout: Layout) -> None:
+    def _add_ends(self, builder: Builder, p: int, layout: Layout) -> None:
         problem, variables = layout.problem, layout.variables
         names = (*problem.names, *variables.controls)
         by_name = {
@@ -285,7 +348,7 @@ class Transcription:
         block = EvaluatedBlock(Block(ends, data, columns, has_cost + len(items)))
         builder.constraints("conditions", p, block, items, has_cost=has_cost)
 
-    def _add_link(self, builder: _Builder, i: int, how: Any, dynamics: Sequence[EvaluatedBlock]) -> None:
+    def _add_link(self, builder: Builder, i: int, how: Any, dynamics: Sequence[EvaluatedBlock]) -> None:
         j = (i + 1) % len(self.layouts)
         one, other = self.layouts[i], self.layouts[j]
         linked = other.problem.names
@@ -342,7 +405,7 @@ class Transcription:
         jax.eval_shape(record, self.x[layout.columns[[0, last]]])
         return found
 
-    def _check_functions(self, builder: _Builder) -> None:
+    def _check_functions(self, builder: Builder) -> None:
         for block, label in builder.user_blocks:
             values = block.values(self.x)
             if not np.all(np.isfinite(values)):
@@ -365,7 +428,7 @@ class Transcription:
         return max(finite, default=1.0)
 
 
-class _Builder:
+class Builder:
     """Collects blocks, constraints and their bounds."""
 
     def __init__(self, n: int) -> None:
@@ -479,7 +542,7 @@ def _sparse(entries: tuple[np.ndarray, np.ndarray, np.ndarray], shape: tuple[int
     return scipy.sparse.csr_matrix((factors, (rows, columns)), shape)
 
 
-def _layouts(problems: Sequence[Problem], meshes: Sequence[np.ndarray], method: Lobatto) -> list[Layout]:
+def _layouts(problems: Sequence[PhaseProblem], meshes: Sequence[np.ndarray], method: Lobatto) -> list[Layout]:
     variables = [variables_of(problem) for problem in problems]
     nodes = [nodes_of(mesh, method) for mesh in meshes]
     firsts = np.cumsum([0, *(len(s) * v.n_z for s, v in zip(nodes, variables, strict=True))])
@@ -488,10 +551,16 @@ def _layouts(problems: Sequence[Problem], meshes: Sequence[np.ndarray], method: 
     for problem in problems:
         durations.append(next_one if problem.has_free_duration else None)
         next_one += problem.has_free_duration
-    parameters = variables[0].parameters
-    places = np.arange(next_one, next_one + (0 if parameters is None else parameters.size))
+    sizes = [0 if v.parameters is None else v.parameters.size - p.n_local for p, v in zip(problems, variables)]
+    shared = np.arange(next_one, next_one + sizes[0])
+    next_one += sizes[0]
+    layouts = []
     rows: Any = zip(problems, variables, meshes, nodes, firsts[:-1].tolist(), durations, strict=True)
-    return [Layout(p, v, mesh, s, first, duration, places) for p, v, mesh, s, first, duration in rows]
+    for problem, of_node, mesh, s, first, duration in rows:
+        local = np.arange(next_one, next_one + problem.n_local)
+        next_one += problem.n_local
+        layouts.append(Layout(problem, of_node, mesh, s, first, duration, np.concatenate([shared, local])))
+    return layouts
 
 
 def scales_of(layout: Layout, block: EvaluatedBlock, x: np.ndarray) -> np.ndarray:
@@ -512,8 +581,8 @@ def scales_of(layout: Layout, block: EvaluatedBlock, x: np.ndarray) -> np.ndarra
         numbers = [abs(b) for v in given if v is not None for b in bounds_of(name, v) if math.isfinite(b)]
         sizes[i] = max([sizes[i], *numbers])
     # Without units, a place of 1 and a force of 1e18 are not comparable, but the forces are.
-    kinds = [(next(i for i, group in enumerate((*names_of(problem.system), names)) if name in group), units.get(name, ""))
-             for name in names]  # fmt: skip
+    groups = (*names_of(problem.system), variables.controls)
+    kinds = [(next(i for i, group in enumerate(groups) if name in group), units.get(name, "")) for name in names]
     for kind in {*kinds}:
         same = np.array([each == kind for each in kinds])
         sizes[same & (sizes < 1e-8 * np.max(sizes[same]))] = 0.0  # rounding errors
