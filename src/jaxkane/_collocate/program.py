@@ -198,8 +198,7 @@ class NonlinearProgram:
             picks = scipy.sparse.csr_matrix(
                 (np.ones(b.B * e), (entry_rows, np.arange(b.B * e))), (b.B * b.block.size, b.B * e)
             )
-            used: Any = S @ picks
-            used = used.tocoo()
+            used = scipy.sparse.coo_matrix(S @ picks)
             rows.append(used.row)
             columns.append(entry_columns[used.col])
             sources.append(used.col + total)

@@ -42,7 +42,8 @@ class PhaseProblem(Protocol):
     """What a phase of a motion is: see `jaxkane.collocation.Problem` for the meaning of each attribute.
 
     `parameters` has the method `apply` and the attribute `size`; its last `n_local` numbers belong to this phase alone,
-    the others are shared by all phases. `ends` and `limits` are bounds by name.
+    the others are shared by all phases. `ends` and `limits` are bounds by name. If `is_piecewise`, a control has one
+    value in each interval; else it is continuous, with a value at each node.
     """
 
     @property
@@ -76,7 +77,10 @@ class PhaseProblem(Protocol):
     @property
     def n_local(self) -> int: ...
     @property
+    def is_piecewise(self) -> bool: ...
+    @property
     def n_constraints(self) -> int: ...
+    def variables(self) -> Variables: ...
 
 
 class Motion(NamedTuple):
@@ -108,6 +112,7 @@ class Layout:
 
     - `problem`, `variables`: the problem and how its nodes are read.
     - `mesh` (N + 1,): the ends of the intervals, as fractions of the duration. `s` (K,): the nodes.
+    - `every`: the number of nodes from one end of an interval to the next one.
     - `first`: the index of the first variable. `duration`: the index of the duration, or None.
     - `parameters`: the indices of the parameters.
     """
@@ -116,6 +121,7 @@ class Layout:
     variables: Variables
     mesh: np.ndarray
     s: np.ndarray
+    every: int
     first: int
     duration: int | None
     parameters: np.ndarray
@@ -129,14 +135,55 @@ class Layout:
         return np.concatenate([[] if self.duration is None else [self.duration], self.parameters]).astype(int)
 
     def node(self, k: Any) -> np.ndarray:
-        """The indices (..., n_z) of the variables of nodes k (...,)."""
-        n_z = self.variables.n_z
-        return self.first + np.asarray(k)[..., None] * n_z + np.arange(n_z)
+        """The indices (..., n_z) of the states and controls at nodes k (...,).
+
+        A control that is constant in each interval has the value of the interval that begins at the node.
+        """
+        k = np.asarray(k)
+        if not self.problem.is_piecewise:
+            return self.first + k[..., None] * self.variables.n_z + np.arange(self.variables.n_z)
+        return self.in_interval(np.minimum(k // self.every, len(self.mesh) - 2), k)
+
+    def in_interval(self, i: np.ndarray, k: np.ndarray) -> np.ndarray:
+        """The same for nodes k (...,) of intervals i (...,), with constant controls."""
+        n_y, n_w = self.variables.n_y, len(self.variables.controls)
+        states = self.first + k[..., None] * n_y + np.arange(n_y)
+        controls = self.first + self.K * n_y + i[..., None] * n_w + np.arange(n_w)
+        return np.concatenate([states, controls], axis=-1)
+
+    @property
+    def size(self) -> int:
+        """The number of states and controls."""
+        n_y, n_w = self.variables.n_y, len(self.variables.controls)
+        return self.K * n_y + (len(self.mesh) - 1 if self.problem.is_piecewise else self.K) * n_w
+
+    @property
+    def dynamics(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where the equations of motion are evaluated.
+
+        **Returns:** the nodes (B,), the variables (B, n) and, for each point of each interval, its place (N, s) among
+        them. A node between two intervals is evaluated twice if controls are constant in each interval.
+        """
+        N = len(self.mesh) - 1
+        nodes = np.arange(N)[:, None] * self.every + np.arange(self.every + 1)  # (N, s)
+        if not self.problem.is_piecewise:
+            return np.arange(self.K), self.columns, nodes
+        i = np.broadcast_to(np.arange(N)[:, None], nodes.shape).ravel()
+        shared = np.tile(self.shared, (nodes.size, 1))
+        columns = np.concatenate([self.in_interval(i, nodes.ravel()), shared], axis=1)
+        return nodes.ravel(), columns, np.arange(nodes.size).reshape(nodes.shape)
 
     @property
     def columns(self) -> np.ndarray:
         """For each node, the variables (K, n) that its functions use."""
         return np.concatenate([self.node(np.arange(self.K)), np.tile(self.shared, (self.K, 1))], axis=1)
+
+    def quadrature(self, method: Lobatto) -> np.ndarray:
+        """The weights (K,) of the nodes in an integral over the fraction of the duration."""
+        weights, steps, every = np.zeros(self.K), np.diff(self.mesh), len(method.c) - 1
+        for j, b in enumerate(method.b):
+            np.add.at(weights, np.arange(len(steps)) * every + j, steps * b)
+        return weights
 
     def node_data(self, s: np.ndarray) -> dict[str, Any]:
         """The data of nodes: their fractions, and the values of sampled inputs if their times are fixed."""
@@ -147,7 +194,7 @@ class Layout:
         return {"s": s, "inputs": inputs}
 
 
-def variables_of(problem: PhaseProblem, origin: float = 0.0) -> Variables:
+def variables_of(problem: PhaseProblem) -> Variables:
     """How the nodes of a problem are read."""
     signals = problem.signals
     if not problem.has_free_duration and not callable(signals):
@@ -157,7 +204,7 @@ def variables_of(problem: PhaseProblem, origin: float = 0.0) -> Variables:
         signals=signals,
         parameters=problem.parameters,
         duration=None if problem.has_free_duration else jnp.asarray(problem.durations[0], float),
-        origin=jnp.asarray(origin, float),
+        origin=jnp.zeros(()),
         controls=tuple(problem.bounds_of_controls),
         n_y=len(problem.names),
     )
@@ -212,14 +259,16 @@ class Transcription:
     def _build(self) -> None:
         self.x_bounds = self._variable_bounds()
         dynamics = [
-            EvaluatedBlock(Block(Dynamics(x.variables), x.node_data(x.s), x.columns, x.variables.n_y))
+            EvaluatedBlock(
+                Block(Dynamics(x.variables), x.node_data(x.s[x.dynamics[0]]), x.dynamics[1], x.variables.n_y)
+            )
             for x in self.layouts
         ]
         self._check_finite_dynamics(dynamics)
         self.x_scale = self._scales(dynamics)
-        builder = Builder(self.n)
+        builder = Builder(self.n, self.method)
         for p, (layout, block) in enumerate(zip(self.layouts, dynamics, strict=True)):
-            builder.defects(p, layout, block, self.method, self.x_scale)
+            builder.defects(p, layout, block, self.x_scale)
         for p, layout in enumerate(self.layouts):
             self._add_functions(builder, p, layout)
         for i, how in enumerate(self.links):
@@ -267,7 +316,7 @@ class Transcription:
             names = (*problem.names, *layout.variables.controls)
             for name, (low, high) in problem.limits.items():
                 if name in names:
-                    at = layout.first + np.arange(layout.K) * layout.variables.n_z + names.index(name)
+                    at = layout.node(np.arange(layout.K))[:, names.index(name)]
                     lower[at], upper[at] = low, high
             for label, k in (("start", 0), ("end", layout.K - 1)):
                 for name, value in problem.ends[label].items():
@@ -284,8 +333,9 @@ class Transcription:
             values = block.values(self.x)
             if np.all(np.isfinite(values)):
                 continue
-            k = int(np.argmin(np.all(np.isfinite(values), axis=1)))
-            names = [layout.problem.names[i] for i in np.nonzero(~np.isfinite(values[k]))[0]]
+            place = int(np.argmin(np.all(np.isfinite(values), axis=1)))
+            names = [layout.problem.names[i] for i in np.nonzero(~np.isfinite(values[place]))[0]]
+            k = layout.dynamics[0][place]
             at = dict(zip(layout.problem.names, self.x[layout.node(k)].round(6).tolist()))
             raise ValueError(
                 f"Problem: with the initial guess, the rates of {', '.join(names)} are not finite at "
@@ -310,11 +360,8 @@ class Transcription:
         problem, variables = layout.problem, layout.variables
         data = layout.node_data(layout.s)
         if problem.cost is not None:
-            weights = np.zeros(layout.K)
-            steps = np.diff(layout.mesh)
-            for j, b in enumerate(self.method.b):
-                np.add.at(weights, np.arange(len(steps)) * (len(self.method.b) - 1) + j, steps * b)
-            builder.cost(EvaluatedBlock(Block(Integrand(variables, problem.cost), data, layout.columns, 1)), weights)
+            block = EvaluatedBlock(Block(Integrand(variables, problem.cost), data, layout.columns, 1))
+            builder.cost(block, layout.quadrature(self.method))
         along = {k: v for k, v in problem.limits.items() if k not in (*problem.names, *variables.controls)}
         path = self._constraints(layout, "path", problem.path, 0) if problem.path is not None else {}
         if along or path:
@@ -431,8 +478,8 @@ class Transcription:
 class Builder:
     """Collects blocks, constraints and their bounds."""
 
-    def __init__(self, n: int) -> None:
-        self.n, self.m = n, 0
+    def __init__(self, n: int, method: Lobatto) -> None:
+        self.n, self.m, self.method = n, 0, method
         self.blocks: list[EvaluatedBlock] = []
         self.weights: list[np.ndarray | None] = []
         self.entries: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = []  # rows, places of values, factors
@@ -447,7 +494,8 @@ class Builder:
         self.m += k
         return np.arange(self.m - k, self.m)
 
-    def defects(self, p: int, layout: Layout, block: EvaluatedBlock, method: Lobatto, x_scale: np.ndarray) -> None:
+    def defects(self, p: int, layout: Layout, block: EvaluatedBlock, x_scale: np.ndarray) -> None:
+        method = self.method
         n_y, steps, s = layout.variables.n_y, np.diff(layout.mesh), len(method.c)
         N = len(steps)
         first = np.arange(N) * (s - 1)
@@ -457,7 +505,7 @@ class Builder:
         inner = first[:, None] + np.arange(1, s)
         self.linear.append((rows.ravel(), node[inner].ravel(), one.ravel()))
         self.linear.append((rows.ravel(), np.broadcast_to(node[first][:, None], rows.shape).ravel(), -one.ravel()))
-        values = (first[:, None] + np.arange(s))[:, None, :, None] * n_y + np.arange(n_y)  # (N, 1, s, n_y)
+        values = layout.dynamics[2][:, None, :, None] * n_y + np.arange(n_y)  # (N, 1, s, n_y)
         factors = -steps[:, None, None, None] * method.A[None, :, :, None]
         shape = (N, s - 1, s, n_y)
         parts = (np.broadcast_to(x, shape).ravel() for x in (rows[:, :, None, :], values, factors))
@@ -543,23 +591,23 @@ def _sparse(entries: tuple[np.ndarray, np.ndarray, np.ndarray], shape: tuple[int
 
 
 def _layouts(problems: Sequence[PhaseProblem], meshes: Sequence[np.ndarray], method: Lobatto) -> list[Layout]:
-    variables = [variables_of(problem) for problem in problems]
-    nodes = [nodes_of(mesh, method) for mesh in meshes]
-    firsts = np.cumsum([0, *(len(s) * v.n_z for s, v in zip(nodes, variables, strict=True))])
-    next_one = int(firsts[-1])
-    durations: list[int | None] = []
-    for problem in problems:
-        durations.append(next_one if problem.has_free_duration else None)
-        next_one += problem.has_free_duration
-    sizes = [0 if v.parameters is None else v.parameters.size - p.n_local for p, v in zip(problems, variables)]
-    shared = np.arange(next_one, next_one + sizes[0])
-    next_one += sizes[0]
-    layouts = []
-    rows: Any = zip(problems, variables, meshes, nodes, firsts[:-1].tolist(), durations, strict=True)
-    for problem, of_node, mesh, s, first, duration in rows:
-        local = np.arange(next_one, next_one + problem.n_local)
-        next_one += problem.n_local
-        layouts.append(Layout(problem, of_node, mesh, s, first, duration, np.concatenate([shared, local])))
+    """The layouts of all phases: their nodes, then their durations, shared parameters, and parameters of phases."""
+    layouts, first, none = [], 0, np.zeros(0, int)
+    for problem, mesh in zip(problems, meshes, strict=True):
+        s, every = nodes_of(mesh, method), len(method.c) - 1
+        layouts.append(Layout(problem, problem.variables(), mesh, s, every, first, None, none))
+        first += layouts[-1].size
+    for i, layout in enumerate(layouts):
+        if layout.problem.has_free_duration:
+            layouts[i] = dataclasses.replace(layout, duration=first)
+            first += 1
+    sizes = [0 if x.variables.parameters is None else x.variables.parameters.size - x.problem.n_local for x in layouts]
+    shared = np.arange(first, first + sizes[0])
+    first += sizes[0]
+    for i, layout in enumerate(layouts):
+        local = np.arange(first, first + layout.problem.n_local)
+        first += len(local)
+        layouts[i] = dataclasses.replace(layout, parameters=np.concatenate([shared, local]))
     return layouts
 
 

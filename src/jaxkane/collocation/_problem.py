@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._collocate.functions import Bound, Condition, Now, bounds_of
+from .._collocate.functions import Bound, Condition, Now, Variables, bounds_of
+from .._collocate.transcription import variables_of
 from .._common.lookup import as_names, real_number, refuse_unknown
 from .._integrate.inputs import as_signals, is_samples
 from .._kane.arguments import check_is_system, is_concrete, refuse_multipliers
@@ -257,6 +258,15 @@ class Problem:
         if label == "end" and self.n_constraints:
             values = {k: v for k, v in values.items() if k not in self.system.dependent_coordinates}
         return values
+
+    def variables(self) -> Variables:
+        """How the variables of a node are read."""
+        return variables_of(self)
+
+    @property
+    def is_piecewise(self) -> bool:
+        """Whether controls are constant in each interval."""
+        return False
 
     @property
     def n_local(self) -> int:
