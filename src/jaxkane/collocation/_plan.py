@@ -51,7 +51,8 @@ class Plan:
     - `unmet`: the constraints that are violated by more than the tolerance, by name, with the scaled violation.
     - `active`: the names of bounds and inequality constraints that are active somewhere.
     - `starts`: for several guesses, the cost and the result of each.
-    - `phases`: the plans of all phases; empty for a single problem.
+    - `phases`: the plans of all phases; empty for a single problem. Names of `multipliers`, `unmet` and `active` then
+        start with the phase, as in "phase 0: roll".
     """
 
     problem: Problem
@@ -170,7 +171,10 @@ class Plan:
 
         They are compared at the ends of intervals. Inside an interval the polynomials are less accurate.
         """
+        self._refuse_phases("deviation")
         Y = np.asarray(jnp.concatenate([ride.q, ride.u, ride.x], axis=1))
+        if Y.shape != self.motion.Y.shape:
+            raise ValueError(f"Plan.deviation: the simulation must have the {len(self.motion.Y)} times of plan.t.")
         every = len(self.method.c) - 1
         return float(np.max(np.abs(Y - self.motion.Y)[::every] / self.scales[: Y.shape[1]]))
 
@@ -229,7 +233,8 @@ class Multipliers(Mapping[str, Any]):
 
     - `multipliers["roll"]` (K,): by a shift of the bound of a state or control that is active at a node; 0 elsewhere.
         At a fixed start, this is the derivative by the initial value.
-    - `multipliers["condition"]`: by a shift of the value of a condition, (K,) for a path constraint.
+    - `multipliers["condition"]`: by a shift of the value of a condition, (K,) for a path constraint. If its name is
+        also that of a variable, "conditions: roll" or "path: roll".
     - `costate["roll"]` (N,): by a sudden change of a state within an interval.
     """
 
