@@ -275,7 +275,7 @@ class Problem(NamedTuple):
             read = y_dot if self.events.read_rates else None
             if self.events.layout.names:
                 quantities = self.event_values(point.t, point.y, args, y_dot)
-                return moved_to_event(quantities, point, y_dot, reach, event, happened)
+                return moved_to_event(quantities, point, y_dot, reach, event, happened, REST * self.taus[-1])
             return next_point(args.system, args.origin, point, y_dot, read, reach, event, happened)
 
         near = stepped(EventPoint(t, y, jnp.zeros_like(t), jnp.array(True)))
