@@ -211,7 +211,7 @@ def _states_by_accelerations(
     """
     bearing, G, a, kinetic, d = jnp.asarray(layout.is_bearing), terms.delassus, terms.a, terms.laws.friction, layout.d
     candidates, known, directions = candidates | bearing, None, memory.directions
-    is_still = slip = jnp.zeros(0)
+    is_still = slip = stops = slow = jnp.zeros(0)
     if d:
         # A bearing is a contact with a normal force of its own: G_NN = 1 and a_N = -(the largest friction).
         corner = np.zeros((1 + d, 1 + d))
@@ -227,6 +227,7 @@ def _states_by_accelerations(
         rtol, atol = tolerances
         errors = atol * jnp.sum(jnp.abs(terms.C), axis=1).reshape(terms.v.shape) + rtol * terms.size
         is_slow = speed <= 100 * jnp.sum(errors[:, 1:], axis=1)
+        slow = jnp.sum(errors[:, 1:], axis=1) / jnp.sqrt(jnp.maximum(rtol, float(jnp.finfo(v.dtype).eps)))
         if d == 2:
             # In space, the slip need not vanish where its component along its first direction does.
             stops &= is_slow
@@ -255,7 +256,12 @@ def _states_by_accelerations(
         else:
             signs = jnp.sign(start[:, :1]) * np.array([[1.0, 0.0, 0.0]])
             directions = jnp.where(bearing[:, None], signs, jnp.sum(start[:, :, None] * terms.tangents, axis=1))
-    return ContactMemory(states, directions), found.determined
+    kept = memory.slow
+    if d == 2:
+        goes_on = (memory.states == SLIDES) & ~event.stops
+        kept = jnp.where(is_still, slow, jnp.where(goes_on, memory.slow[:, 0], 0.0))
+        kept = jax.lax.stop_gradient(jnp.where((states == SLIDES) & ~bearing, kept, 0.0))[:, None]
+    return ContactMemory(states, directions, kept), found.determined
 
 
 def _stops_within(delays: Array, terms: ContactTerms, v: Array, speed: Array) -> Array:
