@@ -109,7 +109,8 @@ def test_a_line_has_a_gap_at_each_jump():
     jumps = JumpTable(at, events, before, after, at, at[..., None], inputs, count, ("bump",))
     rides = dataclasses.replace(trajectory(status=np.array([0, 0]), t_end=np.array([2.0, 2.0]), batch=(2,)), jumps=jumps)
     axes = jk.plot.trajectories(rides, ["yaw_rate", "roll", "steer_torque"], degrees=True)
-    for ax, sides in zip(axes, ((1.0, -1.0), np.degrees((1.0, -1.0)), (2.0, 3.0))):
+    degrees = np.degrees((1.0, -1.0))
+    for ax, sides in zip(axes, (degrees, degrees, (2.0, 3.0))):
         for k, line in enumerate(ax.lines):
             t, y = (np.asarray(x) for x in line.get_data())
             gaps = np.flatnonzero(np.isnan(y))
