@@ -1,8 +1,8 @@
 """Walkers of 20 steps in a sweep, and the continuation of their gait, against SciPy around exported C.
 
-The walker is the compass gait of Goswami et al. (1998). The peer has the exported C for the motion between two steps, the
-impact equations of the article, and solve_ivp with an event. End states, periods and multipliers are compared before they
-are timed. A subset of the walkers and orbits is computed by the peer, and its time is scaled.
+The walker is the compass gait of Goswami et al. (1998). The peer uses the exported C between two steps, the impact
+equations of the article, and solve_ivp with an event. End states, periods and multipliers are compared before they are
+timed. The peer computes a subset of the walkers and orbits, and its time is scaled.
 """
 
 from __future__ import annotations
@@ -47,10 +47,9 @@ def walks(setting: Setting, rates: Rates, gait: Any, n: int, few: int) -> Iterat
     away = np.stack([away[:, 0], -away[:, 0], 0.0 * away[:, 0]], axis=1), np.stack([away[:, 1]] * 2, axis=1)
     starts = jk.State(gait.state.q + away[0], gait.state.u + away[1])
     ts = jnp.array([0.0, DURATION])
-    options = {"rtol": TOLERANCE, "atol": TOLERANCE}
 
     def sweep() -> Any:
-        return jk.sweep.sweep(CompassGait(), starts, ts, **options)
+        return jk.sweep.sweep(CompassGait(), starts, ts, rtol=TOLERANCE, atol=TOLERANCE)
 
     def by_scipy() -> np.ndarray:
         first = np.concatenate([np.asarray(starts.q)[:few, :2], np.asarray(starts.u)[:few]], axis=1)
@@ -111,7 +110,14 @@ def exported(folder: Path) -> Rates:
     f.argtypes = [ctypes.c_double, *[ctypes.c_void_p] * 6]
     names = list(jk.export.parameters(CompassGait()))
     p = np.array([float(x) for x in jk.export.parameters(CompassGait()).values()])
-    q, u, q_dot, u_dot, none, place = np.zeros(3), np.zeros(2), np.empty(3), np.empty(2), np.zeros(1), names.index("slope")
+    q, u, q_dot, u_dot, none, place = (
+        np.zeros(3),
+        np.zeros(2),
+        np.empty(3),
+        np.empty(2),
+        np.zeros(1),
+        names.index("slope"),
+    )
     pointers = [x.ctypes.data for x in (q, u, none, p, q_dot, u_dot)]
 
     def rates(t: float, y: np.ndarray, slope: float) -> np.ndarray:

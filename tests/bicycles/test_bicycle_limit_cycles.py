@@ -28,7 +28,7 @@ def motorcycle(speed):
 
 
 def cycles(speed, steer, until, **steps):
-    """The limit cycles from a Hopf point near this speed, from this amplitude of the steering [rad] to another speed."""
+    """The limit cycles from a Hopf point near this speed, until another speed. `steer`: the first amplitude [rad]."""
     system = motorcycle(speed)
     straight = steady_turn(system, hold=("roll",))
     small = limit_cycle(system, straight, {"steer": steer}, parameter="drive.speed")

@@ -254,7 +254,7 @@ class Driven(Particle):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance, atol", [(1e-6, 1e-6), (1e-10, 1e-9)])
+@pytest.mark.parametrize(("tolerance", "atol"), [(1e-6, 1e-6), (1e-10, 1e-9)])
 def test_a_slip_begins_without_an_acceleration(tolerance, atol):
     """Static equals kinetic friction. In polar coordinates of the slip, by SciPy's Radau with 1e-11.
 

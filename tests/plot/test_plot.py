@@ -107,7 +107,9 @@ def test_a_line_has_a_gap_at_each_jump():
     inputs = tuple({"steer_torque": sign * at} for sign in (2.0, 3.0))
     events, count = np.where(np.isfinite(at), 0, -1), np.array([2, 1])
     jumps = JumpTable(at, events, before, after, at, at[..., None], inputs, count, ("bump",))
-    rides = dataclasses.replace(trajectory(status=np.array([0, 0]), t_end=np.array([2.0, 2.0]), batch=(2,)), jumps=jumps)
+    rides = dataclasses.replace(
+        trajectory(status=np.array([0, 0]), t_end=np.array([2.0, 2.0]), batch=(2,)), jumps=jumps
+    )
     axes = jk.plot.trajectories(rides, ["yaw_rate", "roll", "steer_torque"], degrees=True)
     degrees = np.degrees((1.0, -1.0))
     for ax, sides in zip(axes, (degrees, degrees, (2.0, 3.0))):

@@ -16,15 +16,15 @@ from ._entry import entry
     "contacts that jam: a toy hops down a pole",
     q=(0.0, 0.05, 0.06),
     u=(-0.1, -3.0, -5.0),
-    operations=60,
+    operations=121,
 )
 class Woodpecker(System):
     """A sleeve with play on a pole, and a bird on a spring at the sleeve (Leine et al., 2003).
 
-    The source is Leine et al. (2003), *Nonlinear dynamics and modeling of various wooden toys with impact and friction*,
-    Journal of Vibration and Control 9(1-2), with the equations and parameters of Glocker (1995). Angles are small: the
-    gaps and the positions are linear in them. In each period of 0.146 s, the sleeve jams on the pole, slides down,
-    tilts, and the beak strikes the pole.
+    The source is Leine et al. (2003), *Nonlinear dynamics and modeling of various wooden toys with impact and
+    friction*, Journal of Vibration and Control 9(1-2), with the equations and parameters of Glocker (1995). Angles are
+    small: the gaps and the positions are linear in them. In each period of 0.146 s, the sleeve jams on the pole, slides
+    down, tilts, and the beak strikes the pole.
 
     | parameter | source | meaning |
     |---|---|---|
@@ -35,7 +35,7 @@ class Woodpecker(System):
     | `half_height` | h_M | half the height of the sleeve [m] |
     | `sleeve_to_spring` | l_M | from the centre of the sleeve [m] |
     | `spring_to_bird` | l_G | to the mass centre of the bird [m] |
-    | `beak_length`, `beak_height` | l_S, h_S | of the beak from the mass centre of the bird, towards the pole and up [m] |
+    | `beak_length`, `beak_height` | l_S, h_S | from the mass centre of the bird to the beak: to the pole, and up [m] |
     | `friction` | mu | coefficient of friction of all contacts (no unit) |
     | `restitution` | e_1 | coefficient of restitution of the beak; that of the sleeve is 0 (no unit) |
     | `gravity` | g | along -N.y [m/s^2] |
