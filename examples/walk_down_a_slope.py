@@ -1,8 +1,8 @@
 """How does a walker without motors walk down a slope, and where does its gait double its period?
 
 The walker is the compass gait of the catalogue: two straight legs with a mass each, and a mass at the hip. The swing
-foot lands without bouncing (Kane's impulse equations), and the legs exchange their roles. The scuffing of the swing foot
-at mid-stance is ignored.
+foot lands without bouncing (Kane's impulse equations), and the legs exchange their roles. The scuffing of the swing
+foot at mid-stance is ignored.
 
     variable                    meaning                                            unit
     stance, swing               angle of each leg from the vertical, downhill      rad

@@ -260,8 +260,14 @@ def test_a_slip_begins_without_an_acceleration(tolerance, atol):
 
     s' = f cos(5 t - theta) - mu g,  theta' = f sin(5 t - theta) / s,  from s = 5/2 (t - 0.1)^2
     """
-    options = {"rtol": tolerance, "atol": tolerance}
-    ride = jk.simulate(Driven(0.5, 0.0), jk.State({}, {}), jnp.linspace(0, 0.6, 21), **options)
+    options = {"rtol": tolerance, "atol": tolerance, "adjoint": "forward"}
+
+    def speeds(friction):
+        ride = jk.simulate(Driven(friction, 0.0), jk.State({}, {}), jnp.linspace(0, 0.6, 21), **options)
+        return ride.u, ride
+
+    slopes, ride = jax.jit(jax.jacfwd(speeds, has_aux=True))(0.5)
+    np.testing.assert_array_equal(np.isnan(slopes).any(axis=1), ride.t > 0.1)  # correct derivatives or none
     np.testing.assert_allclose(ride.jumps.t[0], 0.1, atol=1e-12)
     np.testing.assert_allclose(ride.end.u[:2], [-0.5208914533291, 0.2588472904328], atol=atol)
     assert int(ride.stats["steps"]) < 1000  # there were 600 000, and an error of 3e-6, with the direction v / |v|

@@ -92,12 +92,14 @@ class Change(NamedTuple):
     - `delay` [s]: the rest of the bounces of a contact that rests now.
     - `impulses` (c, r): of the impact, zero without one [N s].
     - `is_determined`: whether the contact laws have a solution.
+    - `is_smooth`: whether derivatives afterwards are correct.
     """
 
     y: Array
     delay: Array
     impulses: Array
     is_determined: Array
+    is_smooth: Array
 
 
 def changed_contacts(
@@ -173,7 +175,13 @@ def changed_contacts(
     q = without_gaps(after, takes_part & (event.touches | near | closed) & ~event.is_start, state.q)
     y = jnp.concatenate([q, u, y[n_q + n_u : y.size - layout.memory_size], new.packed()])
     delay = jnp.max(jnp.where(new.states != OPEN, delays, 0.0), initial=0.0)
-    return Change(y, delay, impulses, is_determined & (~is_impact | hit.determined))
+    is_smooth = jnp.array(True)
+    if layout.d == 2:
+        # A slip that begins without an acceleration is stiff. The error estimate does not contain the derivatives:
+        # those of a particle were 21 instead of 3.
+        begins = (new.slow[:, 0] > 0) & (memory.states != SLIDES)
+        is_smooth = ~jnp.any(begins & (after.laws.static <= after.laws.friction))
+    return Change(y, delay, impulses, is_determined & (~is_impact | hit.determined), is_smooth)
 
 
 def _negligible(terms: ContactTerms) -> Array:
