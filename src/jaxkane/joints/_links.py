@@ -356,10 +356,14 @@ def _check_names(structure: Structure) -> None:
 
 def _check_stops(structure: Structure) -> None:
     stops = [joint.name for joint in structure.joints for has in joint.has_stops if has]
-    if len(stops) > MOST_CONTACTS:
+    rough = [joint.name for joint in structure.joints if joint.has_friction]
+    if len(stops) + len(rough) > MOST_CONTACTS:
+        kinds = (("the limits of", stops, "stops"), ("the dry friction of", rough, "friction"))
+        parts = [f"{what} {', '.join(dict.fromkeys(names))}" for what, names, _ in kinds if names]
+        options = [f"`{option}`" for _, names, option in kinds if names]
         raise ValueError(
-            f"{structure.name} has {len(stops)} contacts, which are the limits of {', '.join(dict.fromkeys(stops))}. "
-            f"At most {MOST_CONTACTS} are possible. Name fewer joints in `stops`, or use MuJoCo."
+            f"{structure.name} has {len(stops) + len(rough)} contacts, which are {' and '.join(parts)}. At most "
+            f"{MOST_CONTACTS} are possible. Name fewer joints in {' and '.join(options)}, or use MuJoCo."
         )
 
 
@@ -367,8 +371,9 @@ _UNITS = {"mass": "kg", "inertia": "kg m^2", "gravity": "m/s^2"} | dict.fromkeys
     ("center", "position", "anchor", "site"), "m"
 )
 _OF_HINGES = {"damping": "N m s/rad", "stiffness": "N m/rad", "rest": "rad", "armature": "kg m^2"}
-_OF_HINGES |= {"lower": "rad", "upper": "rad"}
-_OF_SLIDERS = {"damping": "N s/m", "stiffness": "N/m", "rest": "m", "armature": "kg", "lower": "m", "upper": "m"}
+_OF_HINGES |= {"lower": "rad", "upper": "rad", "friction": "N m"}
+_OF_SLIDERS = {"damping": "N s/m", "stiffness": "N/m", "rest": "m", "armature": "kg"}
+_OF_SLIDERS |= {"lower": "m", "upper": "m", "friction": "N"}
 
 
 def _field(name: str, joints: Mapping[str, JointType]) -> Field:

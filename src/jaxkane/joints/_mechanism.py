@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from .._common.lookup import hint, not_there
-from .._kane.contact import Contact
+from .._kane.contact import Contact, DryFriction
 from .._scalarjit.components import (
     ZERO3,
     Component,
@@ -96,7 +96,7 @@ class Structure(NamedTuple):
 
 _OWNERS = {
     **dict.fromkeys(("mass", "center", "inertia", "position"), "links"),
-    **dict.fromkeys(("anchor", "damping", "stiffness", "rest", "armature", "lower", "upper"), "joints"),
+    **dict.fromkeys(("anchor", "damping", "stiffness", "rest", "armature", "lower", "upper", "friction"), "joints"),
     **dict.fromkeys(("gain", "offset", "position_gain", "velocity_gain"), "actuators"),
     "site": "sites",
 }
@@ -269,9 +269,9 @@ class Mechanism(System):
             return []
         return self._loops_at_rest(t, q, independent=False)
 
-    def stops(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion) -> dict[str, Contact]:
-        """The limits of the joints, which are the `contacts` of a mechanism that has such limits."""
-        contacts = {}
+    def stops(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion) -> dict[str, Contact | DryFriction]:
+        """The limits and the dry friction of the joints: the `contacts` of a mechanism that has these."""
+        contacts: dict[str, Contact | DryFriction] = {}
         for joint in self.structure.joints:
             has_lower, has_upper = joint.has_stops
             if has_lower:
@@ -280,6 +280,9 @@ class Mechanism(System):
             if has_upper:
                 gap = sub(self._read(f"upper.{joint.name}"), q[joint.name])
                 contacts[f"{joint.name} upper"] = Contact(gap=gap)
+            if joint.has_friction:
+                friction = self._read(f"friction.{joint.name}")
+                contacts[f"{joint.name} friction"] = DryFriction(u[f"{joint.name}_rate"], friction)
         return contacts
 
     def _loops_at_rest(self, t: Component, q: NamedVector, independent: bool) -> GroupedResiduals:
@@ -449,7 +452,7 @@ def class_of(structure: Structure, fields: tuple[Field, ...]) -> type[Mechanism]
         "inputs": tuple(actuator.name for actuator in structure.actuators),
         "units": units,
     }
-    if any(any(joint.has_stops) for joint in joints):
+    if any(any(joint.has_stops) or joint.has_friction for joint in joints):
         members["contacts"] = Mechanism.stops  # without it, a mechanism is simulated without contact states
     cls: Any = type(Mechanism)(structure.name, (Mechanism,), members | of_parameters)  # pyright: ignore
     return cls
