@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -31,6 +31,8 @@ def from_mjcf(
     stops: Selection = (),
     friction: Selection = (),
     dependent: Sequence[str] | None = None,
+    independent: Sequence[str] = (),
+    pose: str | Mapping[str, float] | None = None,
     name: str | None = None,
 ) -> Mechanism:
     """The mechanism of an MJCF file.
@@ -53,19 +55,25 @@ def from_mjcf(
     - `friction`: names of hinges and sliders whose `frictionloss` becomes dry friction, the contact `NAME friction`
         with the parameter `friction.NAME`. True: all that have friction.
     - `dependent`: hinges and sliders that are solved for in closed loops, as in `jaxkane.joints.mechanism`.
+    - `independent`: joints that are not solved for, e.g. those with motors.
+    - `pose`: where loops are closed approximately: the name of a key frame, "qpos0", or coordinates by name.
+        Independent residuals and dependent joints are chosen there.
     - `name`: of the class; the model's name by default.
 
     **Returns:** a `jaxkane.joints.Mechanism` with the names of the file. Its coordinates are `qpos`, except for the
     order of the Euler parameters, which are scalar-last here. Its speeds are `qvel`, its inputs `ctrl`. A dot in a name
     becomes an underscore. An actuator or a site whose name is already used gets the suffix `_input` or `_site`. Masses
-    and inertias are those that MuJoCo compiles, also from geoms and meshes.
+    and inertias are those that MuJoCo compiles, also from geoms and meshes. `poses` has the coordinates `qpos0` and
+    those of the key frames, from which `jk.assemble(system, system.poses["qpos0"])` starts.
 
     **Raises:** `ImportError` without MuJoCo; `ValueError` for a file that MuJoCo cannot read, one without a moving
     body, two names that differ only by a dot, `stops` without a limit, more than four contacts, and with `strict` for
     unsupported elements.
     """
     mujoco = _mujoco()
-    return _ModelReader(mujoco, _compiled(mujoco, model), name, stops, friction).mechanism(strict, dependent)
+    return _ModelReader(mujoco, _compiled(mujoco, model), name, stops, friction).mechanism(
+        strict, dependent, independent, pose
+    )
 
 
 def _mujoco() -> ModuleType:
@@ -141,7 +149,13 @@ class _ModelReader:
         types = self.kinds.mjtJoint
         return [j for j in range(self.m.njnt) if int(self.m.jnt_type[j]) in (types.mjJNT_HINGE, types.mjJNT_SLIDE)]
 
-    def mechanism(self, strict: bool, dependent: Sequence[str] | None) -> Mechanism:
+    def mechanism(
+        self,
+        strict: bool,
+        dependent: Sequence[str] | None,
+        independent: Sequence[str],
+        pose: str | Mapping[str, float] | None,
+    ) -> Mechanism:
         m = self.m
         if not m.nv:
             raise ValueError(f"{self.name}: the file has no joint, so nothing can move.")
@@ -162,9 +176,37 @@ class _ModelReader:
             sites=self.sites,
             loops=self.loops,
             dependent=dependent,
+            independent=[without_dots(joint) for joint in independent],
+            pose=self._pose(pose),
+            poses=self._poses(),
             name=self.name,
             left_out=left_out,
         )
+
+    def _poses(self) -> dict[str, dict[str, float]]:
+        """The coordinates of the file and of its key frames, by name."""
+        rows = [self.m.qpos0, *self.m.key_qpos]
+        return dict(zip(["qpos0", *self._names("key", self.m.nkey)], map(self._coordinates, rows), strict=True))
+
+    def _coordinates(self, qpos: np.ndarray) -> dict[str, float]:
+        types, values = self.kinds.mjtJoint, {}
+        for j, name in enumerate(self.joints):
+            own = qpos[int(self.m.jnt_qposadr[j]) :]
+            if int(self.m.jnt_type[j]) in (types.mjJNT_HINGE, types.mjJNT_SLIDE):
+                values[name] = float(own[0])
+                continue
+            start = 3 if int(self.m.jnt_type[j]) == types.mjJNT_FREE else 0
+            values |= {f"{name}_{x}": float(own[i]) for i, x in enumerate("xyz"[:start])}
+            values |= {f"{name}_e{i + 1}": x for i, x in enumerate(_euler(own[start : start + 4]))}
+        return values
+
+    def _pose(self, pose: str | Mapping[str, float] | None) -> Mapping[str, float] | None:
+        if not isinstance(pose, str):
+            return pose
+        poses = self._poses()
+        if pose not in poses:
+            raise ValueError(f"{self.name}: `pose` is {pose!r}, but the poses of the file are {', '.join(poses)}.")
+        return poses[pose]
 
     def _carrier(self, body: int) -> str | None:
         return None if body == 0 else self.bodies[body]

@@ -53,13 +53,13 @@ def from_urdf(
     - `dependent`: hinges and sliders that follow others, as in `jaxkane.joints.mechanism`.
     - `name`: of the class; the robot's name by default.
 
-    **Returns:** a `jaxkane.joints.Mechanism`. `left_out` lists omitted elements. A dot in a name becomes an underscore. A
-    floating joint on the ground becomes a free joint. On a moving link it becomes three sliders, `NAME_x`, `NAME_y` and
-    `NAME_z`, and a ball joint `NAME`. Joints that move no mass are fixed.
+    **Returns:** a `jaxkane.joints.Mechanism`. `left_out` lists omitted elements. A dot in a name becomes an underscore.
+    A floating joint on the ground becomes a free joint. On a moving link it becomes three sliders, `NAME_x`, `NAME_y`
+    and `NAME_z`, and a ball joint `NAME`. Joints that move no mass are fixed.
 
     **Raises:** `ValueError` for a file that is not a URDF, contains macros of xacro, or is not one tree of links; for
-    numbers that are missing, not finite or in degrees; for impossible inertias; for a file in which nothing moves. Also for
-    `stops` and `friction` of joints without these, more than four contacts, and with `strict` for omitted elements.
+    numbers that are missing, not finite or in degrees; for impossible inertias; for a file in which nothing moves. Also
+    for `stops` and `friction` of joints without these, more than four contacts, and with `strict` for omitted elements.
     `FileNotFoundError` for a missing file.
     """
     file = read_urdf(text_of(model))

@@ -135,12 +135,7 @@ def _joint(joint: Element, label: str) -> FileJoint:
     kind = joint.get("type", "")
     if kind not in KINDS:
         raise ValueError(f"{label}: the type must be one of {', '.join(KINDS)}; got {kind!r}.")
-    ends = []
-    for end in ("parent", "child"):
-        element = joint.find(end)
-        if element is None or not element.get("link"):
-            raise ValueError(f'{label}: <{end} link="..."/> is missing.')
-        ends.append(without_dots(element.get("link", "")))
+    parent, child = (_end(joint, end, label) for end in ("parent", "child"))
     position, orientation = _placement(joint, label)
     axis, dynamics, mimic = joint.find("axis"), joint.find("dynamics"), joint.find("mimic")
     direction = np.array([1.0, 0.0, 0.0]) if axis is None else _numbers(axis, "xyz", label, (1.0, 0.0, 0.0))
@@ -156,7 +151,8 @@ def _joint(joint: Element, label: str) -> FileJoint:
     return FileJoint(
         without_dots(joint.get("name", "")),
         kind,
-        *ends,
+        parent,
+        child,
         position,
         orientation,
         direction,
@@ -165,6 +161,13 @@ def _joint(joint: Element, label: str) -> FileJoint:
         friction,
         follows,
     )
+
+
+def _end(joint: Element, end: str, label: str) -> str:
+    element = joint.find(end)
+    if element is None or not element.get("link"):
+        raise ValueError(f'{label}: <{end} link="..."/> is missing.')
+    return without_dots(element.get("link", ""))
 
 
 def _limits(joint: Element, kind: str, label: str) -> tuple[float, float] | None:

@@ -63,6 +63,7 @@ class LoopStructure(NamedTuple):
     second: str
     rigid: bool
     independent: tuple[int, ...]  # indices of its independent residuals
+    dropped: tuple[int, ...] = ()  # those that nearly depend on these, and are omitted
 
     @property
     def size(self) -> int:
@@ -88,6 +89,7 @@ class Structure(NamedTuple):
     dependent_speeds: tuple[str, ...] = ()
     dependent_coordinates: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+    poses: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
     @property
     def joints(self) -> tuple[JointType, ...]:
@@ -148,6 +150,12 @@ class Mechanism(System):
     left_out: ClassVar[tuple[str, ...]] = ()
     """Elements of the file that are not part of the mechanism."""
 
+    @property
+    def poses(self) -> dict[str, dict[str, float]]:
+        """Coordinates by the name of a pose, e.g. of the key frames of a file, to start from: `jk.assemble(arm,
+        arm.poses["stand"])`."""
+        return {name: dict(zip(self.coordinates, q, strict=True)) for name, q in self.structure.poses}
+
     def __init__(self, **values: Any):
         for field in dataclasses.fields(self):  # names with a dot cannot be keyword arguments
             setattr(self, field.name, values.pop(field.name) if field.name in values else _default(self, field))
@@ -206,10 +214,10 @@ class Mechanism(System):
     def q_dot(self, t, q, u):
         return [rate for joint in self.structure.joints for rate in joint.rates(*self._of(joint, q, u))]
 
-    def motion(self, t, q, u):
-        N, O = inertial()
-        carried: dict[str | None, tuple[Frame, Point]] = {None: (N, O)}
-        bodies, points, joints = [], {}, {}
+    def _tree(self, q: Any, u: Any) -> tuple[dict[str | None, tuple[Frame, Point]], dict[str, JointKinematics]]:
+        """The frame and the origin of each link (None: the ground), and the kinematics of the joints."""
+        carried: dict[str | None, tuple[Frame, Point]] = {None: inertial()}
+        joints: dict[str, JointKinematics] = {}
         for link in self.structure.links:
             F, P = carried[link.parent]
             P = _moved(P, F, self._triple(f"position.{link.name}"))
@@ -219,6 +227,25 @@ class Mechanism(System):
                 joints[joint.name] = at
                 F, P = at.child_frame, at.child_point
             carried[link.name] = F, P
+        return carried, joints
+
+    def sites_at(self, q: Any, u: Any) -> dict[str, tuple[Frame, Point]]:
+        """The frames and points of the sites."""
+        return self._sites(self._tree(q, u)[0])
+
+    def _sites(self, carried: dict[str | None, tuple[Frame, Point]]) -> dict[str, tuple[Frame, Point]]:
+        sites = {}
+        for site in self.structure.sites:
+            F, P = carried[site.link]
+            point = P.fixed(F.vector(*self._triple(f"site.{site.name}")))
+            sites[site.name] = _turned(F, site.orientation, site.name), point
+        return sites
+
+    def motion(self, t, q, u):
+        carried, joints = self._tree(q, u)
+        N, bodies, points = carried[None][0], [], {}
+        for link in self.structure.links:
+            F, P = carried[link.name]
             if link.has_mass:
                 G = _moved(P, F, self._triple(f"center.{link.name}"))
                 bodies.append(Body(self._read(f"mass.{link.name}"), self._inertia(link.name), G, F, name=link.name))
@@ -228,11 +255,8 @@ class Mechanism(System):
             armature = self._read(f"armature.{joint.name}")
             if not is_zero(armature):
                 bodies += joint.rotors(N, joints[joint.name].child_point, armature, self._of(joint, q, u)[1])
-        sites = {}
-        for site in self.structure.sites:
-            F, P = carried[site.link]
-            points[site.name] = P.fixed(F.vector(*self._triple(f"site.{site.name}")))
-            sites[site.name] = _turned(F, site.orientation, site.name), points[site.name]
+        sites = self._sites(carried)
+        points |= {name: point for name, (_, point) in sites.items()}
         frames = {
             at.child_frame.name: at.child_frame for at in joints.values() if at.child_frame is not at.parent_frame
         }
@@ -264,7 +288,7 @@ class Mechanism(System):
 
     def implied_constraints(self, t, q):
         structure = self.structure
-        all_independent = all(len(loop.independent) == loop.size for loop in structure.loops)
+        all_independent = all(len(loop.independent) + len(loop.dropped) == loop.size for loop in structure.loops)
         if all_independent and all(coupling.is_independent for coupling in structure.couplings):
             return []
         return self._loops_at_rest(t, q, independent=False)
@@ -287,7 +311,7 @@ class Mechanism(System):
 
     def _loops_at_rest(self, t: Component, q: NamedVector, independent: bool) -> GroupedResiduals:
         rest = dict.fromkeys((*self.speeds, *self.dependent_speeds), 0.0)
-        return loop_residuals(self, self.motion(t, q, tuple(rest.values())).sites, q, rest, independent)[0]
+        return loop_residuals(self, self.sites_at(q, rest), q, rest, independent)[0]
 
     def _forces(self, joint: JointType, q: list[Component], u: list[Component], inputs: Any) -> list[Component]:
         """Forces along the joint's speeds [N or N m], by its spring, damper and actuators."""
@@ -376,13 +400,14 @@ def loop_residuals(
         if loop.rigid:
             turned = _turned_apart(A, B)
             parting = (*parting, *(B.angular_velocity - A.angular_velocity).components_in(A))
-        rows = [i for i in range(loop.size) if (i in loop.independent) == independent]
+        used = [i for i in range(loop.size) if i not in loop.dropped]
+        rows = [i for i in used if (i in loop.independent) == independent]
         h.append(SomeComponents(tuple(apart[i] for i in rows if i < 3), apart))
         h.append(SomeComponents(tuple(turned[i - 3] for i in rows if i >= 3), (1.0,)))
         c += [parting[i] for i in rows]
     for coupling in mechanism.structure.couplings:
         if coupling.is_independent == independent:
-            value, slope = _polynomial(coupling.coefficients, q[coupling.second] if coupling.second else 0.0)
+            value, slope = polynomial(coupling.coefficients, q[coupling.second] if coupling.second else 0.0)
             h.append(SomeComponents((q[coupling.first] - value,), (q[coupling.first] - value,)))
             rate = mul(slope, u[f"{coupling.second}_rate"]) if coupling.second else 0.0
             c.append(sub(u[f"{coupling.first}_rate"], rate))
@@ -416,7 +441,7 @@ def _turned_apart(A: Frame, B: Frame) -> Triple:
 _HALF_A_TURN = 1e-6  # 1 + the sum of the direction cosines: within 0.06 degrees of half a turn
 
 
-def _polynomial(coefficients: tuple[float, ...], x: Component) -> tuple[Component, Component]:
+def polynomial(coefficients: tuple[float, ...], x: Component) -> tuple[Component, Component]:
     """Value and derivative."""
     value: Component = 0.0
     slope: Component = 0.0
