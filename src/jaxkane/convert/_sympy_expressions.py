@@ -96,8 +96,8 @@ class Extractor:
             "inertia": tuple(tuple(map(place, row)) for row in data.inertia.M),
             "inertia_rates": tuple(tuple(map(in_loads, row)) for row in data.inertia.M_dot),
         }
-        inputs, constants = self._symbols()
         self._check_prescribed()
+        inputs, constants = self._symbols()
         return ExtractedModel(
             name=data.name,
             q=tuple(data.q),
