@@ -201,18 +201,8 @@ class Mechanism(System):
         kind: Any = type(self)
         return _equipped(kind, outputs, tuple(extra))(**values, **extra)
 
-    def _read(self, name: str) -> Component:
-        return getattr(self, name, 0.0)
-
-    def _triple(self, name: str) -> Triple:
-        return self._read(f"{name}.x"), self._read(f"{name}.y"), self._read(f"{name}.z")
-
-    def _of(self, joint: JointType, q: NamedVector, u: NamedVector) -> tuple[list[Component], list[Component]]:
-        """The joint's own coordinates and speeds."""
-        return [q[name] for name in joint.names(joint.coordinates)], [u[name] for name in joint.names(joint.speeds)]
-
     def q_dot(self, t, q, u):
-        return [rate for joint in self.structure.joints for rate in joint.rates(*self._of(joint, q, u))]
+        return [rate for joint in self.structure.joints for rate in joint.rates(*_own(joint, q, u))]
 
     def _tree(self, q: Any, u: Any) -> tuple[dict[str | None, tuple[Frame, Point]], dict[str, JointKinematics]]:
         """The frame and the origin of each link (None: the ground), and the kinematics of the joints."""
@@ -220,10 +210,10 @@ class Mechanism(System):
         joints: dict[str, JointKinematics] = {}
         for link in self.structure.links:
             F, P = carried[link.parent]
-            P = _moved(P, F, self._triple(f"position.{link.name}"))
+            P = _moved(P, F, _triple(self, f"position.{link.name}"))
             F = _turned(F, link.orientation, link.name)
             for joint in link.joints:
-                at = joint.kinematics(F, P, *self._of(joint, q, u), self._triple(f"anchor.{joint.name}"))
+                at = joint.kinematics(F, P, *_own(joint, q, u), _triple(self, f"anchor.{joint.name}"))
                 joints[joint.name] = at
                 F, P = at.child_frame, at.child_point
             carried[link.name] = F, P
@@ -237,7 +227,7 @@ class Mechanism(System):
         sites = {}
         for site in self.structure.sites:
             F, P = carried[site.link]
-            point = P.fixed(F.vector(*self._triple(f"site.{site.name}")))
+            point = P.fixed(F.vector(*_triple(self, f"site.{site.name}")))
             sites[site.name] = _turned(F, site.orientation, site.name), point
         return sites
 
@@ -247,14 +237,14 @@ class Mechanism(System):
         for link in self.structure.links:
             F, P = carried[link.name]
             if link.has_mass:
-                G = _moved(P, F, self._triple(f"center.{link.name}"))
-                bodies.append(Body(self._read(f"mass.{link.name}"), self._inertia(link.name), G, F, name=link.name))
+                G = _moved(P, F, _triple(self, f"center.{link.name}"))
+                bodies.append(Body(_read(self, f"mass.{link.name}"), _inertia(self, link.name), G, F, name=link.name))
             else:
                 points[link.name] = P.fixed(F.vector(0.0, 0.0, 0.0))
         for joint in self.structure.joints:
-            armature = self._read(f"armature.{joint.name}")
+            armature = _read(self, f"armature.{joint.name}")
             if not is_zero(armature):
-                bodies += joint.rotors(N, joints[joint.name].child_point, armature, self._of(joint, q, u)[1])
+                bodies += joint.rotors(N, joints[joint.name].child_point, armature, _own(joint, q, u)[1])
         sites = self._sites(carried)
         points |= {name: point for name, (_, point) in sites.items()}
         frames = {
@@ -265,12 +255,12 @@ class Mechanism(System):
         return motion
 
     def loads(self, t, q, u, motion: Any, inputs):
-        gravity = motion.N.vector(*self._triple("gravity"))
+        gravity = motion.N.vector(*_triple(self, "gravity"))
         falls = not all(is_zero(x) for x in gravity.components)
         weighed = [body for body in motion.bodies if falls and not is_zero(body.mass)]  # rotors have no weight
         loads: list[Any] = [Force(body.mass * gravity, body.center) for body in weighed]
         for joint in self.structure.joints:
-            forces = self._forces(joint, *self._of(joint, q, u), inputs)
+            forces = _forces(self, joint, *_own(joint, q, u), inputs)
             if not all(is_zero(x) for x in forces):
                 loads += joint.loads(motion.joints[joint.name], forces)
         return loads
@@ -299,13 +289,13 @@ class Mechanism(System):
         for joint in self.structure.joints:
             has_lower, has_upper = joint.has_stops
             if has_lower:
-                gap = sub(q[joint.name], self._read(f"lower.{joint.name}"))
+                gap = sub(q[joint.name], _read(self, f"lower.{joint.name}"))
                 contacts[f"{joint.name} lower"] = Contact(gap=gap)
             if has_upper:
-                gap = sub(self._read(f"upper.{joint.name}"), q[joint.name])
+                gap = sub(_read(self, f"upper.{joint.name}"), q[joint.name])
                 contacts[f"{joint.name} upper"] = Contact(gap=gap)
             if joint.has_friction:
-                friction = self._read(f"friction.{joint.name}")
+                friction = _read(self, f"friction.{joint.name}")
                 contacts[f"{joint.name} friction"] = DryFriction(u[f"{joint.name}_rate"], friction)
         return contacts
 
@@ -313,31 +303,53 @@ class Mechanism(System):
         rest = dict.fromkeys((*self.speeds, *self.dependent_speeds), 0.0)
         return loop_residuals(self, self.sites_at(q, rest), q, rest, independent)[0]
 
-    def _forces(self, joint: JointType, q: list[Component], u: list[Component], inputs: Any) -> list[Component]:
-        """Forces along the joint's speeds [N or N m], by its spring, damper and actuators."""
-        damping, stiffness = self._read(f"damping.{joint.name}"), self._read(f"stiffness.{joint.name}")
-        forces = [mul(-1.0, mul(damping, w)) for w in u]
-        if not is_zero(stiffness):
-            rest = self._triple(f"rest.{joint.name}") if len(u) == 6 else (self._read(f"rest.{joint.name}"),)
-            forces = [sub(f, mul(stiffness, x)) for f, x in zip(forces, joint.displacement(q, rest), strict=True)]
-        for actuator in self.structure.actuators:
-            if actuator.joint == joint.name:
-                drive = self._drive(actuator, q, u, inputs[actuator.name])
-                forces = [add(f, mul(g, drive)) for f, g in zip(forces, actuator.gear, strict=True)]
-        return forces
 
-    def _drive(
-        self, actuator: ActuatorStructure, q: list[Component], u: list[Component], control: Component
-    ) -> Component:
-        gain, offset, stiff, damp = (
-            self._read(f"{kind}.{actuator.name}") for kind in ("gain", "offset", "position_gain", "velocity_gain")
-        )
-        resisted = add(mul(damp, dot(actuator.gear, u)), mul(stiff, mul(actuator.gear[0], q[0])))
-        return total(map(component, (mul(gain, control), offset, mul(-1.0, resisted))))
+# Functions and not methods: equinox makes an object of a method at each access, in a time that grows with the number of
+# parameters. For 200 links, 10 000 accesses took a sixth of the time of the first accelerations.
 
-    def _inertia(self, link: str) -> Matrix:
-        xx, yy, zz, xy, xz, yz = (self._read(f"inertia.{link}.{ij}") for ij in MOMENTS)
-        return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+
+def _read(mechanism: Mechanism, name: str) -> Component:
+    return getattr(mechanism, name, 0.0)
+
+
+def _triple(mechanism: Mechanism, name: str) -> Triple:
+    return _read(mechanism, f"{name}.x"), _read(mechanism, f"{name}.y"), _read(mechanism, f"{name}.z")
+
+
+def _own(joint: JointType, q: Any, u: Any) -> tuple[list[Component], list[Component]]:
+    """The joint's own coordinates and speeds."""
+    return [q[name] for name in joint.names(joint.coordinates)], [u[name] for name in joint.names(joint.speeds)]
+
+
+def _forces(
+    mechanism: Mechanism, joint: JointType, q: list[Component], u: list[Component], inputs: Any
+) -> list[Component]:
+    """Forces along the joint's speeds [N or N m], by its spring, damper and actuators."""
+    damping, stiffness = _read(mechanism, f"damping.{joint.name}"), _read(mechanism, f"stiffness.{joint.name}")
+    forces = [mul(-1.0, mul(damping, w)) for w in u]
+    if not is_zero(stiffness):
+        rest = _triple(mechanism, f"rest.{joint.name}") if len(u) == 6 else (_read(mechanism, f"rest.{joint.name}"),)
+        forces = [sub(f, mul(stiffness, x)) for f, x in zip(forces, joint.displacement(q, rest), strict=True)]
+    for actuator in mechanism.structure.actuators:
+        if actuator.joint == joint.name:
+            drive = _drive(mechanism, actuator, q, u, inputs[actuator.name])
+            forces = [add(f, mul(g, drive)) for f, g in zip(forces, actuator.gear, strict=True)]
+    return forces
+
+
+def _drive(
+    mechanism: Mechanism, actuator: ActuatorStructure, q: list[Component], u: list[Component], control: Component
+) -> Component:
+    gain, offset, stiff, damp = (
+        _read(mechanism, f"{kind}.{actuator.name}") for kind in ("gain", "offset", "position_gain", "velocity_gain")
+    )
+    resisted = add(mul(damp, dot(actuator.gear, u)), mul(stiff, mul(actuator.gear[0], q[0])))
+    return total(map(component, (mul(gain, control), offset, mul(-1.0, resisted))))
+
+
+def _inertia(mechanism: Mechanism, link: str) -> Matrix:
+    xx, yy, zz, xy, xz, yz = (_read(mechanism, f"inertia.{link}.{ij}") for ij in MOMENTS)
+    return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
 
 
 class MechanismMotion(Motion):
