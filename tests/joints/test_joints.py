@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
+from jaxkane._kane.checks import _Consistency
 from jaxkane._system.parameters import parameter_info
+from jaxkane._system.system import with_class
 from jaxkane.fit.problem.from_declarations import parameters_of
 from jaxkane.joints import (
     Actuator,
@@ -150,6 +152,35 @@ def test_a_spring_on_a_ball_joint_is_smooth_where_it_rests_and_takes_the_shorter
         np.testing.assert_allclose(alpha(jnp.float64(angle), -1.0)[0], -4.0 * angle, rtol=1e-12)
     slope = jax.jit(jax.vmap(jax.grad(lambda angle: alpha(angle)[0])))(jnp.array([0.0, 1e-5, 1.0]))
     np.testing.assert_allclose(slope, -4.0, rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("base", [free("base"), planar("base"), [ball("s"), slide("x", (1, 2, 0))]])
+def test_the_methods_of_a_tree_of_joints_agree(base):
+    """`check_description` relies on this and does not check trees."""
+    links = [
+        Link("trunk", None, base, **BAR),
+        Link("leg", "trunk", universal("hip", anchor=(0, 0, 0.1)), (0.1, 0, 0), **BAR),
+        Link("foot", "leg", [slide("x2", (0, 0, 1)), ball("ankle", anchor=(0, 0.1, 0))], (0, 0, -0.2), **BAR),
+    ]
+    system = mechanism(links, sites=[Site("toe", "foot", (0.1, 0, 0))])
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-0.5, 0.5, len(system.coordinates))
+    for i, name in enumerate(system.coordinates):
+        if name.endswith("_e4"):
+            q[i - 3 : i + 1] /= np.linalg.norm(q[i - 3 : i + 1])
+    assert _Consistency(system, np.zeros(()), q, rng).check()
+
+
+def test_a_class_that_inherits_from_a_mechanism_is_checked():
+    base = mechanism(pendulums(1))
+
+    class Wrong(type(base)):
+        def q_dot(self, t, q, u):
+            return [2.0 * u["q0_rate"]]
+
+    with pytest.raises(ValueError, match="by the rates of its coordinates"):
+        jk.accelerations(with_class(base, Wrong), 0.0, [0.3], [0.2])
 
 
 # Loops

@@ -488,6 +488,7 @@ def class_of(structure: Structure, fields: tuple[Field, ...]) -> type[Mechanism]
         "dependent_coordinates": structure.dependent_coordinates,
         "inputs": tuple(actuator.name for actuator in structure.actuators),
         "units": units,
+        "is_tree_of_joints": not (structure.loops or structure.couplings),  # see `check_description`
     }
     if any(any(joint.has_stops) or joint.has_friction for joint in joints):
         members["contacts"] = Mechanism.stops  # without it, a mechanism is simulated without contact states
