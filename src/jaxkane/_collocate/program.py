@@ -66,7 +66,7 @@ def _pattern(function: BlockFunction, data: Any, x: Array) -> Pattern:
     return Pattern(*(tuple(i.tolist()) for i in places))
 
 
-def _padded(size: int) -> int:
+def padded(size: int) -> int:
     """The next power of two. Other numbers of intervals then use the same compiled program."""
     return 1 << max(0, (size - 1).bit_length())
 
@@ -76,10 +76,10 @@ class EvaluatedBlock:
 
     def __init__(self, block: Block, dtype: Any = jnp.float64):
         self.block, (self.B, n) = block, block.columns.shape
-        padded = _padded(self.B) - self.B
+        extra = padded(self.B) - self.B
 
         def with_padding(x: Any) -> np.ndarray:  # the last place is repeated
-            return np.concatenate([x, np.repeat(x[-1:], padded, axis=0)]) if padded else np.asarray(x)
+            return np.concatenate([x, np.repeat(x[-1:], extra, axis=0)]) if extra else np.asarray(x)
 
         self.data = jax.tree.map(lambda x: jnp.asarray(with_padding(np.asarray(x))), block.data)
         self.columns = with_padding(block.columns)
@@ -98,9 +98,9 @@ class EvaluatedBlock:
         """The entries (B, e) of the Hessian of the values weighted by `weights` (B, m)."""
         if not self.pattern.hessian_rows:
             return np.zeros((self.B, 0))
-        padded = np.zeros((len(self.columns), self.block.size))
-        padded[: self.B] = weights
-        entries = _hessian(self.block.function, self.pattern, self.data, x[self.columns], padded)
+        factors = np.zeros((len(self.columns), self.block.size))
+        factors[: self.B] = weights
+        entries = _hessian(self.block.function, self.pattern, self.data, x[self.columns], factors)
         return np.asarray(entries)[: self.B]
 
 

@@ -14,6 +14,7 @@ import scipy.linalg
 from jaxtyping import Array, Float
 
 from .._collocate.lobatto import Lobatto
+from .._collocate.program import padded
 from .._collocate.transcription import Motion
 from .._integrate.simulate import simulate
 from .._integrate.status import Status
@@ -119,7 +120,9 @@ class Plan:
         return with_controls(self.problem.signals, polynomials)
 
     def at(self, ts: Any) -> dict[str, np.ndarray]:
-        """States and controls by name at other times, by the polynomials of the method.
+        """States and controls by name at other times, by the polynomials through the nodes of each interval.
+
+        Between the nodes, the states are less accurate than at the nodes: parabolas for "hermite-simpson".
 
         **Arguments:**
 
@@ -327,11 +330,13 @@ def _drift(system: System, t: Array, q: Array) -> Array:
 def trajectory_of(system: System, problem: Problem, motion: Motion, origin: float = 0.0) -> Trajectory:
     """A motion as a `Trajectory` at its nodes."""
     t = origin + motion.s * motion.duration
-    q, u, x, u_dep, inputs, outputs = _along(
-        system, problem.signals, tuple(problem.bounds_of_controls), jnp.asarray(t), motion.Y, motion.W
-    )
+    # Padded as the blocks of the program, so that meshes of similar sizes use one compiled program.
+    rows = np.minimum(np.arange(padded(len(t))), len(t) - 1)
+    controls = tuple(problem.bounds_of_controls)
+    found = _along(system, problem.signals, controls, t[rows], motion.Y[rows], motion.W[rows])
+    q, u, x, u_dep, inputs, outputs = jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[: len(t)]), found)
     count = jnp.asarray(0)
-    end = State(q[-1], u[-1], x[-1] if system.states else None)
+    end = jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[-1]), State(q, u, x if system.states else None))
     return Trajectory(
         t=jnp.asarray(t), q=q, u=u, u_dep=u_dep, x=x, inputs=inputs, outputs=outputs,
         status=jnp.asarray(int(Status.COMPLETED)), t_end=jnp.asarray(t[-1]),
