@@ -23,6 +23,7 @@ from .._kane.api import _dependent_speeds
 from .._kane.constraint_residuals import configuration_residual
 from .._kane.right_hand_side import outputs_at, values_of, vector_field
 from .._scalarjit.cache_key import jit
+from .._scalarjit.compat import on_device
 from .._system.prints import wrapped
 from .._system.system import State, System, has_outputs, names_of, units_of, unpacked
 from ._mesh import ControlPolynomial, coefficients_of, interpolated, with_controls, without_events
@@ -330,18 +331,16 @@ def _drift(system: System, t: Array, q: Array) -> Array:
 def trajectory_of(system: System, problem: Problem, motion: Motion, origin: float = 0.0) -> Trajectory:
     """A motion as a `Trajectory` at its nodes."""
     t = origin + motion.s * motion.duration
-    # Padded as the blocks of the program, so that meshes of similar sizes use one compiled program.
-    rows = np.minimum(np.arange(padded(len(t))), len(t) - 1)
     controls = tuple(problem.bounds_of_controls)
-    found = _along(system, problem.signals, controls, t[rows], motion.Y[rows], motion.W[rows])
-    q, u, x, u_dep, inputs, outputs = jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[: len(t)]), found)
+    along = _along(system, problem.signals, controls, *(padded(a) for a in (t, motion.Y, motion.W)))
+    q, u, x, u_dep, inputs, outputs = jax.tree.map(lambda a: on_device(np.asarray(a)[: len(t)]), along)
     count = jnp.asarray(0)
-    end = jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[-1]), State(q, u, x if system.states else None))
+    ends = (on_device(np.asarray(a)[-1]) for a in ((q, u, x) if system.states else (q, u)))
     return Trajectory(
-        t=jnp.asarray(t), q=q, u=u, u_dep=u_dep, x=x, inputs=inputs, outputs=outputs,
-        status=jnp.asarray(int(Status.COMPLETED)), t_end=jnp.asarray(t[-1]),
+        t=on_device(t), q=q, u=u, u_dep=u_dep, x=x, inputs=inputs, outputs=outputs,
+        status=jnp.asarray(int(Status.COMPLETED)), t_end=on_device(t[-1]),
         stats={"steps": count, "accepted": count, "rejected": count}, names=names_of(system), events=(),
-        adjoint="none", units=tuple(units_of(system).items()), end=end,
+        adjoint="none", units=tuple(units_of(system).items()), end=State(*ends),
     )  # fmt: skip
 
 
