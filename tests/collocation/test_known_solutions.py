@@ -169,6 +169,7 @@ class Hypersensitive(Sled):
         return jk.Force((inputs["force"] - u["v"] ** 3) * motion.N.x, motion["sled"])
 
 
+@pytest.mark.slow
 def test_hypersensitive_problem():
     """J. T. Betts, Practical Methods for Optimal Control, example 10.7: 6.7241 over 10 000 s, which is at rest but for
     the first and last seconds."""
@@ -200,6 +201,7 @@ class Chute(jk.System):
         return jk.weight(motion, 9.81 * motion.N.y), jk.Torque(inputs["torque"] * motion.N.z, motion["bead"])
 
 
+@pytest.mark.slow
 def test_brachistochrone():
     """A cycloid of radius 1 m down to the parameter 2: its time is 2 sqrt(1 / 9.81) s. Its heading turns steadily."""
     rtol = 1e-5

@@ -468,9 +468,8 @@ def active_of(transcription: Transcription, solution: Solution, p: int) -> tuple
 def _joined(plans: Sequence[Plan]) -> Plan:
     """One plan for all phases, whose trajectory contains them one after another."""
     first = plans[0]
-    trajectory = first.trajectory
-    if all(plan.trajectory.names == trajectory.names for plan in plans):
-        trajectory = _concatenated([plan.trajectory for plan in plans])
+    parts = [plan.trajectory for plan in plans if plan.trajectory is not None]
+    trajectory = _concatenated(parts) if len({part.names for part in parts}) == 1 else None
     offsets = np.cumsum([0.0, *(plan.duration for plan in plans)])
     meshes = [plan.mesh + offset for plan, offset in zip(plans, offsets)]
     mesh = np.concatenate([meshes[0], *(mesh[1:] for mesh in meshes[1:])])
