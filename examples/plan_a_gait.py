@@ -1,0 +1,111 @@
+"""How does a walker with a motor at its hip walk on flat ground at the least cost of transport?
+
+The walker is the compass gait of the catalogue on flat ground, with a torque between its legs. Each step loses energy in
+the impact of the foot, and the motor must replace this energy. The step is one phase of the problem. Its end is linked to
+its start by the impact and the exchange of the legs, so the gait is periodic. The time and the length of the step are
+free. The cost of transport is the work of the motor (in both directions) divided by weight and distance.
+
+    variable                    meaning                                                        unit
+    stance, swing               angle of each leg from the vertical, forwards                  rad
+    hip_torque                  forwards on the swing leg, backwards on the stance leg         N m
+    work                        of the motor since the start of the step                       J
+    speed                       average of the gait                                            m/s
+
+Run:      python examples/plan_a_gait.py [--out FOLDER]
+Appears:  the cost of transport for several speeds; a simulation of two steps; plan_a_gait.png; plan_a_gait.html.
+Takes:    half a minute.
+"""
+
+import argparse
+from pathlib import Path
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import jaxkane as jk
+from jaxkane import collocation as col
+
+jk.configure(verbose=False)
+
+SPEEDS = np.linspace(0.5, 1.1, 7)  # [m/s]
+SMALL = 0.2  # [W]: the size of the power is sqrt(power^2 + SMALL^2) - SMALL, which is smooth
+
+
+class MotorWalker(jk.catalog.CompassGait):
+    """The compass gait with a motor between its legs. The first-order state is the work of the motor."""
+
+    inputs, states = ("hip_torque",), ("work",)
+
+    def loads(self, t, q, u, motion, inputs):
+        torque = jk.Torque(-inputs["hip_torque"] * motion.N.z, motion["swing leg"], reaction_on=motion["stance leg"])
+        return super().loads(t, q, u, motion, inputs), torque
+
+    def state_rates(self, t, q, u, x, motion, now):
+        power = now["hip_torque"] * (u["swing_rate"] - u["stance_rate"])
+        return {"work": jnp.sqrt(power**2 + SMALL**2) - SMALL}
+
+
+WALKER = MotorWalker(slope=0.0)
+WEIGHT = float((WALKER.hip_mass + 2 * WALKER.leg_mass) * WALKER.gravity)  # [N]
+LEG = float(WALKER.shank + WALKER.thigh)  # [m]
+
+
+def step_length(now):
+    """The distance from the stance foot to the swing foot, if both are on the ground [m]."""
+    return LEG * (jnp.sin(now["stance"]) - jnp.sin(now["swing"]))
+
+
+def gait_at(speed: float) -> col.Phases:
+    """The problem of one step at an average speed."""
+
+    def next_step(last, first):
+        after = last.after("heel_strike")
+        names = ("stance", "swing", "stance_rate", "swing_rate")
+        return {"heel_strike": last.event("heel_strike")} | {name: first[name] - after[name] for name in names}
+
+    step = col.Problem(
+        WALKER,
+        (0.2, 1.5),
+        controls={"hip_torque": (-60.0, 60.0)},
+        # A small cost of the torque, because a cost of work alone leads to impulses.
+        cost=lambda t, now: 1e-5 * now["hip_torque"] ** 2,
+        final_cost=lambda t, now: now["work"] / (WEIGHT * step_length(now)),
+        conditions=lambda first, last, duration: {"speed": step_length(last) / duration - speed},
+        start={"foot": 0.0, "work": 0.0, "stance": (-0.6, -0.1)},
+        end={"stance": (0.1, 0.6)},
+        within={"swing": (-0.8, 0.8)},
+    )
+    return col.Phases([step], links=[next_step])
+
+
+def main(out: Path) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    guess = {
+        "duration": 0.7,
+        "stance": [-0.25, 0.25],
+        "swing": [0.25, -0.25],
+        "stance_rate": 0.8,
+        "swing_rate": [0.0, -1.5, 0.0],
+    }
+    plans = col.continuation(gait_at, SPEEDS, [guess], intervals=40, tolerance=1e-5)
+    for speed, plan in zip(SPEEDS, plans, strict=False):
+        print(f"{speed:.2f} m/s: {described(plan)}")
+        assert plan.ok, plan
+    assert len(plans) == len(SPEEDS)
+
+
+def described(plan: col.Plan) -> str:
+    step, transport = plan.phases[0], cost_of_transport(plan)
+    length = 2 * LEG * np.sin(float(step["stance"][-1]))
+    return f"cost of transport {transport:.4f}, step {length:.3f} m in {plan.duration:.3f} s; {plan.reason}"
+
+
+def cost_of_transport(plan: col.Plan) -> float:
+    return float(plan["work"][-1]) / (WEIGHT * 2 * LEG * float(np.sin(plan["stance"][-1])))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("figures"), help="folder of the files (default: figures)")
+    main(parser.parse_args().out)
