@@ -12,7 +12,7 @@ free. The cost of transport is the work of the motor (in both directions) divide
     speed                       average of the gait                                            m/s
 
 Run:      python examples/plan_a_gait.py [--out FOLDER]
-Appears:  the cost of transport for several speeds; a simulation of two steps; plan_a_gait.png; plan_a_gait.html.
+Appears:  the cost of transport for several speeds; a simulation of a step with its impact; plan_a_gait.png.
 Takes:    half a minute.
 """
 
@@ -28,8 +28,8 @@ from jaxkane import collocation as col
 
 jk.configure(verbose=False)
 
-SPEEDS = np.linspace(0.5, 1.1, 7)  # [m/s]
-SMALL = 0.2  # [W]: the size of the power is sqrt(power^2 + SMALL^2) - SMALL, which is smooth
+SPEEDS = (0.4, 0.45, 0.5, 0.55)  # [m/s]
+SMALL = 1.0  # [W]: the size of the power is sqrt(power^2 + SMALL^2) - SMALL, which is smooth
 
 
 class MotorWalker(jk.catalog.CompassGait):
@@ -81,18 +81,30 @@ def gait_at(speed: float) -> col.Phases:
 
 def main(out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    guess = {
+    guess = {  # the shape of a passive step down a slope
         "duration": 0.7,
-        "stance": [-0.25, 0.25],
-        "swing": [0.25, -0.25],
-        "stance_rate": 0.8,
-        "swing_rate": [0.0, -1.5, 0.0],
+        "stance": [-0.2, -0.1, 0.0, 0.1, 0.2],
+        "swing": [0.2, 0.1, -0.1, -0.25, -0.2],
+        "stance_rate": [0.8, 0.6, 0.5, 0.6, 0.8],
+        "swing_rate": [-0.3, -1.0, -1.0, -0.3, 0.3],
     }
-    plans = col.continuation(gait_at, SPEEDS, [guess], intervals=40, tolerance=1e-5)
+    plans = col.continuation(gait_at, SPEEDS, [guess], intervals=40, tolerance=1e-4)
     for speed, plan in zip(SPEEDS, plans, strict=False):
         print(f"{speed:.2f} m/s: {described(plan)}")
         assert plan.ok, plan
-    assert len(plans) == len(SPEEDS)
+    transports = [cost_of_transport(plan) for plan in plans]
+    assert len(plans) == len(SPEEDS) and np.all(np.diff(transports) > 0)  # faster gaits lose more energy in impacts
+
+    # A simulation with the event and its impact: the state after the first step is that of its start.
+    plan = plans[-1]
+    step = plan.phases[0]
+    ts = jnp.linspace(0.0, step.duration + 0.001, 101)
+    ride = jk.simulate(step.system, step.state(0), ts, step.inputs, rtol=1e-9, atol=1e-9)
+    print(ride)
+    assert int(ride.jumps.count) == 1 and abs(float(ride.jumps.t[0]) - step.duration) < 1e-3
+    np.testing.assert_allclose(ride.jumps.after.q[0, :2], step.q[0, :2], atol=1e-3)
+    np.testing.assert_allclose(ride.jumps.after.u[0], step.u[0], atol=1e-2)
+    draw(plans, out / "plan_a_gait.png")
 
 
 def described(plan: col.Plan) -> str:
@@ -103,6 +115,28 @@ def described(plan: col.Plan) -> str:
 
 def cost_of_transport(plan: col.Plan) -> float:
     return float(plan["work"][-1]) / (WEIGHT * 2 * LEG * float(np.sin(plan["stance"][-1])))
+
+
+def draw(plans: list[col.Plan], path: Path) -> None:
+    figure, (above, middle, right) = plt.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
+    step = plans[-1].phases[0]
+    found = step.at(np.linspace(0.0, step.duration, 11))
+    for k, (stance, swing) in enumerate(zip(found["stance"], found["swing"], strict=True)):
+        hip = LEG * np.array([np.sin(stance), np.cos(stance)])
+        toe = hip - LEG * np.array([np.sin(swing), np.cos(swing)])
+        color = plt.get_cmap("viridis")(k / 10)
+        above.plot([0.0, hip[0], toe[0]], [0.0, hip[1], toe[1]], "-", color=color, lw=1.2)
+    above.axhline(0.0, color="0.6", lw=0.8, zorder=0)
+    above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"one step at {SPEEDS[-1]:g} m/s")
+    for speed, plan in zip(SPEEDS, plans, strict=True):
+        middle.plot(plan.t, plan["hip_torque"], label=f"{speed:g} m/s")
+    middle.set(xlabel="time [s]", ylabel="hip torque [N m]")
+    middle.legend(frameon=False)
+    right.plot(SPEEDS, [cost_of_transport(plan) for plan in plans], "o-")
+    right.set(xlabel="speed [m/s]", ylabel="cost of transport", ylim=(0, None))
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+    print(f"picture: {path}")
 
 
 if __name__ == "__main__":
