@@ -2,8 +2,8 @@
 
 The rider of the benchmark bicycle does not lean. Two problems are solved:
 
-- Half slalom: cones stand in a row, alternately passed on the left and on the right, 0.4 m from the line of cones. The
-  motion from one cone to the next is the mirror image of the next one. This condition makes it periodic. The cost is the
+- Half slalom: the bicycle passes a row of cones alternately on the left and on the right, at a distance of 0.4 m. The
+  motion from one cone to the next is the mirror image of the following one, so the slalom is periodic. The cost is the
   integral of the squared steer torque. A small drive torque keeps the speed.
 - Quickest lane change: the bicycle moves by 1.5 m to the side and rides straight ahead again, in the shortest time. The
   steer torque is bounded, and the result is compared for several bounds.
@@ -81,8 +81,10 @@ def main(out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     slalom = half_slalom()
     print(slalom)
-    print(f"  roll up to {degrees(slalom['roll']):.1f} deg, steer up to {degrees(slalom['steer']):.1f} deg, "
-          f"drive torque up to {np.max(np.abs(slalom['drive_torque'])):.2f} N m")
+    print(
+        f"  roll up to {degrees(slalom['roll']):.1f} deg, steer up to {degrees(slalom['steer']):.1f} deg, "
+        f"drive torque up to {np.max(np.abs(slalom['drive_torque'])):.2f} N m"
+    )
     assert slalom.ok
     ride = slalom.replay()
     assert slalom.deviation(ride) < 1e-3

