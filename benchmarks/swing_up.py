@@ -40,7 +40,8 @@ class Solved(NamedTuple):
 def measure(setting: Setting) -> Iterator[Figure]:
     if not here("opty"):
         return
-
+    for package in ("opty", "sympy.physics.mechanics"):
+        importlib.import_module(package)  # not a part of the first solution
     line = np.outer(END, np.linspace(0.0, 1.0, 2 * N + 1))
     still = np.zeros((2, 2 * N + 1))
     ours, seconds = _timed(lambda: by_jaxkane(line, still, 1.0))
@@ -70,8 +71,6 @@ def _timed(f: Callable[[], Solved]) -> tuple[Solved, float]:
 
 
 def _cpu() -> float:
-    import resource
-
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(each.ru_utime + each.ru_stime for each in used)
 
