@@ -187,7 +187,7 @@ class NonlinearProgram:
 
     def _map_jacobian(self) -> None:
         """Each entry of the Jacobian of g, and of the gradient of f, is a sum of entries of the blocks."""
-        A = self._A.tocoo()  # pyright: ignore[reportAttributeAccessIssue]
+        A = scipy.sparse.coo_matrix(self._A)
         rows, columns, sources, factors = [A.row], [A.col], [], []
         self._gradient_maps, places = [], []
         total = 0
@@ -198,7 +198,7 @@ class NonlinearProgram:
             picks = scipy.sparse.csr_matrix(
                 (np.ones(b.B * e), (entry_rows, np.arange(b.B * e))), (b.B * b.block.size, b.B * e)
             )
-            used = (S @ picks).tocoo()
+            used = scipy.sparse.coo_matrix(S @ picks)
             rows.append(used.row)
             columns.append(entry_columns[used.col])
             sources.append(used.col + total)

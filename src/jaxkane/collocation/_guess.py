@@ -9,13 +9,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from .._collocate.functions import Condition, bounds_of
+from .._collocate.transcription import Motion
 from .._common.lookup import real_number, refuse_unknown
 from .._integrate.trajectory import Trajectory
 from .._kane.consistent_state import assemble
 from .._kane.right_hand_side import vector_field
 from .._system.system import units_of
-from ._problem import Condition, Problem, bounds_of
-from ._transcription import Motion, variables_of
+from ._problem import Problem
 
 
 def guess_of(problem: Problem, guess: Any, s: np.ndarray, detour: np.ndarray | None = None) -> Motion:
@@ -124,7 +125,7 @@ def _assembled(problem: Problem, start: np.ndarray, given: np.ndarray) -> np.nda
 
 
 def _rates(problem: Problem, y: np.ndarray, w: np.ndarray) -> np.ndarray:
-    variables = variables_of(problem)
+    variables = problem.variables()
     x = jnp.concatenate([jnp.asarray(y), jnp.asarray(w)])
     tail = jnp.zeros(problem.has_free_duration + (0 if variables.parameters is None else variables.parameters.size))
     sampled = {} if callable(problem.signals) else problem.signals

@@ -11,15 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._collocate.functions import Integrand
 from .._collocate.lobatto import Lobatto
 from .._collocate.program import Block, EvaluatedBlock
+from .._collocate.transcription import Layout, Motion
 from .._integrate.simulate import simulate
 from .._scalarjit.cache import Cache
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Component
 from .._system.system import State, System, packed, unpacked, with_class
-from ._functions import Integrand
-from ._transcription import Layout, Motion
 
 
 class ControlPolynomial(eqx.Module):

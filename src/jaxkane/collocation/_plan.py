@@ -14,6 +14,7 @@ import scipy.linalg
 from jaxtyping import Array, Float
 
 from .._collocate.lobatto import Lobatto
+from .._collocate.transcription import Motion
 from .._integrate.simulate import simulate
 from .._integrate.status import Status
 from .._integrate.trajectory import Trajectory
@@ -25,7 +26,6 @@ from .._system.prints import wrapped
 from .._system.system import State, System, has_outputs, names_of, units_of, unpacked
 from ._mesh import ControlPolynomial, coefficients_of, interpolated, with_controls, without_events
 from ._problem import Problem
-from ._transcription import Motion
 
 
 @dataclasses.dataclass(frozen=True)

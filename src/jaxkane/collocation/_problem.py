@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._collocate.functions import Bound, Condition, Now, Variables, bounds_of
+from .._collocate.transcription import variables_of
 from .._common.lookup import as_names, real_number, refuse_unknown
 from .._integrate.inputs import as_signals, is_samples
 from .._kane.arguments import check_is_system, is_concrete, refuse_multipliers
@@ -22,10 +24,7 @@ from .._system.parameters import in_batches
 from .._system.system import State, System, names_of
 from ..fit.problem.from_declarations import parameters_of
 from ..fit.problem.parameters import Parameters
-from ._functions import Now, named
 
-Bound = tuple[float, float]
-Condition = float | tuple[float | None, float | None]
 Values = Mapping[str, Condition] | State
 
 
@@ -235,6 +234,20 @@ class Problem:
             values = {k: v for k, v in values.items() if k not in self.system.dependent_coordinates}
         return values
 
+    def variables(self) -> Variables:
+        """How the variables of a node are read."""
+        return variables_of(self)
+
+    @property
+    def is_piecewise(self) -> bool:
+        """Whether controls are constant in each interval."""
+        return False
+
+    @property
+    def n_local(self) -> int:
+        """The number of parameters that belong to this phase alone."""
+        return 0
+
     @property
     def n_constraints(self) -> int:
         """The number of residuals of the configuration constraints."""
@@ -314,42 +327,5 @@ def events_with_jumps(system: System) -> tuple[str, ...]:
     return names_of_jumps(system)
 
 
-def bounds_of(label: str, value: Any) -> Bound:
-    """Lower and upper bound, equal for a number.
-
-    **Raises:** `ValueError` if the lower bound is greater than the upper one, or not a number.
-    """
-    if isinstance(value, (tuple, list)):
-        if len(value) != 2:
-            raise ValueError(f"Problem: {label} must be a number or (lower, upper), got {value!r}.")
-        low, high = (
-            infinite if x is None else real_number(x, f"Problem: {label}")
-            for x, infinite in zip(value, (-math.inf, math.inf), strict=True)
-        )
-    else:
-        low = high = real_number(value, f"Problem: {label}")
-        if not math.isfinite(low):
-            raise ValueError(f"Problem: {label} is {value!r}. Pass a finite number, or leave the name out.")
-    if not low <= high:
-        raise ValueError(f"Problem: {label} is {value!r}: the lower bound is greater than the upper one, or is NaN.")
-    return low, high
-
-
 def _is_number(value: Any) -> bool:
     return not isinstance(value, (tuple, list))
-
-
-def constraints_of(label: str, values: Any, is_equality: bool) -> dict[str, Bound]:
-    """The bounds of constraints by name, from what the user's function returned.
-
-    **Raises:** `ValueError` or `TypeError` for bounds that are not concrete numbers.
-    """
-    found = {}
-    for name, item in named(label, values).items():
-        if not isinstance(item, tuple):
-            found[name] = (0.0, 0.0 if is_equality else math.inf)
-            continue
-        if len(item) != 3:
-            raise ValueError(f"`{label}`: {name!r} must be a number or (number, lower, upper), got {item!r}.")
-        found[name] = bounds_of(f"`{label}`: the bounds of {name!r}", item[1:])
-    return found

@@ -14,13 +14,13 @@ import numpy as np
 from .._collocate.lobatto import Lobatto, lobatto
 from .._collocate.program import NonlinearProgram
 from .._collocate.solvers import INTERRUPTED, Monitor, Solution, Solver, default_solver
+from .._collocate.transcription import Motion, Transcription, nodes_of, system_at
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
 from ._guess import detours, guess_of
 from ._mesh import interpolated, local_errors, quadrature_errors, refined
 from ._plan import Multipliers, Plan, trajectory_of
 from ._problem import Phases, Problem
-from ._transcription import Motion, Transcription, nodes_of, system_at
 
 MAX_MESHES = 10
 
@@ -133,7 +133,9 @@ def check_derivatives(
     mesh = np.linspace(0.0, 1.0, intervals + 1)
     motions = [guess_of(p, getattr(guess, "trajectory", guess), nodes_of(mesh, found)) for p in phases.phases]
     theta = np.zeros(0 if phases.phases[0].parameters is None else phases.phases[0].parameters.size)
-    program = (transcription := Transcription(phases, [mesh] * len(motions), found, motions, theta)).program
+    program = (
+        transcription := Transcription(phases.phases, phases.links, [mesh] * len(motions), found, motions, theta)
+    ).program
     rng = np.random.default_rng(seed)
     z = np.clip(transcription.z + 0.1 * rng.normal(size=program.n), program.lower, program.upper)
     weights = rng.normal(size=program.m)
@@ -202,7 +204,7 @@ class _Search:
         costs: list[float] = []
         iterations, is_warm = 0, isinstance(guesses[0][0], Plan)
         while True:
-            transcription = Transcription(self.phases, meshes, self.method, motions, theta)
+            transcription = Transcription(self.phases.phases, self.phases.links, meshes, self.method, motions, theta)
             solution = self._solved(transcription, is_warm)
             program, x = transcription.program, solution.z * transcription.x_scale
             costs.append(program.objective(solution.z) * program.f_scale)
@@ -289,10 +291,10 @@ class _Search:
         layout, motion = transcription.layouts[p], transcription.motions(x)[p]
         system = system_at(transcription, p, x)
         return Plan(
-            problem=layout.problem,
+            problem=self.phases.phases[p],
             duration=motion.duration,
             system=system,
-            trajectory=trajectory_of(system, layout.problem, motion),
+            trajectory=trajectory_of(system, self.phases.phases[p], motion),
             mesh=layout.mesh * motion.duration,
             errors=errors,
             multipliers=multipliers_of(transcription, solution, p),

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
+from ..collocated._fit import Collocation, CollocationFit
 from ..problem.declarations import Items
 from ..problem.model import Simulation, Unknowns
 from ..problem.problem import Problem
@@ -41,8 +42,9 @@ def fit(
     checkpoint: str | os.PathLike[str] | None = None,
     callback: Callable[[Unknowns, float], None] | None = None,
     progress: bool = False,
+    transcription: Collocation | None = None,
     **options: Any,
-) -> Fit:
+) -> Fit | CollocationFit:
     """Estimate parameters of a system from measured trials.
 
         minimize  sum ((gain * simulated + offset - measured) / sigma)^2
@@ -89,12 +91,22 @@ def fit(
     - `checkpoint`: a file from which an interrupted fit can be resumed, as in `minimize`.
     - `callback`: a function of the unknowns and their cost, as in `minimize`.
     - `progress`: whether to show a progress bar.
+    - `transcription`: `Collocation(...)` to fit by direct collocation, for long unstable motions and unknown inputs.
+        The result is then a `CollocationFit`. `window`, `defect_std`, `noise`, `errors`, `zero_order_hold`,
+        `simulation`, `optimizer`, `steps`, `start`, `checkpoint` and `callback` cannot be used with it.
 
     **Returns:** a `Fit`. Trials that cannot be simulated with the initial guess are excluded. `Fit.failed` and
     `Fit.notes` state the reason for each of them.
 
     **Raises:** `ValueError` if a trial, a channel, a parameter or a window is invalid, or if no trial can be simulated.
     """
+    if transcription is not None:
+        refuse_other(transcription, Collocation, "`transcription=`", "transcription=Collocation()")
+        run = {"optimizer": optimizer, "steps": steps, "start": start, "checkpoint": checkpoint, "callback": callback}
+        used = [name for name, value in run.items() if value is not None]
+        if used:
+            raise ValueError(f"`{used[0]}` cannot be used with `transcription=Collocation()`. Omit it.")
+        return transcription.fit(system, trials, free, progress=progress, **options)
     problem = Problem.of(system, trials, free, **options)
     run = {"steps": steps, "callback": callback, "progress": progress}
     return solve(problem, optimizer, start=start, checkpoint=checkpoint, **run)

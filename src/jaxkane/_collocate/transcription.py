@@ -10,20 +10,77 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
-from .._collocate.lobatto import Lobatto
-from .._collocate.program import Block, Bounds, EvaluatedBlock, NonlinearProgram
 from .._integrate.inputs import is_samples
 from .._system.system import System, units_of
-from ._functions import Dynamics, Ends, Integrand, Link, Path, Variables, called, named
-from ._problem import Bound, Phases, Problem, bounds_of, constraints_of
+from .functions import (
+    Bound,
+    Condition,
+    Dynamics,
+    Ends,
+    Integrand,
+    Link,
+    Path,
+    Variables,
+    bounds_of,
+    called,
+    constraints_of,
+    named,
+)
+from .lobatto import Lobatto
+from .program import Block, Bounds, EvaluatedBlock, NonlinearProgram
+
+
+class PhaseProblem(Protocol):
+    """What a phase of a motion is: see `jaxkane.collocation.Problem` for the meaning of each attribute.
+
+    `parameters` has the method `apply` and the attribute `size`; its last `n_local` numbers belong to this phase alone,
+    the others are shared by all phases. `ends` and `limits` are bounds by name. If `is_piecewise`, a control has one
+    value in each interval; else it is continuous, with a value at each node.
+    """
+
+    @property
+    def cost(self) -> Any: ...
+    @property
+    def final_cost(self) -> Any: ...
+    @property
+    def conditions(self) -> Any: ...
+    @property
+    def path(self) -> Any: ...
+    @property
+    def system(self) -> System: ...
+    @property
+    def title(self) -> str: ...
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def durations(self) -> Bound: ...
+    @property
+    def has_free_duration(self) -> bool: ...
+    @property
+    def bounds_of_controls(self) -> dict[str, Bound]: ...
+    @property
+    def limits(self) -> dict[str, Bound]: ...
+    @property
+    def ends(self) -> Mapping[str, Mapping[str, Condition]]: ...
+    @property
+    def signals(self) -> Any: ...
+    @property
+    def parameters(self) -> Any: ...
+    @property
+    def n_local(self) -> int: ...
+    @property
+    def is_piecewise(self) -> bool: ...
+    @property
+    def n_constraints(self) -> int: ...
+    def variables(self) -> Variables: ...
 
 
 class Motion(NamedTuple):
@@ -55,14 +112,16 @@ class Layout:
 
     - `problem`, `variables`: the problem and how its nodes are read.
     - `mesh` (N + 1,): the ends of the intervals, as fractions of the duration. `s` (K,): the nodes.
+    - `every`: the number of nodes from one end of an interval to the next one.
     - `first`: the index of the first variable. `duration`: the index of the duration, or None.
     - `parameters`: the indices of the parameters.
     """
 
-    problem: Problem
+    problem: PhaseProblem
     variables: Variables
     mesh: np.ndarray
     s: np.ndarray
+    every: int
     first: int
     duration: int | None
     parameters: np.ndarray
@@ -76,14 +135,55 @@ class Layout:
         return np.concatenate([[] if self.duration is None else [self.duration], self.parameters]).astype(int)
 
     def node(self, k: Any) -> np.ndarray:
-        """The indices (..., n_z) of the variables of nodes k (...,)."""
-        n_z = self.variables.n_z
-        return self.first + np.asarray(k)[..., None] * n_z + np.arange(n_z)
+        """The indices (..., n_z) of the states and controls at nodes k (...,).
+
+        A control that is constant in each interval has the value of the interval that begins at the node.
+        """
+        k = np.asarray(k)
+        if not self.problem.is_piecewise:
+            return self.first + k[..., None] * self.variables.n_z + np.arange(self.variables.n_z)
+        return self.in_interval(np.minimum(k // self.every, len(self.mesh) - 2), k)
+
+    def in_interval(self, i: np.ndarray, k: np.ndarray) -> np.ndarray:
+        """The same for nodes k (...,) of intervals i (...,), with constant controls."""
+        n_y, n_w = self.variables.n_y, len(self.variables.controls)
+        states = self.first + k[..., None] * n_y + np.arange(n_y)
+        controls = self.first + self.K * n_y + i[..., None] * n_w + np.arange(n_w)
+        return np.concatenate([states, controls], axis=-1)
+
+    @property
+    def size(self) -> int:
+        """The number of states and controls."""
+        n_y, n_w = self.variables.n_y, len(self.variables.controls)
+        return self.K * n_y + (len(self.mesh) - 1 if self.problem.is_piecewise else self.K) * n_w
+
+    @property
+    def dynamics(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where the equations of motion are evaluated.
+
+        **Returns:** the nodes (B,), the variables (B, n) and, for each point of each interval, its place (N, s) among
+        them. A node between two intervals is evaluated twice if controls are constant in each interval.
+        """
+        N = len(self.mesh) - 1
+        nodes = np.arange(N)[:, None] * self.every + np.arange(self.every + 1)  # (N, s)
+        if not self.problem.is_piecewise:
+            return np.arange(self.K), self.columns, nodes
+        i = np.broadcast_to(np.arange(N)[:, None], nodes.shape).ravel()
+        shared = np.tile(self.shared, (nodes.size, 1))
+        columns = np.concatenate([self.in_interval(i, nodes.ravel()), shared], axis=1)
+        return nodes.ravel(), columns, np.arange(nodes.size).reshape(nodes.shape)
 
     @property
     def columns(self) -> np.ndarray:
         """For each node, the variables (K, n) that its functions use."""
         return np.concatenate([self.node(np.arange(self.K)), np.tile(self.shared, (self.K, 1))], axis=1)
+
+    def quadrature(self, method: Lobatto) -> np.ndarray:
+        """The weights (K,) of the nodes in an integral over the fraction of the duration."""
+        weights, steps, every = np.zeros(self.K), np.diff(self.mesh), len(method.c) - 1
+        for j, b in enumerate(method.b):
+            np.add.at(weights, np.arange(len(steps)) * every + j, steps * b)
+        return weights
 
     def node_data(self, s: np.ndarray) -> dict[str, Any]:
         """The data of nodes: their fractions, and the values of sampled inputs if their times are fixed."""
@@ -94,7 +194,7 @@ class Layout:
         return {"s": s, "inputs": inputs}
 
 
-def variables_of(problem: Problem, origin: float = 0.0) -> Variables:
+def variables_of(problem: PhaseProblem) -> Variables:
     """How the nodes of a problem are read."""
     signals = problem.signals
     if not problem.has_free_duration and not callable(signals):
@@ -104,7 +204,7 @@ def variables_of(problem: Problem, origin: float = 0.0) -> Variables:
         signals=signals,
         parameters=problem.parameters,
         duration=None if problem.has_free_duration else jnp.asarray(problem.durations[0], float),
-        origin=jnp.asarray(origin, float),
+        origin=jnp.zeros(()),
         controls=tuple(problem.bounds_of_controls),
         n_y=len(problem.names),
     )
@@ -121,25 +221,28 @@ class Transcription:
 
     **Arguments:**
 
-    - `phases`: the problems and their links.
+    - `phases`, `links`: the phases and what links them.
     - `meshes`: for each phase the ends (N + 1,) of its intervals.
     - `method`: the method of collocation.
     - `motions`: for each phase the guess at the nodes.
     - `theta` (p,): the guess of the free parameters, in their search variables.
+    - `objectives`: a function of the builder and the layouts, which adds to the cost.
 
     **Raises:** `ValueError` if a function is not finite at the guess, or a constraint has no derivative.
     """
 
     def __init__(
         self,
-        phases: Phases,
+        phases: Sequence[PhaseProblem],
+        links: Sequence[Any],
         meshes: Sequence[np.ndarray],
         method: Lobatto,
         motions: Sequence[Motion],
         theta: np.ndarray,
+        objectives: Callable[[Builder, Sequence[Layout]], None] | None = None,
     ):
-        self.phases, self.method = phases, method
-        self.layouts = _layouts(phases.phases, meshes, method)
+        self.links, self.method, self._objectives = links, method, objectives
+        self.layouts = _layouts(phases, meshes, method)
         self.n = 1 + max(int(layout.columns.max()) for layout in self.layouts)
         self.parameters = self.layouts[0].variables.parameters
         self.x = np.zeros(self.n)
@@ -147,24 +250,28 @@ class Transcription:
             self.x[layout.node(np.arange(layout.K))] = np.concatenate([motion.Y, motion.W], axis=1)
             if layout.duration is not None:
                 self.x[layout.duration] = motion.duration
-        self.x[self.layouts[0].parameters] = theta
+        self.x[self._shared_parameters] = theta
         self._build()
 
     def _build(self) -> None:
         self.x_bounds = self._variable_bounds()
         dynamics = [
-            EvaluatedBlock(Block(Dynamics(x.variables), x.node_data(x.s), x.columns, x.variables.n_y))
+            EvaluatedBlock(
+                Block(Dynamics(x.variables), x.node_data(x.s[x.dynamics[0]]), x.dynamics[1], x.variables.n_y)
+            )
             for x in self.layouts
         ]
         self._check_finite_dynamics(dynamics)
         self.x_scale = self._scales(dynamics)
-        builder = _Builder(self.n)
+        builder = Builder(self.n, self.method)
         for p, (layout, block) in enumerate(zip(self.layouts, dynamics, strict=True)):
-            builder.defects(p, layout, block, self.method, self.x_scale)
+            builder.defects(p, layout, block, self.x_scale)
         for p, layout in enumerate(self.layouts):
             self._add_functions(builder, p, layout)
-        for i, how in enumerate(self.phases.links):
+        for i, how in enumerate(self.links):
             self._add_link(builder, i, how, dynamics)
+        if self._objectives is not None:
+            self._objectives(builder, self.layouts)
         self.rows = builder.rows
         self._check_functions(builder)
         g_scale = builder.scales(self.x, self.x_scale)
@@ -175,6 +282,11 @@ class Transcription:
     def z(self) -> np.ndarray:
         """The guess (n,) in scaled variables."""
         return self.x / self.x_scale
+
+    @property
+    def _shared_parameters(self) -> np.ndarray:
+        layout = self.layouts[0]
+        return layout.parameters[: len(layout.parameters) - layout.problem.n_local]
 
     def motions(self, x: np.ndarray) -> list[Motion]:
         """The motions of all phases at variables (n,)."""
@@ -187,7 +299,7 @@ class Transcription:
         return found
 
     def theta(self, x: np.ndarray) -> np.ndarray:
-        return x[self.layouts[0].parameters]
+        return x[self._shared_parameters]
 
     def _variable_bounds(self) -> Bounds:
         lower, upper = np.full(self.n, -math.inf), np.full(self.n, math.inf)
@@ -196,7 +308,7 @@ class Transcription:
             names = (*problem.names, *layout.variables.controls)
             for name, (low, high) in problem.limits.items():
                 if name in names:
-                    at = layout.first + np.arange(layout.K) * layout.variables.n_z + names.index(name)
+                    at = layout.node(np.arange(layout.K))[:, names.index(name)]
                     lower[at], upper[at] = low, high
             for label, k in (("start", 0), ("end", layout.K - 1)):
                 for name, value in problem.ends[label].items():
@@ -213,8 +325,9 @@ class Transcription:
             values = block.values(self.x)
             if np.all(np.isfinite(values)):
                 continue
-            k = int(np.argmin(np.all(np.isfinite(values), axis=1)))
-            names = [layout.problem.names[i] for i in np.nonzero(~np.isfinite(values[k]))[0]]
+            place = int(np.argmin(np.all(np.isfinite(values), axis=1)))
+            names = [layout.problem.names[i] for i in np.nonzero(~np.isfinite(values[place]))[0]]
+            k = layout.dynamics[0][place]
             at = dict(zip(layout.problem.names, self.x[layout.node(k)].round(6).tolist()))
             raise ValueError(
                 f"Problem: with the initial guess, the rates of {', '.join(names)} are not finite at "
@@ -231,15 +344,12 @@ class Transcription:
                 scale[layout.duration] = max(self.x[layout.duration], 1e-3 * layout.problem.durations[1])
         return scale
 
-    def _add_functions(self, builder: _Builder, p: int, layout: Layout) -> None:
+    def _add_functions(self, builder: Builder, p: int, layout: Layout) -> None:
         problem, variables = layout.problem, layout.variables
         data = layout.node_data(layout.s)
         if problem.cost is not None:
-            weights = np.zeros(layout.K)
-            steps = np.diff(layout.mesh)
-            for j, b in enumerate(self.method.b):
-                np.add.at(weights, np.arange(len(steps)) * (len(self.method.b) - 1) + j, steps * b)
-            builder.cost(EvaluatedBlock(Block(Integrand(variables, problem.cost), data, layout.columns, 1)), weights)
+            block = EvaluatedBlock(Block(Integrand(variables, problem.cost), data, layout.columns, 1))
+            builder.cost(block, layout.quadrature(self.method))
         along = {k: v for k, v in problem.limits.items() if k not in (*problem.names, *variables.controls)}
         path = self._constraints(layout, "path", problem.path, 0) if problem.path is not None else {}
         if along or path:
@@ -247,7 +357,7 @@ class Transcription:
             builder.constraints("path", p, EvaluatedBlock(block), [*along.items(), *path.items()])
         self._add_ends(builder, p, layout)
 
-    def _add_ends(self, builder: _Builder, p: int, layout: Layout) -> None:
+    def _add_ends(self, builder: Builder, p: int, layout: Layout) -> None:
         problem, variables = layout.problem, layout.variables
         names = (*problem.names, *variables.controls)
         by_name = {
@@ -273,7 +383,7 @@ class Transcription:
         block = EvaluatedBlock(Block(ends, data, columns, has_cost + len(items)))
         builder.constraints("conditions", p, block, items, has_cost=has_cost)
 
-    def _add_link(self, builder: _Builder, i: int, how: Any, dynamics: Sequence[EvaluatedBlock]) -> None:
+    def _add_link(self, builder: Builder, i: int, how: Any, dynamics: Sequence[EvaluatedBlock]) -> None:
         j = (i + 1) % len(self.layouts)
         one, other = self.layouts[i], self.layouts[j]
         linked = other.problem.names
@@ -330,7 +440,7 @@ class Transcription:
                 raise ValueError(f"`{label}`: {name!r} must be one number, got the shape {shape.shape}.")
         return found
 
-    def _check_functions(self, builder: _Builder) -> None:
+    def _check_functions(self, builder: Builder) -> None:
         for block, label in builder.user_blocks:
             values = block.values(self.x)
             if not np.all(np.isfinite(values)):
@@ -353,11 +463,11 @@ class Transcription:
         return max(finite, default=1.0)
 
 
-class _Builder:
+class Builder:
     """Collects blocks, constraints and their bounds."""
 
-    def __init__(self, n: int) -> None:
-        self.n, self.m = n, 0
+    def __init__(self, n: int, method: Lobatto) -> None:
+        self.n, self.m, self.method = n, 0, method
         self.blocks: list[EvaluatedBlock] = []
         self.weights: list[np.ndarray | None] = []
         self.entries: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = []  # rows, places of values, factors
@@ -372,7 +482,8 @@ class _Builder:
         self.m += k
         return np.arange(self.m - k, self.m)
 
-    def defects(self, p: int, layout: Layout, block: EvaluatedBlock, method: Lobatto, x_scale: np.ndarray) -> None:
+    def defects(self, p: int, layout: Layout, block: EvaluatedBlock, x_scale: np.ndarray) -> None:
+        method = self.method
         n_y, steps, s = layout.variables.n_y, np.diff(layout.mesh), len(method.c)
         N = len(steps)
         first = np.arange(N) * (s - 1)
@@ -382,7 +493,7 @@ class _Builder:
         inner = first[:, None] + np.arange(1, s)
         self.linear.append((rows.ravel(), node[inner].ravel(), one.ravel()))
         self.linear.append((rows.ravel(), np.broadcast_to(node[first][:, None], rows.shape).ravel(), -one.ravel()))
-        values = (first[:, None] + np.arange(s))[:, None, :, None] * n_y + np.arange(n_y)  # (N, 1, s, n_y)
+        values = layout.dynamics[2][:, None, :, None] * n_y + np.arange(n_y)  # (N, 1, s, n_y)
         factors = -steps[:, None, None, None] * method.A[None, :, :, None]
         shape = (N, s - 1, s, n_y)
         parts = (np.broadcast_to(x, shape).ravel() for x in (rows[:, :, None, :], values, factors))
@@ -467,19 +578,25 @@ def _sparse(entries: tuple[np.ndarray, np.ndarray, np.ndarray], shape: tuple[int
     return scipy.sparse.csr_matrix((factors, (rows, columns)), shape)
 
 
-def _layouts(problems: Sequence[Problem], meshes: Sequence[np.ndarray], method: Lobatto) -> list[Layout]:
-    variables = [variables_of(problem) for problem in problems]
-    nodes = [nodes_of(mesh, method) for mesh in meshes]
-    firsts = np.cumsum([0, *(len(s) * v.n_z for s, v in zip(nodes, variables, strict=True))])
-    next_one = int(firsts[-1])
-    durations: list[int | None] = []
-    for problem in problems:
-        durations.append(next_one if problem.has_free_duration else None)
-        next_one += problem.has_free_duration
-    parameters = variables[0].parameters
-    places = np.arange(next_one, next_one + (0 if parameters is None else parameters.size))
-    rows: Any = zip(problems, variables, meshes, nodes, firsts[:-1].tolist(), durations, strict=True)
-    return [Layout(p, v, mesh, s, first, duration, places) for p, v, mesh, s, first, duration in rows]
+def _layouts(problems: Sequence[PhaseProblem], meshes: Sequence[np.ndarray], method: Lobatto) -> list[Layout]:
+    """The layouts of all phases: their nodes, then their durations, shared parameters, and parameters of phases."""
+    layouts, first, none = [], 0, np.zeros(0, int)
+    for problem, mesh in zip(problems, meshes, strict=True):
+        s, every = nodes_of(mesh, method), len(method.c) - 1
+        layouts.append(Layout(problem, problem.variables(), mesh, s, every, first, None, none))
+        first += layouts[-1].size
+    for i, layout in enumerate(layouts):
+        if layout.problem.has_free_duration:
+            layouts[i] = dataclasses.replace(layout, duration=first)
+            first += 1
+    sizes = [0 if x.variables.parameters is None else x.variables.parameters.size - x.problem.n_local for x in layouts]
+    shared = np.arange(first, first + sizes[0])
+    first += sizes[0]
+    for i, layout in enumerate(layouts):
+        local = np.arange(first, first + layout.problem.n_local)
+        first += len(local)
+        layouts[i] = dataclasses.replace(layout, parameters=np.concatenate([shared, local]))
+    return layouts
 
 
 def scales_of(layout: Layout, block: EvaluatedBlock, x: np.ndarray) -> np.ndarray:

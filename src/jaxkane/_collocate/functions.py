@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -9,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._common.lookup import not_there
+from .._common.lookup import not_there, real_number
 from .._integrate.events import crossings, events_of
 from .._integrate.inputs import inputs_at
 from .._integrate.jumps import stages_of, state_after
@@ -19,6 +20,9 @@ from .._kane.kanes_method import KaneEquations
 from .._kane.right_hand_side import outputs_at, values_of, vector_field
 from .._scalarjit.components import Component
 from .._system.system import System, explain_value_of_traced, has_outputs, names_of, unpacked
+
+Bound = tuple[float, float]
+Condition = float | tuple[float | None, float | None]
 
 
 class Now:
@@ -252,3 +256,40 @@ def named(label: str, values: Any) -> Mapping[str, Any]:
 def _value(item: Any) -> Any:
     """The value of an item of a dict of constraints: a number, or (number, lower bound, upper bound)."""
     return item[0] if isinstance(item, tuple) else item
+
+
+def bounds_of(label: str, value: Any) -> Bound:
+    """Lower and upper bound, equal for a number.
+
+    **Raises:** `ValueError` if the lower bound is greater than the upper one, or not a number.
+    """
+    if isinstance(value, (tuple, list)):
+        if len(value) != 2:
+            raise ValueError(f"Problem: {label} must be a number or (lower, upper), got {value!r}.")
+        low, high = (
+            infinite if x is None else real_number(x, f"Problem: {label}")
+            for x, infinite in zip(value, (-math.inf, math.inf), strict=True)
+        )
+    else:
+        low = high = real_number(value, f"Problem: {label}")
+        if not math.isfinite(low):
+            raise ValueError(f"Problem: {label} is {value!r}. Pass a finite number, or leave the name out.")
+    if not low <= high:
+        raise ValueError(f"Problem: {label} is {value!r}: the lower bound is greater than the upper one, or is NaN.")
+    return low, high
+
+
+def constraints_of(label: str, values: Any, is_equality: bool) -> dict[str, Bound]:
+    """The bounds of constraints by name, from what the user's function returned.
+
+    **Raises:** `ValueError` or `TypeError` for bounds that are not concrete numbers.
+    """
+    found = {}
+    for name, item in named(label, values).items():
+        if not isinstance(item, tuple):
+            found[name] = (0.0, 0.0 if is_equality else math.inf)
+            continue
+        if len(item) != 3:
+            raise ValueError(f"`{label}`: {name!r} must be a number or (number, lower, upper), got {item!r}.")
+        found[name] = bounds_of(f"`{label}`: the bounds of {name!r}", item[1:])
+    return found

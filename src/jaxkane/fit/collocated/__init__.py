@@ -1,0 +1,1 @@
+"""Parameters from long or unstable motions by direct collocation, with unknown inputs."""

@@ -1,0 +1,345 @@
+"""`Collocation`: the transcription of a fit by direct collocation, and its result."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+
+from ..._collocate.lobatto import lobatto
+from ..._collocate.program import Bounds, NonlinearProgram
+from ..._collocate.solvers import INTERRUPTED, Monitor, Solution, Solver, default_solver
+from ..._collocate.transcription import Transcription
+from ..._scalarjit.cache_key import jit
+from ..._system.system import System
+from ..problem.declarations import Items
+from ..problem.parameters import LOW_PASSES, Parameters
+from ..problem.problem import Problem
+from ..problem.specification import ProblemSpec
+from ..problem.trial import Trial
+from ..result.statistics import check_level, names_of
+from ..result.tables import text_table
+from ._kkt import Kkt
+from ._marginal import Marginal
+from ._phases import TrialPhase, add_squares, checked_inputs, checked_within, guessed
+
+
+@dataclasses.dataclass(frozen=True)
+class Collocation:
+    """Fit by direct collocation instead of simulation: all states at all samples are unknowns.
+
+        jk.fit.fit(bicycle, trials, free, unknown=states, transcription=jk.fit.Collocation(
+            unknown_inputs={"roll_torque": 4.0}, within={"roll": (-0.5, 0.5)}))
+
+    The equations of motion are constraints, so a motion may be unstable and long. An unknown input is a function of
+    time that is estimated too. Its prior is white noise of a given spectral density S, so that the cost contains the
+    integral of w^2 / S. The parameters are those of the largest marginal likelihood, in which the unknown inputs are
+    integrated out. Prefer the default, linked windows, if all inputs are recorded: it is faster.
+
+    **Arguments:**
+
+    - `intervals_per_sample`: the number of intervals of the mesh between two samples.
+    - `unknown_inputs`: by name, the spectral density [unit^2 s] of inputs that were not recorded. An input that is also
+        recorded is the sum of its record and the unknown part.
+    - `within`: by name (lower, upper) of states and unknown inputs, at all nodes. Either bound may be None.
+    - `method`: "trapezoid", "hermite-simpson" or "lobatto".
+    - `solver`: a solver of `jaxkane.collocation`; by default the first one that is installed.
+    - `max_iterations`: the largest number of iterations.
+    """
+
+    intervals_per_sample: int = 1
+    unknown_inputs: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    within: Mapping[str, tuple[float | None, float | None]] = dataclasses.field(default_factory=dict)
+    method: str = "hermite-simpson"
+    solver: Solver | None = None
+    max_iterations: int = 500
+
+    def __post_init__(self) -> None:
+        n = self.intervals_per_sample
+        if isinstance(n, bool) or not isinstance(n, int) or n < 1:
+            raise ValueError(f"Collocation: `intervals_per_sample` must be a positive integer, got {n!r}.")
+        for name in ("unknown_inputs", "within"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise TypeError(f"Collocation: `{name}` must be a dict by name, got {getattr(self, name)!r}.")
+        lobatto(self.method)
+
+    def fit(
+        self,
+        system: System,
+        trials: Sequence[Trial] | Trial,
+        free: Items,
+        *,
+        progress: bool = False,
+        **options: Any,
+    ) -> CollocationFit:
+        """Fit by collocation. The arguments are those of `jaxkane.fit.fit`."""
+        _check_options(options)
+        problem = Problem.with_first_steps(ProblemSpec(system, free, **options), trials)
+        _check_problem(problem)
+        return solved(problem, self, progress)
+
+
+def _check_options(options: Mapping[str, Any]) -> None:
+    reasons = {
+        "window": "Collocation has no windows",
+        "defect_std": "Pass `unknown_inputs` for disturbances",
+        "noise": "Pass `unknown_inputs` for disturbances",
+        "errors": "Collocation supports independent normal errors only",
+        "zero_order_hold": "Collocation needs continuous inputs",
+        "simulation": "Collocation does not simulate",
+    }
+    for name, reason in reasons.items():
+        if options.get(name):
+            raise ValueError(f"`{name}` cannot be used with `transcription=Collocation()`. {reason}. Omit it.")
+
+
+def _check_problem(problem: Problem) -> None:
+    kinds = {
+        role[0] for entry in (*problem.parameters.all_entries, *problem.model.nuisance.trial) for role in entry.roles
+    }
+    wrong = kinds & {"delay of sensor", *(f"{kind} of sensor" for kind in LOW_PASSES)}
+    if wrong:
+        raise ValueError(
+            f"Collocation does not support the {wrong.pop()}: it compares measurements with the states at the same "
+            "time. Use windows instead, or add the sensor's dynamics to the system as a state."
+        )
+    if problem.model.nuisance.window:
+        raise ValueError("Collocation has no windows: each='window' cannot be used. Pass each='trial'.")
+    if problem.parameters.distributions:
+        raise ValueError("Collocation does not support distributions over groups. Pass prior=(mean, deviation).")
+    if jnp.result_type(float) != jnp.float64:
+        raise ValueError("Collocation needs float64. Call jaxkane.configure() first.")
+
+
+def solved(problem: Problem, how: Collocation, progress: bool) -> CollocationFit:
+    densities = checked_inputs(problem, how.unknown_inputs)
+    within = checked_within(problem, how.within, tuple(densities))
+    method = lobatto(how.method)
+    phases = [TrialPhase(problem, k, densities, within) for k in range(len(problem.trials))]
+    meshes = [phase.mesh(how.intervals_per_sample) for phase in phases]
+    motions = [guessed(phase, mesh, method) for phase, mesh in zip(phases, meshes, strict=True)]
+    every = how.intervals_per_sample * (len(method.c) - 1)
+    objectives = functools.partial(add_squares, problem, jnp.asarray([*densities.values()], float), every)
+    theta = np.zeros(problem.parameters.size)
+    transcription = Transcription(phases, (), meshes, method, motions, theta, objectives)
+    program = transcription.program
+    monitor = Monitor(program, _show if progress else None)
+    solver = default_solver() if how.solver is None else how.solver
+    shared, local = places_of(transcription)
+    if densities:  # first the motion for the initial guess of the parameters
+        program = with_fixed(program, shared, transcription.z)
+    solution = solver(program, transcription.z, monitor, max_iterations=how.max_iterations)
+    if densities and solution.ok:
+        found = Marginal(transcription, shared, local).minimum(solution)
+        point, covariance = found.point, found.covariance
+        status = solution.status if found.ok else "the largest number of steps of the parameters was reached"
+        solution = Solution(
+            point.z, point.multipliers, solution.bound_multipliers, found.ok, status, solution.iterations
+        )
+    else:
+        covariance = covariance_of(transcription, solution)
+    return CollocationFit(problem, how, transcription, solution, covariance)
+
+
+def with_fixed(program: NonlinearProgram, variables: np.ndarray, z: np.ndarray) -> NonlinearProgram:
+    """The same program in which some variables have the values z (n,), in scaled numbers."""
+    changed = copy.copy(program)
+    lower, upper = program.x_bounds.lower.copy(), program.x_bounds.upper.copy()
+    lower[variables] = upper[variables] = z[variables] * program.x_scale[variables]
+    changed.x_bounds = Bounds(lower, upper)
+    return changed
+
+
+def places_of(transcription: Transcription) -> tuple[np.ndarray, np.ndarray]:
+    """The indices of the shared parameters, and of the unknowns of all trials."""
+    layouts = transcription.layouts
+    n = len(layouts[0].parameters) - layouts[0].problem.n_local
+    return layouts[0].parameters[:n], np.concatenate([layout.parameters[n:] for layout in layouts])
+
+
+def covariance_of(transcription: Transcription, solution: Solution) -> np.ndarray:
+    """The covariance (p, p) of the scaled shared parameters; NaN if it does not exist."""
+    shared, local = places_of(transcription)
+    try:
+        kkt = Kkt(transcription.program, np.concatenate([shared, local]), solution.z, solution.multipliers)
+    except np.linalg.LinAlgError:
+        return np.full((len(shared),) * 2, np.nan)
+    return kkt.covariance(shared)
+
+
+def _show(iteration: int, cost: float, violation: float) -> None:
+    print(f"\riteration {iteration}: cost {cost:.6g}".ljust(60), end="", file=sys.stderr, flush=True)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class CollocationFit:
+    """The result of a fit by collocation.
+
+    Attributes:
+
+    - `estimates`, `start`: estimates and initial guesses by name, gains and delays included.
+    - `standard_errors`: by name, from the inverse of the matrix of Karush, Kuhn and Tucker. `sigma` and the spectral
+        densities are used as given.
+    - `intervals(level)`: confidence intervals by name.
+    - `covariance`, `correlation` (p, p): of the estimates, in the order of `names`.
+    - `system`: the system with the estimates.
+    - `cost`: the sum of the squares of residuals, priors, and unknown inputs divided by their spectral densities.
+    - `residuals`, `fitted`: by trial and channel, (fitted - measured) / sigma and the fitted measurements (n_t,).
+    - `motions`: by trial and name, the estimated states and inputs at the samples (n_t,).
+    - `status`, `ok`, `message`: why the search ended.
+    """
+
+    problem: Problem
+    transcription_options: Collocation
+    transcription: Transcription
+    solution: Solution
+    scaled_covariance: np.ndarray
+
+    @property
+    def parameters(self) -> Parameters:
+        return self.problem.parameters
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.parameters.names
+
+    @property
+    def status(self) -> str:
+        if self.solution.ok:
+            return "converged" if np.all(np.isfinite(self.covariance)) else "undetermined"
+        return "interrupted" if self.solution.status == INTERRUPTED else "failed"
+
+    @property
+    def ok(self) -> bool:
+        """Whether the search converged and the data determine all parameters."""
+        return self.status == "converged"
+
+    @property
+    def message(self) -> str:
+        """The status as a sentence."""
+        words = {
+            "converged": "The search converged.",
+            "undetermined": "The search converged, but the data do not determine all parameters.",
+            "interrupted": "The search was interrupted.",
+            "failed": f"The search ended early: {self.solution.status}.",
+        }
+        return words[self.status]
+
+    @functools.cached_property
+    def _x(self) -> np.ndarray:
+        return self.solution.z * self.transcription.x_scale
+
+    @property
+    def _theta(self) -> np.ndarray:
+        return self.transcription.theta(self._x)
+
+    @property
+    def cost(self) -> float:
+        return self.transcription.program.objective(self.solution.z) * self.transcription.program.f_scale
+
+    @property
+    def estimates(self) -> dict[str, float]:
+        return self._by_name(self.parameters.values(jnp.asarray(self._theta)))
+
+    @property
+    def start(self) -> dict[str, float]:
+        return self._by_name(self.parameters.values(jnp.zeros(self.parameters.size)))
+
+    def _by_name(self, values: Any) -> dict[str, float]:
+        return dict(zip(self.names, np.asarray(values, float).tolist(), strict=True))
+
+    @functools.cached_property
+    def system(self) -> System:
+        """The system with the estimates. Parameters of groups keep their initial values."""
+        return self.parameters.apply(self.problem.system, jnp.asarray(self._theta))[0]
+
+    @functools.cached_property
+    def covariance(self) -> np.ndarray:
+        """The covariance (p, p) of the estimates; NaN if the data do not determine a parameter."""
+        slopes = np.asarray(self.parameters.slopes(jnp.asarray(self._theta)))
+        return slopes @ self.scaled_covariance @ slopes.T
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        return self._by_name(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def correlation(self) -> np.ndarray:
+        deviation = np.sqrt(np.diag(self.covariance))
+        return self.covariance / np.outer(deviation, deviation)
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Confidence intervals by name, truncated at the bounds of the parameters."""
+        check_level(level)
+        half = scipy.stats.norm.ppf(0.5 * (1 + level)) * np.array([*self.standard_errors.values()])
+        values = np.array([*self.estimates.values()])
+        ends = np.clip([values - half, values + half], *np.expand_dims(self.parameters.bounds.T, 1))
+        return {name: (float(a), float(b)) for name, a, b in zip(self.names, *ends, strict=True)}
+
+    @functools.cached_property
+    def _at_samples(self) -> list[tuple[dict[str, np.ndarray], dict[str, np.ndarray]]]:
+        """For each trial, states and inputs by name, and fitted measurements by channel."""
+        every = self.transcription_options.intervals_per_sample * (len(self.transcription.method.c) - 1)
+        found = []
+        for layout, motion in zip(self.transcription.layouts, self.transcription.motions(self._x), strict=True):
+            places = np.arange(0, layout.K, every)
+            data = layout.node_data(layout.s[places])
+            x = jnp.asarray(self._x[layout.columns[places]])
+            read, inputs = _read(layout.variables, data, x)
+            values = dict(zip(layout.problem.names, motion.Y[places].T, strict=True))
+            values |= {name: np.asarray(value) for name, value in inputs.items()}
+            found.append((values, dict(zip(self.problem.channels, np.asarray(read).T, strict=True))))
+        return found
+
+    @property
+    def motions(self) -> dict[str, dict[str, np.ndarray]]:
+        return dict(zip(names_of(self.problem.trials), (values for values, _ in self._at_samples), strict=True))
+
+    @property
+    def fitted(self) -> dict[str, dict[str, np.ndarray]]:
+        return dict(zip(names_of(self.problem.trials), (read for _, read in self._at_samples), strict=True))
+
+    @property
+    def residuals(self) -> dict[str, dict[str, np.ndarray]]:
+        pairs = zip(self.fitted.items(), self.problem.trials, strict=True)
+        return {
+            name: {c: (read[c] - np.asarray(x)) / np.asarray(trial.sigma[c]) for c, x in trial.measured.items()}
+            for (name, read), trial in pairs
+        }
+
+    def nuisance(self) -> dict[str, dict[str, float]]:
+        """By trial and name, the values of the unknowns of the trial."""
+        model, n = self.problem.model.nuisance, self.parameters.size
+        rows = {}
+        for name, layout in zip(names_of(self.problem.trials), self.transcription.layouts, strict=True):
+            values = np.asarray(model.trial_center) + self._x[layout.parameters[n:]]
+            rows[name] = dict(zip(model.trial_names, values.tolist(), strict=True))
+        return rows
+
+    def __repr__(self) -> str:
+        rows = [("parameter", "unit", "start", "estimate", "standard error", "95 % interval")]
+        for name, unit in zip(self.names, self.parameters.units, strict=True):
+            low, high = self.intervals()[name]
+            numbers = self.start[name], self.estimates[name], self.standard_errors[name]
+            rows.append((name, unit, *(f"{x:.6g}" for x in numbers), f"{low:.6g} to {high:.6g}"))
+        head = f"{self.problem.title}. By collocation: {self.message} Cost {self.cost:.6g}."
+        return f"{head}\n{text_table(rows, left=(0, 1))}"
+
+
+@jit
+def _read(variables: Any, data: Any, x: Any) -> Any:
+    def at(node: Any, x: Any) -> Any:
+        now = variables.now(node, x)
+        _, calibration = variables.parameters.apply(variables.system, x[variables.n_z :])
+        inputs = {name: now[name] for name in variables.system.inputs}
+        return variables.model.as_read([now[c] for c in variables.model.channels], calibration), inputs
+
+    return jax.vmap(at)(data, x)
