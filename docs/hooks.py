@@ -103,6 +103,7 @@ SUBJECTS = {
         "result": ("Results, uncertainty, validation", "uncertainty"),
         "extend": ("Model extensions", "model_extensions"),
         "inverse": ("Inverse dynamics", "inverse_dynamics"),
+        "collocated": ("Fits by collocation", "optimal_control"),
         "_bicycle": ("Bicycles", "bicycles_fit"),
     },
 }

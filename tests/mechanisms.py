@@ -409,3 +409,20 @@ class SliderInGuides(jk.System):
             name: jk.Contact(motion[name], side, gap=0.026 + motion[name].position.dot(side), **law)
             for name, side in sides.items()
         }
+
+
+class Sled(jk.System):
+    """A point that a force moves along N.x, with a spring and drag; without units."""
+
+    mass: Scalar = parameter(1.0, positive=True)
+    drag: Scalar = parameter(0.0)
+    stiffness: Scalar = parameter(0.0)
+    coordinates, speeds, inputs = ("x",), ("v",), ("force",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), N, name="sled")])
+
+    def loads(self, t, q, u, motion, inputs):
+        force = inputs["force"] - self.drag * u["v"] - self.stiffness * q["x"]
+        return jk.Force(force * motion.N.x, motion["sled"])

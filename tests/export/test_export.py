@@ -725,3 +725,9 @@ def test_no_parameters_no_inputs(tmp_path):
         sources = [files.source, files.test]
         subprocess.run([CC, *STRICT, *sources, "-lm", "-o", tmp_path / "test"], check=True)
         subprocess.run([tmp_path / "test"], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_systems_with_multipliers_are_refused():
+    """Their constraint forces are not part of M u_dot = f."""
+    with pytest.raises(ValueError, match="has multipliers"):
+        jk.export.c(jk.with_multipliers(Bob()), "never.c", ("rates",))

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._integrate.trajectory import Trajectory, reached_times
+from .._integrate.trajectory import Trajectory, as_trajectory, reached_times
 from .._scalarjit.cache_key import version_of
 from .._scalarjit.captured_values import CapturedValues
 from .._scalarjit.components import stack
@@ -199,7 +199,10 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
     its times.
     """
     name = type(system).__name__
+    trajectory = as_trajectory(trajectory)
     reached = reached_times("animate", system, trajectory)
+    # A plan with phases has the state before and after a link at the same time, between which no frame can be drawn.
+    reached = reached & np.append(True, np.diff(np.asarray(trajectory.t)) > 0)
     numbers, rest = eqx.partition(system, eqx.is_array)
     drawing = None if figure is None else _Drawing(weakref.ref(figure), CapturedValues(figure).version)
     t, q, u, u_dep = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u, trajectory.u_dep))

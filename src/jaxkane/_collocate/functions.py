@@ -131,7 +131,11 @@ class Variables(eqx.Module):
         t = self.origin + node["s"] * duration
         inputs = {name: w[i] for i, name in enumerate(self.controls)} | node["inputs"]
         if callable(self.signals) or self.signals:
-            inputs = inputs_at(system, self.signals, t, unpacked(system, y)) | inputs
+            others = inputs_at(system, self.signals, t, unpacked(system, y))
+            both = [name for name in others if name in self.controls]
+            if both:  # only a function of all inputs reaches this place
+                raise ValueError(f"Problem: {both[0]!r} is in `controls`, and the function `inputs` returns it.")
+            inputs = others | inputs
         inputs |= {name: jnp.zeros_like(t) for name in system.inputs if name not in inputs}
         return system, duration, t, y, inputs
 
@@ -160,7 +164,7 @@ class Integrand(eqx.Module):
     def __call__(self, node: Any, x: Array) -> Float[Array, " 1"]:
         _, duration = self.variables.shared(x[self.variables.n_z :])
         now = self.variables.now(node, x)
-        return jnp.reshape(duration * called("cost", self.cost, now.t, now), (1,))
+        return jnp.reshape(duration * number("cost", called("cost", self.cost, now.t, now), x.dtype), (1,))
 
 
 class Path(eqx.Module):
@@ -174,7 +178,7 @@ class Path(eqx.Module):
         now = self.variables.now(node, x)
         values = [now[name] for name in self.names]
         if self.path is not None:
-            values += [_value(item) for item in named("path", called("path", self.path, now.t, now)).values()]
+            values += numbers("path", called("path", self.path, now.t, now), x.dtype).values()
         return jnp.stack(values)
 
 
@@ -196,14 +200,16 @@ class Ends(eqx.Module):
         first = self.variables.now(nodes[0], jnp.concatenate([x[:n], shared]))
         last = self.variables.now(nodes[1], jnp.concatenate([x[n : 2 * n], shared]))
         _, duration = self.variables.shared(shared)
-        values = [] if self.final_cost is None else [called("final_cost", self.final_cost, last.t, last)]
+        values = []
+        if self.final_cost is not None:
+            values.append(number("final_cost", called("final_cost", self.final_cost, last.t, last), x.dtype))
         if self.conditions is not None:
             found = called("conditions", self.conditions, first, last, duration)
-            values += [_value(item) for item in named("conditions", found).values()]
+            values += numbers("conditions", found, x.dtype).values()
         values += [first[name] for name in self.start] + [last[name] for name in self.end]
         if self.has_constraints:
             values += [*configuration_residual(first.system, first.t, first.state.q)]
-        return jnp.stack([jnp.reshape(jnp.asarray(value, x.dtype), ()) for value in values])
+        return jnp.stack(values)
 
 
 class Link(eqx.Module):
@@ -231,14 +237,13 @@ class Link(eqx.Module):
         x1 = jnp.concatenate([x[a : a + b], shared[skipped:other], shared[other:]])
         last, first = self.before.now(nodes[0], x0), self.after.now(nodes[1], x1)
         if callable(self.how):
-            found = named("links", called("links", self.how, last, first))
-            values = [_value(item) for item in found.values()]
+            values = [*numbers("links", called("links", self.how, last, first), x.dtype).values()]
         elif self.how is None:
             values = [first[name] - last[name] for name in self.linked]
         else:
             after = last.after(self.how)
             values = [last.event(self.how), *(first[name] - after[name] for name in self.linked)]
-        return jnp.stack([jnp.reshape(jnp.asarray(value, x.dtype), ()) for value in values])
+        return jnp.stack(values)
 
 
 def called(label: str, f: Callable[..., Any], *args: Any) -> Any:
@@ -253,9 +258,32 @@ def named(label: str, values: Any) -> Mapping[str, Any]:
     return values
 
 
-def _value(item: Any) -> Any:
-    """The value of an item of a dict of constraints: a number, or (number, lower bound, upper bound)."""
-    return item[0] if isinstance(item, tuple) else item
+def number(label: str, value: Any, dtype: Any) -> Array:
+    """The number that a function of the user returned.
+
+    **Raises:** `TypeError` for truth values, which have no derivative, and for anything else that is not one number.
+    """
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError):  # text, None, containers
+        array = None
+    if array is not None and array.dtype.kind == "b":
+        raise TypeError(
+            f"The function `{label}` returns a truth value. Return a smooth signed number, such as `x - 1` instead of "
+            "`x > 1`."
+        )
+    if array is None or array.shape != () or array.dtype.kind not in "iuf":
+        got = repr(value) if array is None else f"the shape {array.shape} and the type {array.dtype}"
+        raise TypeError(f"The function `{label}` must return one real number, got {got}.")
+    return array.astype(dtype)
+
+
+def numbers(label: str, values: Any, dtype: Any) -> dict[str, Array]:
+    """The values by name that a function of constraints returned, as numbers or as (number, lower, upper)."""
+    found = {}
+    for name, item in named(label, values).items():
+        found[name] = number(f"{label}` of `{name}", item[0] if isinstance(item, tuple) else item, dtype)
+    return found
 
 
 def bounds_of(label: str, value: Any) -> Bound:
@@ -291,5 +319,5 @@ def constraints_of(label: str, values: Any, is_equality: bool) -> dict[str, Boun
             continue
         if len(item) != 3:
             raise ValueError(f"`{label}`: {name!r} must be a number or (number, lower, upper), got {item!r}.")
-        found[name] = bounds_of(f"`{label}`: the bounds of {name!r}", item[1:])
+        found[name] = bounds_of(f"`{label}` of {name!r}", item[1:])
     return found

@@ -171,6 +171,7 @@ def _ipopt_options(max_iterations: int, is_warm: bool, options: Mapping[str, Any
         "sb": "yes",
         "tol": 1e-9,
         "max_iter": max_iterations,
+        "diverging_iterates_tol": 1e10,  # typical values are 1
         "nlp_scaling_method": "none",  # the program is scaled
         "fixed_variable_treatment": "make_parameter",
     }
@@ -232,7 +233,10 @@ class Ipopt:
             "show_eval_warnings": False,
             "ipopt": _ipopt_options(max_iterations, is_warm, options),
         }
-        solve = ca.nlpsol("solve", "ipopt", {"x": x, "f": cost, "g": constraints}, settings)
+        try:
+            solve = ca.nlpsol("solve", "ipopt", {"x": x, "f": cost, "g": constraints}, settings)
+        except RuntimeError as error:
+            raise ValueError(f"solve: IPOPT refuses the `options` {dict(options or {})}: {error}") from None
         start = {"x0": z, "lbx": program.lower, "ubx": program.upper, "lbg": program.g_lower, "ubg": program.g_upper}
         with monitor.interruptible():
             result = solve(**start)

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.sparse
 
 from .._integrate.inputs import is_samples
-from .._system.system import System, units_of
+from .._system.system import System, names_of, units_of
 from .functions import (
     Bound,
     Condition,
@@ -227,6 +227,7 @@ class Transcription:
     - `motions`: for each phase the guess at the nodes.
     - `theta` (p,): the guess of the free parameters, in their search variables.
     - `objectives`: a function of the builder and the layouts, which adds to the cost.
+    - `sizes`: for each phase the sizes (n_z,) of states and controls on a coarser mesh, or None.
 
     **Raises:** `ValueError` if a function is not finite at the guess, or a constraint has no derivative.
     """
@@ -240,8 +241,10 @@ class Transcription:
         motions: Sequence[Motion],
         theta: np.ndarray,
         objectives: Callable[[Builder, Sequence[Layout]], None] | None = None,
+        sizes: Sequence[np.ndarray | None] | None = None,
     ):
         self.links, self.method, self._objectives = links, method, objectives
+        self._known_sizes = [None] * len(phases) if sizes is None else sizes
         self.layouts = _layouts(phases, meshes, method)
         self.n = 1 + max(int(layout.columns.max()) for layout in self.layouts)
         self.parameters = self.layouts[0].variables.parameters
@@ -277,6 +280,11 @@ class Transcription:
         g_scale = builder.scales(self.x, self.x_scale)
         self.program = NonlinearProgram(*builder.arguments(), self.x_bounds, builder.bounds, self.x_scale, g_scale)
         self.program.f_scale = self._cost_scale()
+
+    @property
+    def sizes(self) -> list[np.ndarray]:
+        """For each phase the sizes (n_z,) of states and controls."""
+        return [self.x_scale[layout.node(0)] for layout in self.layouts]
 
     @property
     def z(self) -> np.ndarray:
@@ -337,8 +345,12 @@ class Transcription:
     def _scales(self, blocks: Sequence[EvaluatedBlock]) -> np.ndarray:
         """Typical sizes (n,) of the variables: one for each name."""
         scale = np.ones(self.n)
-        for layout, block in zip(self.layouts, blocks, strict=True):
+        for layout, block, known in zip(self.layouts, blocks, self._known_sizes, strict=True):
             values = scales_of(layout, block, self.x)
+            if known is not None:
+                # A state that should be zero is as large as its error (2e-5 m beside 200 m in the flight of an
+                # aircraft). Relative to that, no error is small, and the mesh would grow from 40 to 316 intervals.
+                values = np.maximum(values, 1e-2 * known)
             scale[layout.node(np.arange(layout.K))] = values
             if layout.duration is not None:
                 scale[layout.duration] = max(self.x[layout.duration], 1e-3 * layout.problem.durations[1])
@@ -406,8 +418,12 @@ class Transcription:
         found: list[str] = []
 
         def recorded(last: Any, first: Any) -> Any:
-            values = named("links", called("links", link.how, last, first))
-            found.extend(values)
+            values = called("links", link.how, last, first)
+            found.extend(named("links", values))
+            if not found:
+                raise ValueError(
+                    "The function `links` returns no residuals. Return a dict by name of what must be zero."
+                )
             return values
 
         node = jax.tree.map(lambda a: jnp.asarray(a)[0], data)
@@ -432,12 +448,8 @@ class Transcription:
                 duration = layout.variables.shared(x[0][layout.variables.n_z :])[1]
                 values = called(label, f, first, layout.variables.now(end, x[1]), duration)
             found.update(constraints_of(label, values, is_equality=label != "path"))
-            return [item[0] if isinstance(item, tuple) else item for item in named(label, values).values()]
 
-        shapes = jax.eval_shape(record, self.x[layout.columns[[0, last]]])
-        for name, shape in zip(found, shapes, strict=True):
-            if getattr(shape, "shape", ()) != ():
-                raise ValueError(f"`{label}`: {name!r} must be one number, got the shape {shape.shape}.")
+        jax.eval_shape(record, self.x[layout.columns[[0, last]]])
         return found
 
     def _check_functions(self, builder: Builder) -> None:
@@ -616,8 +628,11 @@ def scales_of(layout: Layout, block: EvaluatedBlock, x: np.ndarray) -> np.ndarra
         given = [limits.get(name), *(problem.ends[label].get(name) for label in ("start", "end"))]
         numbers = [abs(b) for v in given if v is not None for b in bounds_of(name, v) if math.isfinite(b)]
         sizes[i] = max([sizes[i], *numbers])
-    for unit in {units.get(name, "") for name in names}:
-        same = np.array([units.get(name, "") == unit for name in names])
+    # Without units, a place of 1 and a force of 1e18 are not comparable, but the forces are.
+    groups = (*names_of(problem.system), variables.controls)
+    kinds = [(next(i for i, group in enumerate(groups) if name in group), units.get(name, "")) for name in names]
+    for kind in {*kinds}:
+        same = np.array([each == kind for each in kinds])
         sizes[same & (sizes < 1e-8 * np.max(sizes[same]))] = 0.0  # rounding errors
     angles = np.array([units.get(name, "") == "rad" for name in names])
     sizes[angles & (sizes == 0)] = 0.3
@@ -636,6 +651,9 @@ def scales_of(layout: Layout, block: EvaluatedBlock, x: np.ndarray) -> np.ndarra
             usable = known & (slopes[:, i] > 0)
             if usable.any():
                 new[i] = np.exp(np.mean(np.log(typical[usable] / slopes[usable, i])))
+        if np.array_equal(new, sizes):  # no rate depends on the others: their sizes are those of their own rates
+            for i in np.nonzero(sizes[: variables.n_y] == 0)[0]:
+                new[i] = np.max(slopes[i] * sizes)
         if np.array_equal(new, sizes):
             break
         sizes = new

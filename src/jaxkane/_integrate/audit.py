@@ -23,7 +23,7 @@ from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Point, Vector
 from .._system.motion import Force, Motion, ReflectedInertia, kinetic_energy_of
 from .._system.system import State, System, packed, unpacked
-from .trajectory import Trajectory, reached_times
+from .trajectory import Trajectory, as_trajectory, reached_times
 
 
 @jit
@@ -459,7 +459,10 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
     **Raises:** `ValueError` for a batch, for a trajectory of another system, and for one that reached fewer than two of
     its times.
     """
+    trajectory = as_trajectory(trajectory)
     reached = reached_times("audit", system, trajectory)
+    if not np.all(np.diff(np.asarray(trajectory.t)) > 0):
+        raise ValueError("audit: the times must increase. Of a plan with phases, pass one phase: plan.phases[0].")
     t, q, u, inputs = jax.tree.map(
         lambda x: np.asarray(x)[reached], (trajectory.t, trajectory.q, trajectory.u, trajectory.values)
     )

@@ -90,14 +90,14 @@ def state_after(system: System, t: Component, y: Array, event: Array, which: Any
     after = y
     for i in range(len(which.names)):
         if which.stages[i]:
-            after = jnp.where(event == i, _after_stages(system, t, y, i, which)[0], after)
+            after = jnp.where(event == i, after_stages(system, t, y, i, which)[0], after)
     return after
 
 
 @ScalarFunction
 def impulses_at(system: System, t: Component, y: Array, event: Array, which: Any) -> Array:
     """The impulses (r,) of the first impact among the stages of an event. Arguments as `state_after`."""
-    rows = {i: _after_stages(system, t, y, i, which)[1] for i in range(len(which.names)) if which.stages[i]}
+    rows = {i: after_stages(system, t, y, i, which)[1] for i in range(len(which.names)) if which.stages[i]}
     width = max(len(row) for row in rows.values())
     impulses = jnp.full((width,), jnp.nan, y.dtype)
     for i, row in rows.items():
@@ -106,7 +106,7 @@ def impulses_at(system: System, t: Component, y: Array, event: Array, which: Any
     return impulses
 
 
-def _after_stages(system: System, t: Component, y: Array, event: int, which: Any) -> tuple[Array, Sequence[Array]]:
+def after_stages(system: System, t: Component, y: Array, event: int, which: Any) -> tuple[Array, Sequence[Array]]:
     """The packed state after all stages of an event, and the impulses of its first impact."""
     impulses: Sequence[Array] = ()
     for stage in range(which.stages[event]):

@@ -20,11 +20,11 @@ from .._scalarjit.nan import nan_where
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Point
 from .._system.system import System
-from .trajectory import Trajectory, refuse_other_system
+from .trajectory import Trajectory, as_trajectory, refuse_other_system
 
 
 def along(f: Callable[..., Any], system: System, t: Any, q: Any, u: Any, inputs: InputValues) -> Any:
-    """`f(system, t, q, u, inputs)` at one time, or at all times of a `Trajectory` that is passed as `t`.
+    """`f(system, t, q, u, inputs)` at one time, or at all times of a `Trajectory` or plan that is passed as `t`.
 
     After the end of a trajectory the result and its derivatives are NaN. `f` is evaluated at the first time instead: a
     NaN in its arguments would reach the derivatives at all other times.
@@ -34,6 +34,7 @@ def along(f: Callable[..., Any], system: System, t: Any, q: Any, u: Any, inputs:
     """
     if f not in (_positions, _velocities, _orientations):
         refuse_multipliers(system)
+    t = as_trajectory(t)
     if not isinstance(t, Trajectory):
         arrays = checked_arrays(system, t, q, u, inputs)
         return finite_or_explained(f(*arrays), arrays)

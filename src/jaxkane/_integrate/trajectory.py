@@ -125,6 +125,12 @@ class Trajectory(eqx.Module):
         return f"{text}\n{wrapped(f'At {float(self.t_end):.6g} s: {named_numbers(names, rows, {}, self.units)}')}"
 
 
+def as_trajectory(value: Any) -> Any:
+    """The `Trajectory` that a plan of `jaxkane.collocation` contains. Any other value is returned unchanged."""
+    contained = getattr(value, "trajectory", None)
+    return contained if isinstance(contained, Trajectory) else value
+
+
 def refuse_other_system(label: str, system: System, trajectory: Any) -> None:
     """Check that a trajectory or a steady motion belongs to a system. `label` is the calling function, for the message.
 

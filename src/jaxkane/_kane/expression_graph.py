@@ -17,7 +17,7 @@ import numpy as np
 from .._scalarjit.compat import MISSING, ClosedJaxpr, jaxpr_as_fun
 from .._scalarjit.components import ELIMINATE_UP_TO, as_vector, is_written_out
 from .._scalarjit.graph import Graph, NotScalarError, unrolled
-from .._scalarjit.jaxpr import Direction, cse, jacobian
+from .._scalarjit.jaxpr import Direction, cse, jacobian, tangent_program
 from .._system.parameters import ANY, ParameterInfo, declared, in_batches, leaf_name
 from .._system.system import System
 from .api import (
@@ -29,7 +29,7 @@ from .api import (
     kinetic_energy,
     partial_velocities,
 )
-from .arguments import as_row, check_is_system, is_concrete
+from .arguments import as_row, check_is_system, is_concrete, refuse_multipliers
 from .checks import check_system
 from .description import DescriptionEvaluator
 from .kanes_method import motion_rates_by_matrix
@@ -115,6 +115,7 @@ class Formulas:
 
     def __init__(self, system: System, dtype: str = "float64", more: Mapping[str, Function] | None = None):
         check_is_system(system)
+        refuse_multipliers(system)
         self.system, self.name, self.dtype = system, type(system).__name__, str(jnp.dtype(dtype))
         self.functions = {**FUNCTIONS, **(more or {})}
         if self.dtype not in ("float64", "float32"):
@@ -214,6 +215,23 @@ class Formulas:
         except NotScalarError as error:
             raise ValueError(self._refusal(function, error)) from None
         return dict(zip(self.functions[function].outputs, outputs, strict=True))
+
+    def directional_derivative(self, function: str, direction: Mapping[int, np.ndarray]) -> list[np.ndarray]:
+        """The derivatives of a function's outputs along one direction, as nodes. They are shorter than a Jacobian.
+
+        `direction`: the direction as nodes, by the index of the argument, with the shape of the argument.
+        """
+        places = [i for i, nodes in direction.items() if nodes.size]
+        outputs = self.nodes(function).values()
+        try:
+            with jax.enable_x64(self.dtype == "float64"):
+                program, has_tangent = tangent_program(self.program(function, keeps_solutions=True), places)
+                tangents = iter(unrolled(program, [*self.inputs, *(direction[i] for i in places)], self.graph))
+        except NotScalarError as error:
+            raise ValueError(self._refusal(function, error)) from None
+        zero = self.graph.constant(0.0, self.dtype)
+        pairs = zip(has_tangent, outputs, strict=True)
+        return [next(tangents) if has else np.full(nodes.shape, zero) for has, nodes in pairs]
 
     def by_jax(self, function: str, *args: Any) -> tuple[Any, ...]:
         """The values of a function or of a Jacobian by JAX. `args` are arrays in the order of `arguments`."""

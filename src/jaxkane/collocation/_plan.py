@@ -51,7 +51,8 @@ class Plan:
     - `unmet`: the constraints that are violated by more than the tolerance, by name, with the scaled violation.
     - `active`: the names of bounds and inequality constraints that are active somewhere.
     - `starts`: for several guesses, the cost and the result of each.
-    - `phases`: the plans of all phases; empty for a single problem.
+    - `phases`: the plans of all phases; empty for a single problem. Names of `multipliers`, `unmet` and `active` then
+        start with the phase, as in "phase 0: roll".
     """
 
     problem: Problem
@@ -170,7 +171,10 @@ class Plan:
 
         They are compared at the ends of intervals. Inside an interval the polynomials are less accurate.
         """
+        self._refuse_phases("deviation")
         Y = np.asarray(jnp.concatenate([ride.q, ride.u, ride.x], axis=1))
+        if Y.shape != self.motion.Y.shape:
+            raise ValueError(f"Plan.deviation: the simulation must have the {len(self.motion.Y)} times of plan.t.")
         every = len(self.method.c) - 1
         return float(np.max(np.abs(Y - self.motion.Y)[::every] / self.scales[: Y.shape[1]]))
 
@@ -229,7 +233,8 @@ class Multipliers(Mapping[str, Any]):
 
     - `multipliers["roll"]` (K,): by a shift of the bound of a state or control that is active at a node; 0 elsewhere.
         At a fixed start, this is the derivative by the initial value.
-    - `multipliers["condition"]`: by a shift of the value of a condition, (K,) for a path constraint.
+    - `multipliers["condition"]`: by a shift of the value of a condition, (K,) for a path constraint. If its name is
+        also that of a variable, "conditions: roll" or "path: roll".
     - `costate["roll"]` (N,): by a sudden change of a state within an interval.
     """
 
@@ -263,7 +268,7 @@ class Regulator(eqx.Module):
         at = jax.lax.stop_gradient(t)
         i = jnp.clip(jnp.sum(self.mesh <= at, dtype=jnp.int32) - 1, 0, self.mesh.shape[0] - 2)
         u = (t - self.mesh[i]) / (self.mesh[i + 1] - self.mesh[i])
-        powers = u ** jnp.arange(self.Y.shape[1])
+        powers = jnp.stack([u**k for k in range(self.Y.shape[1])])  # an array of integers would be promoted
         x = () if state.x is None else (jnp.asarray(state.x),)
         y = jnp.concatenate([jnp.asarray(state.q), jnp.asarray(state.u), *x])
         w = powers @ self.W[i] - self.gains[i] @ (y - powers @ self.Y[i])

@@ -139,7 +139,7 @@ class Problem:
                 raise TypeError(f"Problem: `{label}` must be a dict by name, got {given!r}.")
             refuse_unknown(given, known, f"Problem: `{label}`: {self.title} has no", "it has")
             for name, value in given.items():
-                low, high = bounds_of(f"`{label}` of {name!r}", value)
+                low, high = (_pair if label == "within" else bounds_of)(f"`{label}` of {name!r}", value)
                 outer = self.limits.get(name, (-math.inf, math.inf))
                 if low > outer[1] or high < outer[0]:
                     raise ValueError(
@@ -152,20 +152,38 @@ class Problem:
         n_q, n_h = len(self.system.coordinates), self.n_constraints
         if isinstance(self.start, State):
             check_state(self.system, 0.0, jnp.asarray(self.start.q))
+        speeds, dependent_speeds = self.system.speeds, self.system.dependent_speeds
         for label in ("start", "end"):
             values = self.ends[label]
+            given = [name for name in (*speeds, *dependent_speeds) if name in values and _is_number(values[name])]
+            if len(given) > len(speeds):
+                raise ValueError(
+                    f"Problem: `{label}` sets {', '.join(given)}, but only {len(speeds)} speeds are independent. Leave "
+                    f"out {', '.join(name for name in given if name in dependent_speeds)}."
+                )
             fixed = [name for name in self.system.coordinates if name in values and _is_number(values[name])]
             if label == "start" and len(fixed) == n_q and n_h:
                 if not isinstance(self.start, State):
                     check_state(
                         self.system, 0.0, jnp.array([bounds_of(c, values[c])[0] for c in self.system.coordinates])
                     )
-            elif n_h and len(fixed) > n_q - n_h:
+            elif n_h and self._is_overdetermined(fixed):
                 raise ValueError(
-                    f"Problem: `{label}` sets {', '.join(fixed)}, but only {n_q - n_h} coordinates are independent. "
-                    f"Leave out {', '.join(self.system.dependent_coordinates) or 'a dependent one'}: the configuration "
-                    "constraints determine the rest."
+                    f"Problem: `{label}` sets {', '.join(fixed)}, but {n_h} of these follow from the others by the "
+                    f"configuration constraints. Leave out "
+                    f"{', '.join(c for c in self.system.dependent_coordinates if c in fixed) or 'a dependent one'}."
                 )
+
+    def _is_overdetermined(self, fixed: Sequence[str]) -> bool:
+        """Whether the configuration constraints relate coordinates that are fixed, at a random configuration."""
+        coordinates = self.system.coordinates
+        q = jnp.asarray(np.random.default_rng(0).uniform(0.1, 1.0, len(coordinates)))
+        J = np.asarray(jax.jacfwd(lambda q: configuration_residual(self.system, jnp.zeros(()), q))(q))  # (n_h, n_q)
+        if not np.all(np.isfinite(J)):
+            return len(fixed) > len(coordinates) - len(J)
+        free = [i for i, name in enumerate(coordinates) if name not in fixed]
+        J = J / np.linalg.norm(J, axis=1, keepdims=True)
+        return not free or int(np.linalg.matrix_rank(J[:, free], tol=1e-9)) < len(J)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -194,15 +212,20 @@ class Problem:
         """Lower and upper bound of each control by name."""
         given = self.controls
         if isinstance(given, Mapping):
-            return {name: bounds_of(f"`controls` of {name!r}", b or (None, None)) for name, b in given.items()}
-        return {name: (-math.inf, math.inf) for name in as_names(given)}
+            return {name: _pair(f"`controls` of {name!r}", b or (None, None)) for name, b in given.items()}
+        if not isinstance(given, (str, Sequence)):
+            raise TypeError(f"Problem: `controls` must be names, or a dict from names to bounds; got {given!r}.")
+        names = as_names(given)
+        if len(set(names)) < len(names):
+            raise ValueError(f"Problem: `controls` contains a name twice: {', '.join(names)}.")
+        return dict.fromkeys(names, (-math.inf, math.inf))
 
     @property
     def limits(self) -> dict[str, Bound]:
         """Bounds along the motion by name, of controls and of `within`."""
         limits = self.bounds_of_controls
         for name, value in (self.within or {}).items():
-            low, high = bounds_of(f"`within` of {name!r}", value)
+            low, high = _pair(f"`within` of {name!r}", value)
             first = limits.get(name, (-math.inf, math.inf))
             limits[name] = max(low, first[0]), min(high, first[1])
             if limits[name][0] > limits[name][1]:
@@ -229,6 +252,8 @@ class Problem:
                 raise ValueError(
                     f"Problem: `{label}` is a State with {numbers.shape} numbers for {', '.join(names) or 'no states'}."
                 )
+            if not np.all(np.isfinite(numbers)):
+                raise ValueError(f"Problem: `{label}` is a State with values that are not finite: {state}.")
             values |= dict(zip(names, numbers.tolist(), strict=True))
         if label == "end" and self.n_constraints:
             values = {k: v for k, v in values.items() if k not in self.system.dependent_coordinates}
@@ -257,6 +282,9 @@ class Problem:
     @property
     def signals(self) -> Any:
         """The inputs that are not controls, as `inputs_at` reads them."""
+        for name, value in self.inputs.items() if isinstance(self.inputs, Mapping) else ():
+            if not callable(value) and np.ndim(value) > 0:
+                raise ValueError(f"Problem: the input {name!r} is an array. Pass jaxkane.Samples(times, values).")
         signals = as_signals(self.inputs, self.system.inputs, jnp.zeros(2), self.title)
         for name, signal in {} if callable(signals) else signals.items():
             if is_samples(signal) and signal.zero_order_hold:
@@ -285,6 +313,9 @@ class Phases:
     With one link fewer than phases, the last phase ends freely. With as many links as phases, the last link leads from
     the end of the last phase to the start of the first one, so the motion is periodic.
 
+    In the functions of each phase, and in systems and inputs that depend on time, the time starts at 0 in each phase.
+    The times of `Plan.t` continue.
+
     **Arguments:**
 
     - `phases`: the problems. Their systems need the same coordinates, speeds and states, unless the links are
@@ -300,6 +331,8 @@ class Phases:
     links: Sequence[Any] = ()
 
     def __post_init__(self) -> None:
+        if isinstance(self.phases, Problem) or isinstance(self.links, str):
+            raise TypeError("Phases: pass sequences, such as Phases([problem], links=[None]).")
         phases, links = tuple(self.phases), tuple(self.links)
         object.__setattr__(self, "phases", phases)
         object.__setattr__(self, "links", links)
@@ -312,6 +345,8 @@ class Phases:
             )
         for i, link in enumerate(links):
             one, other = phases[i], phases[(i + 1) % len(phases)]
+            if not (link is None or isinstance(link, str) or callable(link)):
+                raise TypeError(f"Phases: link {i} must be None, the name of an event, or a function; got {link!r}.")
             if not callable(link) and one.names != other.names:
                 raise ValueError(f"Phases: link {i}: the states have other names. Pass a function (last, first).")
             if isinstance(link, str):
@@ -325,6 +360,13 @@ def events_with_jumps(system: System) -> tuple[str, ...]:
     from .._integrate.jumps import names_of_jumps
 
     return names_of_jumps(system)
+
+
+def _pair(label: str, value: Any) -> Bound:
+    """Lower and upper bound of what must not be a number, because a bound of one side could be meant."""
+    if not isinstance(value, (tuple, list)):
+        raise ValueError(f"Problem: {label} must be (lower, upper), where None is no bound; got {value!r}.")
+    return bounds_of(label, value)
 
 
 def _is_number(value: Any) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import numbers
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -72,12 +73,18 @@ def solve(
     phases = problem if isinstance(problem, Phases) else Phases([problem]) if isinstance(problem, Problem) else None
     if phases is None:
         raise TypeError(f"solve: the first argument must be a Problem or Phases, got {problem!r}.")
-    if isinstance(intervals, bool) or not isinstance(intervals, int) or not 1 <= intervals <= max_intervals:
-        raise ValueError(f"solve: `intervals` must be an integer from 1 to {max_intervals}, got {intervals!r}.")
+    max_intervals = _integer("max_intervals", max_intervals, 1)
+    intervals = _integer("intervals", intervals, 1, max_intervals)
+    max_iterations, starts, seed = (
+        _integer(name, x, least)
+        for name, x, least in (("max_iterations", max_iterations, 0), ("starts", starts, 1), ("seed", seed, 0))
+    )
     if tolerance is not None:
         tolerance = positive_number(tolerance, "solve: `tolerance`")
-    if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
-        raise ValueError(f"solve: `starts` must be a positive integer, got {starts!r}.")
+    if isinstance(solver, type) or not (solver is None or callable(solver)):
+        raise TypeError(f"solve: `solver` must be a solver, such as jaxkane.collocation.Ipopt(); got {solver!r}.")
+    if not isinstance(options, Mapping | None):
+        raise TypeError(f"solve: `options` must be a dict by the names of the solver, got {options!r}.")
     search = _Search(
         phases, lobatto(method), tolerance, default_solver() if solver is None else solver, options, max_iterations,
         max_intervals, progress,
@@ -161,6 +168,15 @@ def check_derivatives(
     }
 
 
+def _integer(name: str, value: Any, least: int, most: int | None = None) -> int:
+    """**Raises:** `ValueError` unless the value is an integer within the bounds."""
+    is_integer = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if not is_integer or int(value) < least or (most is not None and int(value) > most):
+        bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
+        raise ValueError(f"solve: `{name}` must be an integer {bounds}, got {value!r}.")
+    return int(value)
+
+
 def _guesses(problem: Problem | Phases, guess: Any, starts: int, seed: int) -> list[list[tuple[Any, Any]]]:
     """For each start, for each phase: the guess, and the detour that is added."""
     problems = problem.phases if isinstance(problem, Phases) else (problem,)
@@ -203,8 +219,10 @@ class _Search:
         theta = _theta(problems[0], guesses[0][0])
         costs: list[float] = []
         iterations, is_warm = 0, isinstance(guesses[0][0], Plan)
+        sizes = [_sizes(p, guess) for p, (guess, _) in zip(problems, guesses, strict=True)]
+        transcription = self._transcribed(meshes, motions, theta, sizes)
+        sizes = transcription.sizes
         while True:
-            transcription = Transcription(self.phases.phases, self.phases.links, meshes, self.method, motions, theta)
             solution = self._solved(transcription, is_warm)
             program, x = transcription.program, solution.z * transcription.x_scale
             costs.append(program.objective(solution.z) * program.f_scale)
@@ -212,7 +230,10 @@ class _Search:
             motions, theta = transcription.motions(x), transcription.theta(x)
             errors = None
             if self.tolerance is not None and solution.ok:
-                errors = self._errors(transcription, x)
+                try:
+                    errors = self._errors(transcription, x)
+                except KeyboardInterrupt:  # the solution must not be lost
+                    solution = dataclasses.replace(solution, ok=False, status=INTERRUPTED)
             new = self._refined(meshes, errors)
             if new is None or len(costs) == MAX_MESHES or max(len(m) for m in new) > self.max_intervals + 1:
                 return self._plan(transcription, solution, errors, costs, iterations, new is not None)
@@ -220,7 +241,18 @@ class _Search:
                 interpolated(motion, mesh, self.method, nodes_of(finer, self.method))
                 for motion, mesh, finer in zip(motions, meshes, new, strict=True)
             ]
+            try:
+                transcription = self._transcribed(new, motions, theta, sizes)
+            except (KeyboardInterrupt, ValueError) as error:  # a function may not be finite at a new node
+                stopped = isinstance(error, KeyboardInterrupt)
+                reason = INTERRUPTED if stopped else f"solved, but not on a finer mesh: {error}"
+                solution = dataclasses.replace(solution, ok=False, status=reason)
+                return self._plan(transcription, solution, errors, costs, iterations, False)
             meshes, is_warm = new, True
+
+    def _transcribed(self, meshes: Any, motions: Any, theta: np.ndarray, sizes: Any) -> Transcription:
+        phases, links = self.phases.phases, self.phases.links
+        return Transcription(phases, links, meshes, self.method, motions, theta, sizes=sizes)
 
     def _solved(self, transcription: Transcription, is_warm: bool) -> Solution:
         program = transcription.program
@@ -313,11 +345,21 @@ def _first_mesh(guess: Any, intervals: int) -> np.ndarray:
     return np.linspace(0.0, 1.0, intervals + 1)
 
 
-def _guessed(problem: Problem, guess: Any, s: np.ndarray, detour: Any) -> Motion:
+def _is_similar(problem: Problem, guess: Any) -> bool:
+    """Whether a guess is a plan with the same states and controls."""
+
     def names(p: Problem) -> tuple[str, ...]:
         return (*p.names, *p.bounds_of_controls)
 
-    if isinstance(guess, Plan) and names(guess.problem) == names(problem):
+    return isinstance(guess, Plan) and not guess.phases and names(guess.problem) == names(problem)
+
+
+def _sizes(problem: Problem, guess: Any) -> np.ndarray | None:
+    return guess.scales if _is_similar(problem, guess) else None
+
+
+def _guessed(problem: Problem, guess: Any, s: np.ndarray, detour: Any) -> Motion:
+    if _is_similar(problem, guess):
         found = interpolated(guess.motion, guess.mesh / guess.duration, guess.method, s)
         low, high = problem.durations
         return found._replace(duration=min(max(guess.duration, low), high))
@@ -374,7 +416,8 @@ def multipliers_of(transcription: Transcription, solution: Solution, p: int) -> 
         if row.phase == p and row.kind == "dynamics":
             costate[row.name] = by_constraint[row.rows].sum(axis=1)
         elif row.phase == p:
-            values[row.name] = by_constraint[row.rows] if row.rows.size > 1 else float(by_constraint[row.rows[0]])
+            name = f"{row.kind}: {row.name}" if row.name in values else row.name
+            values[name] = by_constraint[row.rows] if row.rows.size > 1 else float(by_constraint[row.rows[0]])
     return Multipliers(values, costate)
 
 
@@ -429,13 +472,20 @@ def _joined(plans: Sequence[Plan]) -> Plan:
     if all(plan.trajectory.names == trajectory.names for plan in plans):
         trajectory = _concatenated([plan.trajectory for plan in plans])
     offsets = np.cumsum([0.0, *(plan.duration for plan in plans)])
-    mesh = np.concatenate([plan.mesh + offset for plan, offset in zip(plans, offsets)])
+    meshes = [plan.mesh + offset for plan, offset in zip(plans, offsets)]
+    mesh = np.concatenate([meshes[0], *(mesh[1:] for mesh in meshes[1:])])
     errors = None if first.errors is None else np.concatenate([plan.errors for plan in plans])  # type: ignore[misc]
     unmet = {f"phase {i}: {k}": x for i, plan in enumerate(plans) for k, x in plan.unmet.items()}
     active = tuple(f"phase {i}: {name}" for i, plan in enumerate(plans) for name in plan.active)
+    multipliers = Multipliers(
+        *(
+            {f"phase {i}: {k}": x for i, plan in enumerate(plans) for k, x in each(plan).items()}
+            for each in (lambda plan: plan.multipliers, lambda plan: plan.multipliers.costate)
+        )
+    )
     return dataclasses.replace(
         first, duration=float(offsets[-1]), trajectory=trajectory, mesh=mesh, errors=errors, unmet=unmet, active=active,
-        phases=tuple(plans),
+        multipliers=multipliers, phases=tuple(plans),
     )  # fmt: skip
 
 

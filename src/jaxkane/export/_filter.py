@@ -106,7 +106,7 @@ class _FilterText(CText):
 
     def __init__(self, filter: Filter, belief: Belief, name: str, dtype: str):
         self.filter, self.belief, system = filter, belief, filter.system
-        more = {"all_rates": Function(("rate",), _all_rates), "sensed": Function(("z",), self._sensed)}
+        more = {"all_rates": Function(("rate",), all_rates), "sensed": Function(("z",), self._sensed)}
         more["weights"] = Function(("weight",), lambda system, t, q, *_: (coordinate_weights(system, t, q),))
         formulas = Formulas(system, dtype, more)
         super().__init__(formulas, name)
@@ -284,7 +284,8 @@ def _template(*sections: str) -> Template:
     return Template("".join(by_name[name] for name in sections))
 
 
-def _all_rates(system, t, q, u, w, _):
+def all_rates(system, t, q, u, w, _):
+    """Rates of coordinates, independent speeds and first-order states, as one vector."""
     rows = [*motion_rates_by_matrix(system, t, q, u, w)]
     if system.states:
         rows.append(jnp.asarray(rates(system, t, q, u, w).x))

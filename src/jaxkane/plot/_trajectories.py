@@ -10,7 +10,7 @@ import numpy as np
 from .._common.lookup import as_names, label_of
 from .._integrate.audit import Audit
 from .._integrate.status import Status
-from .._integrate.trajectory import Trajectory
+from .._integrate.trajectory import Trajectory, as_trajectory
 from .._system.system import in_degrees, refuse_no_angle, unit_of
 
 Axes: TypeAlias = Any
@@ -73,6 +73,7 @@ def trajectories(
     **Raises:** `KeyError` for a name that the trajectory does not have; `ValueError` for `degrees` if no quantity is an
     angle.
     """
+    trajectory = as_trajectory(trajectory)
     groups = [as_names(group) for group in ([names] if isinstance(names, str) else names or trajectory.names[0])]
     drawn = [name for group in groups for name in group]
     units_by_name = {name: unit_of(name, dict(trajectory.units) | dict(units or {})) for name in drawn}

@@ -18,7 +18,7 @@ from .._integrate.events import event_values, own_events_of
 from .._integrate.inputs import as_signals, inputs_at
 from .._integrate.jumps import stages_of, state_after
 from .._integrate.simulate import checked_state, refuse_not_finite
-from .._integrate.trajectory import Trajectory, reached_times
+from .._integrate.trajectory import Trajectory, as_trajectory, reached_times
 from .._kane.arguments import check_time, is_concrete, is_one_number
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import check_state, has_configuration_constraints
@@ -261,6 +261,7 @@ def _checked_guess(name: str, system: System, guess: Any, segments: int, t: Any)
     unknown."""
     check_time(name, t)
     T = states = None
+    guess = as_trajectory(guess)
     if isinstance(guess, Trajectory):
         reached_times("periodic", system, guess)
         ys = packed(State(guess.q, guess.u, guess.x if system.states else None))

@@ -325,7 +325,7 @@ class CollocationFit:
         return rows
 
     def __repr__(self) -> str:
-        rows = [("parameter", "unit", "start", "estimate", "standard error", "95 % interval")]
+        rows: list[tuple[str, ...]] = [("parameter", "unit", "start", "estimate", "standard error", "95 % interval")]
         for name, unit in zip(self.names, self.parameters.units, strict=True):
             low, high = self.intervals()[name]
             numbers = self.start[name], self.estimates[name], self.standard_errors[name]

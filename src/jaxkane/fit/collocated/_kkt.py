@@ -16,7 +16,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.linalg.lapack
+import scipy.linalg
 import scipy.sparse
 import scipy.sparse.csgraph
 
@@ -41,7 +41,8 @@ class BandedFactors:
         self.below, self.above = int(np.max(i - j, initial=0)), int(np.max(j - i, initial=0))
         band = np.zeros((2 * self.below + self.above + 1, n))
         band[self.below + self.above + i - j, j] = ordered.data
-        self.lu, self.pivots, info = scipy.linalg.lapack.dgbtrf(band, self.below, self.above, overwrite_ab=True)
+        factorize, self._solve = scipy.linalg.get_lapack_funcs(("gbtrf", "gbtrs"), (band,))
+        self.lu, self.pivots, info = factorize(band, self.below, self.above, overwrite_ab=True)
         if info != 0:
             raise np.linalg.LinAlgError("The matrix is singular.")
 
@@ -52,7 +53,7 @@ class BandedFactors:
 
     def solve(self, b: np.ndarray) -> np.ndarray:
         """The solution (n, k) for right-hand sides (n, k)."""
-        x, info = scipy.linalg.lapack.dgbtrs(self.lu, self.below, self.above, b[self.rows], self.pivots)
+        x, info = self._solve(self.lu, self.below, self.above, b[self.rows], self.pivots)
         if info != 0:
             raise np.linalg.LinAlgError("The matrix is singular.")
         solved = np.empty_like(x)

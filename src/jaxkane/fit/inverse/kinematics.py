@@ -17,7 +17,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline, make_lsq_spline
 
 from ..._common.lookup import refuse_unknown
-from ..._integrate.trajectory import Trajectory, refuse_other_system
+from ..._integrate.trajectory import Trajectory, as_trajectory, refuse_other_system
 from ..._kane.api import coordinate_rates
 from ..._scalarjit.cache_key import jit
 from ..._system.system import System
@@ -201,6 +201,7 @@ def kinematic_samples(system: System, motions: Motions, *, spacing: float | None
     **Raises:** `ValueError` for a coordinate or a first-order state that a trial does not measure, and for a trial or a
     trajectory that is too short.
     """
+    motions = as_trajectory(motions)
     if isinstance(motions, (KinematicSamples, Trial, Trajectory)):
         motions = [motions]
     parts = [_of_one(system, motion, spacing) for motion in motions]
@@ -229,6 +230,7 @@ def kinematic_samples(system: System, motions: Motions, *, spacing: float | None
 
 
 def _of_one(system: System, motion: Any, spacing: float | None) -> KinematicSamples:
+    motion = as_trajectory(motion)
     if isinstance(motion, KinematicSamples):
         return motion
     if isinstance(motion, Trajectory):

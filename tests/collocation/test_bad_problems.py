@@ -1,0 +1,227 @@
+"""Wrong arguments and problems without solutions: one clear error each, or a status and the last iterate."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mechanisms import BouncingBall, RodOnPin, Sled, SliderCrank
+
+import jaxkane as jk
+from jaxkane.collocation import Ipopt, Phases, Problem, solve
+
+GIVEN = {
+    "controls": ["force"], "cost": lambda t, now: now["force"] ** 2, "start": {"x": 0.0, "v": 0.0},
+    "end": {"x": 1.0, "v": 0.0},
+}  # fmt: skip
+
+
+def problem(duration=1.0, system=None, **changes):
+    return Problem(Sled() if system is None else system, duration, **(GIVEN | changes))
+
+
+def solved(guess=None, duration=1.0, system=None, options=None, **changes):
+    return solve(problem(duration, system, **changes), guess, intervals=4, options=options)
+
+
+NAN = float("nan")
+WRONG = {
+    "unknown control": ({"controls": ["forc"]}, "no input forc; did you mean 'force'"),
+    "control twice": ({"controls": ["force", "force"]}, "a name twice"),
+    "a number as controls": ({"controls": 3}, "must be names"),
+    "no controls": ({"controls": None}, "must be names"),
+    "one bound of a control": ({"controls": {"force": 5.0}}, "must be (lower, upper)"),
+    "exchanged bounds": ({"controls": {"force": (1, -1)}}, "lower bound is greater"),
+    "bound as text": ({"controls": {"force": ("1", 2)}}, "must be a real number, got '1'"),
+    "bound NaN": ({"controls": {"force": (NAN, 2)}}, "or is NaN"),
+    "unknown start": ({"start": {"y": 0.0}}, "`start`: Sled has no y; it has x, v, force"),
+    "unknown end": ({"end": {"y": 0.0}}, "`end`: Sled has no y"),
+    "unknown within": ({"within": {"y": (0, 1)}}, "`within`: Sled has no y"),
+    "start as text": ({"start": {"x": "0"}}, "must be a real number, got '0'"),
+    "start true": ({"start": {"x": True}}, "must be a real number, got True"),
+    "start NaN": ({"start": {"x": NAN}}, "leave the name out"),
+    "start array": ({"start": {"x": np.zeros(1)}}, "must be a real number"),
+    "start as a list": ({"start": [0.0, 0.0]}, "must be a dict by name"),
+    "start state NaN": ({"start": jk.State([NAN], [0.0])}, "values that are not finite"),
+    "start of another system": ({"start": jk.State([0.0, 1.0], [0.0])}, "q must have 1 entries"),
+    "start as a batch": ({"start": jk.State(np.zeros((3, 1)), np.zeros((3, 1)))}, "q must have 1 entries"),
+    "start outside": ({"within": {"x": (0.5, 2.0)}}, "`start` of 'x' is 0.0, but its bounds along the motion"),
+    "one bound within": ({"within": {"x": 0.5}}, "must be (lower, upper)"),
+    "within and controls": ({"controls": {"force": (0, 1)}, "within": {"force": (2, 3)}}, "exclude each other"),
+    "duration 0": ({"duration": 0}, "must be a positive number"),
+    "duration (0, 0)": ({"duration": (0, 0)}, "must be a positive number"),
+    "negative duration": ({"duration": -1.0}, "must be a positive number"),
+    "duration NaN": ({"duration": NAN}, "must be a positive number"),
+    "duration to NaN": ({"duration": (1.0, NAN)}, "must be a positive number"),
+    "duration infinite": ({"duration": (1.0, np.inf)}, "must be a positive number"),
+    "exchanged durations": ({"duration": (2.0, 1.0)}, "must be a positive number"),
+    "duration as text": ({"duration": "1"}, "must be a real number, got '1'"),
+    "duration from None": ({"duration": (None, 3.0)}, "must be a real number, got None"),
+    "three durations": ({"duration": (1, 2, 3)}, "must be a number or (least, greatest)"),
+    "cost as a number": ({"cost": 3.0}, "`cost` must be a function"),
+    "unknown parameter": ({"free": ["masss"]}, "no parameter 'masss'; did you mean 'mass'"),
+    "unknown input": ({"inputs": {"f": 1.0}}, "no input named f"),
+    "control as input": ({"inputs": {"force": 1.0}}, "in `controls` and in `inputs`"),
+    "input as text": ({"controls": [], "inputs": {"force": "1"}}, "must be real numbers"),
+    "input as array": ({"controls": [], "inputs": {"force": np.zeros(2)}}, "Pass jaxkane.Samples"),
+    "zero-order hold": (
+        {"controls": [], "inputs": {"force": jk.Samples([0.0, 1.0], [0.0, 1.0], zero_order_hold=True)}},
+        "needs continuous inputs",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_arguments_of_a_problem(name):
+    changes, message = WRONG[name]
+    with pytest.raises((ValueError, TypeError)) as error:
+        problem(**changes)
+    assert message in str(error.value)
+
+
+class Counted(Sled):
+    count: int = eqx.field(static=True, default=2)
+
+
+def test_systems_that_collocation_does_not_accept():
+    for system, message in (
+        (BouncingBall(), "has contacts"),
+        (Sled(mass=jnp.ones(3)), "is a batch"),
+        (Sled(mass=jnp.ones((), jnp.float32)), "needs float64"),
+        (Sled, "must be an instance of a System"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=message):
+            Problem(system, 1.0, controls=[])
+    with pytest.raises(TypeError, match="is traced"):
+        jax.jit(lambda mass: problem(system=Sled(mass=mass)).duration)(2.0)
+    with pytest.raises(ValueError, match="no parameter 'count'"):
+        problem(system=Counted(), free=["count"])
+
+
+FUNCTIONS = {
+    "cost NaN": ({"cost": lambda t, now: jnp.sqrt(now["x"] - 5.0)}, "`cost` is not finite at the initial guess"),
+    "cost vector": ({"cost": lambda t, now: now.state.q}, "must return one real number"),
+    "cost as text": ({"cost": lambda t, now: "1"}, "must return one real number, got '1'"),
+    "no cost": ({"cost": lambda t, now: None}, "must return one real number, got None"),
+    "truth value": ({"cost": lambda t, now: now["x"] > 0}, "returns a truth value"),
+    "complex cost": ({"cost": lambda t, now: now["x"].astype(complex)}, "must return one real number"),
+    "unknown name": ({"cost": lambda t, now: now["y"]}, "There is no 'y' in `now`"),
+    "a branch": ({"cost": lambda t, now: now["x"] if now["x"] > 0 else 0.0}, "jnp.where"),
+    "final cost NaN": ({"final_cost": lambda t, now: jnp.log(now["x"] - 5.0)}, "is not finite"),
+    "final cost vector": ({"final_cost": lambda t, now: now.state.q}, "must return one real number"),
+    "condition as truth value": ({"conditions": lambda a, b, d: {"c": b["x"] > 0}}, "`conditions` of `c` returns a tr"),
+    "rounded condition": ({"conditions": lambda a, b, d: {"c": jnp.floor(b["x"])}}, "the derivative of 'c' is zero"),
+    "constant condition": ({"conditions": lambda a, b, d: {"c": 1}}, "the derivative of 'c' is zero"),
+    "conditions in a list": ({"conditions": lambda a, b, d: [b["x"]]}, "must return a dict"),
+    "condition as text": ({"conditions": lambda a, b, d: {"c": "x"}}, "must return one real number"),
+    "exchanged bounds": ({"conditions": lambda a, b, d: {"c": (b["x"], 2, 1)}}, "`conditions` of 'c' is (2, 1)"),
+    "two bounds": ({"conditions": lambda a, b, d: {"c": (b["x"], 2)}}, "(number, lower, upper)"),
+    "path as truth value": ({"path": lambda t, now: {"c": now["x"] > 0}}, "returns a truth value"),
+    "integer path": ({"path": lambda t, now: {"c": 1}}, "the derivative of 'c' is zero"),
+    "path vector": ({"path": lambda t, now: {"c": now.state.q}}, "must return one real number"),
+    "control in all inputs": (
+        {"inputs": lambda t, state: {"force": 0.0}}, "is in `controls`, and the function `inputs` returns it"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_functions_that_cannot_be_used(name):
+    changes, message = FUNCTIONS[name]
+    with pytest.raises((ValueError, TypeError, KeyError)) as error:
+        solved(**changes)
+    assert message in str(error.value)
+
+
+def test_wrong_guesses():
+    for guess, message in (
+        ({"x": 5.0}, "'x' is 5 at 0 s, but the problem requires -2 to 2"),
+        ({"x": 0.5}, "'x' is 0.5 at the start, but the problem requires 0"),
+        ({"y": 0.5}, "no y; it has x, v, force, duration"),
+        ({"x": "0"}, "must be a number, an array"),
+        ({"x": lambda t: np.zeros(2)}, "must be a real number"),
+        ({"force": NAN}, "not finite"),
+        ({"duration": 3.0}, "must be from 1 to 1 s"),
+        (3.0, "must be None, a Plan, a Trajectory"),
+        ([], "an empty sequence"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=message):
+            solved(guess, within={"x": (-2.0, 2.0)})
+
+
+def test_wrong_arguments_of_solve():
+    for arguments, message in (
+        ({"intervals": 0}, "from 1 to 2000"), ({"intervals": 2.0}, "an integer"), ({"intervals": True}, "an integer"),
+        ({"max_intervals": "a"}, "an integer"), ({"max_iterations": -1}, "an integer of at least 0"),
+        ({"starts": 0}, "of at least 1"), ({"seed": "a"}, "an integer"), ({"method": "euler"}, "must be one of"),
+        ({"tolerance": 0.0}, "must be positive"), ({"tolerance": "a"}, "real number"),
+        ({"solver": "ipopt"}, "must be a solver"), ({"solver": Ipopt}, r"such as jaxkane.collocation.Ipopt\(\)"),
+        ({"options": 3}, "must be a dict"),
+    ):  # fmt: skip
+        with pytest.raises((ValueError, TypeError), match=message):
+            solve(problem(), **arguments)
+    with pytest.raises(TypeError, match="must be a Problem or Phases"):
+        solve(Sled())  # type: ignore[arg-type]
+    pytest.importorskip("casadi")
+    with pytest.raises(ValueError, match="nonsense"):
+        solved(options={"nonsense": 3})
+
+
+def test_wrong_phases():
+    one = problem()
+    for arguments, message in (
+        (([],), "sequence of Problem"), ((one,), "pass sequences"), (([one, Sled()],), "sequence of Problem"),
+        (([one, one], []), "2 phases need 1 links, or 2"), (([one, one], [3]), "link 0 must be"),
+        (([one], ["strike"]), "has no jump strike"), (([one], "strike"), "pass sequences"),
+        (([one, Problem(RodOnPin(length=1.0), 1.0, controls=[])], [None]), "link 0: the states have other names"),
+        (([problem(free=["mass"]), one], [None]), "the same `free`"),
+    ):  # fmt: skip
+        with pytest.raises((ValueError, TypeError), match=message):
+            Phases(*arguments)
+    for link, message in (
+        (lambda last, first: {}, "returns no residuals"),
+        (lambda last, first: [last["x"]], "must return a dict"),
+        (lambda last, first: {"x": last["x"] > first["x"]}, "truth value"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=message):
+            solve(Phases([problem(end=None), problem(start=None)], [link]), intervals=2)
+    with pytest.raises(ValueError, match="3 guesses for 2 phases"):
+        solve(Phases([problem(end=None), problem(start=None)], [None]), [None] * 3, intervals=2)
+
+
+BICYCLE = jk.catalog.WhippleBicycle.benchmark()
+
+
+def test_ends_that_say_the_same_twice_are_refused():
+    """A pitch that does not belong to roll and steer was once reached by the discretization error."""
+    rod = RodOnPin(length=1.0)
+    for system, end, message in (
+        (rod, {"y": 0.5, "x": 0.8}, "Leave out x"),
+        (rod, {"v": 0.0, "x_dot": 0.0}, "only 1 speeds are independent. Leave out x_dot"),
+        (SliderCrank(), {"crank": 1.0, "x": 0.3}, "Leave out x"),
+        (BICYCLE, {"roll": 0.0, "steer": 0.0, "pitch": 0.1}, "Leave out pitch"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Problem(system, 1.0, controls=[], end=end)
+    Problem(BICYCLE, 1.0, controls=[], end={"roll": 0.0, "pitch": 0.0})
+    with pytest.raises(ValueError, match="violate the configuration constraints"):
+        Problem(rod, 1.0, controls=[], start={"y": 0.0, "x": 0.9})
+
+
+def test_a_problem_without_a_solution_names_its_constraints():
+    plan = solved(controls={"force": (-1.0, 1.0)})
+    assert not plan.ok
+    assert "contradict" in plan.reason
+    assert [name for name in plan.unmet if "equations of motion of x" in name]
+    plan = solved(conditions=lambda first, last, duration: {"far": last["x"] - 5.0})
+    assert not plan.ok
+    assert "far" in plan.unmet
+    assert "not met: far" in plan.report()
+    assert np.all(np.isfinite(plan["x"]))
+
+
+def test_a_cost_without_a_lower_bound():
+    plan = solved(cost=lambda t, now: -(now["force"] ** 2))
+    assert not plan.ok
+    assert "no lower bound" in plan.reason
+    assert plan.cost < -1e6

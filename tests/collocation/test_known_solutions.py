@@ -1,0 +1,247 @@
+"""Optimal control problems whose solutions are known, from formulas and publications."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from mechanisms import Sled
+
+import jaxkane as jk
+from jaxkane.collocation import Phases, Problem, solve
+from jaxkane.stability import periodic
+
+REST = {"x": 0.0, "v": 0.0}
+REST_TO_REST = {"start": REST, "end": {"x": 1.0, "v": 0.0}}
+
+
+def effort(t, now):
+    return now["force"] ** 2
+
+
+def time(t, now):
+    return t
+
+
+def test_least_energy_from_rest_to_rest():
+    """u = 6 - 12 t: the energy is 12, and the last place x, if it were shifted, would change it by 24 x."""
+    atol = 1e-9
+    plan = solve(Problem(Sled(), 1.0, controls=["force"], cost=effort, **REST_TO_REST), intervals=5)
+    assert plan.ok
+    assert plan.cost == pytest.approx(12.0, abs=atol)
+    np.testing.assert_allclose(plan["force"], 6 - 12 * np.asarray(plan.t), atol=atol)
+    np.testing.assert_allclose(plan["x"], 3 * np.asarray(plan.t) ** 2 - 2 * np.asarray(plan.t) ** 3, atol=atol)
+    assert plan.multipliers["x"][-1] == pytest.approx(24.0, abs=1e-6)
+    assert plan.multipliers["v"][-1] == pytest.approx(-12.0, abs=1e-6)
+    np.testing.assert_allclose(plan.multipliers.costate["x"], -24.0, atol=1e-6)
+
+
+def test_least_time_from_rest_to_rest():
+    """Full force forwards, then backwards: 2 s."""
+    atol = 1e-6
+    plan = solve(
+        Problem(Sled(), (0.1, 10.0), controls={"force": (-1.0, 1.0)}, final_cost=time, **REST_TO_REST), intervals=20
+    )
+    assert plan.ok
+    assert plan.duration == pytest.approx(2.0, abs=atol)
+    assert plan.cost == plan.duration
+    assert plan.active == ("force at its lower bound", "force at its upper bound")
+    assert float(plan.t[-1]) == plan.duration == plan.mesh[-1]
+
+
+@pytest.mark.parametrize("limit", ["within", "path"])
+def test_least_time_with_a_speed_limit(limit):
+    """0.5 s to the speed 0.5, as long to brake, and 0.75 / 0.5 s between. Controls are continuous, so that a switch
+    costs an error of the second order in the length of an interval."""
+    atol = 2e-5
+    limits = {"within": {"within": {"v": (None, 0.5)}}, "path": {"path": lambda t, now: {"slow": 0.5 - now["v"]}}}
+    problem = Problem(
+        Sled(), (0.1, 10.0), controls={"force": (-1.0, 1.0)}, final_cost=time, **REST_TO_REST, **limits[limit]
+    )
+    plan = solve(problem, intervals=200, tolerance=None)
+    assert plan.ok
+    assert plan.duration == pytest.approx(2.5, abs=atol)
+    assert ("slow" if limit == "path" else "v at its upper bound") in plan.active
+
+
+def riccati(duration):
+    """x' P x is the least integral of x^2 + v^2 + force^2 of a sled, by the matrix exponential of its Hamiltonian."""
+    A, B = np.array([[0.0, 1.0], [-4.0, -0.3]]), np.array([[0.0], [1.0]])
+    H = np.block([[A, -B @ B.T], [-np.eye(2), -A.T]])
+    F = scipy.linalg.expm(H * duration)
+    return -np.linalg.solve(F[2:, 2:], F[2:, :2])
+
+
+SPRUNG = Sled(drag=0.3, stiffness=4.0)
+FIRST = np.array([1.0, 0.5])
+
+
+def regulated(**arguments):
+    def cost(t, now):
+        return now["x"] ** 2 + now["v"] ** 2 + now["force"] ** 2
+
+    start = dict(zip(("x", "v"), FIRST, strict=True))
+    return solve(Problem(SPRUNG, 2.0, controls=["force"], cost=cost, start=start), **arguments)
+
+
+@pytest.mark.parametrize(("method", "order"), [("trapezoid", 2), ("hermite-simpson", 4), ("lobatto", 6)])
+def test_order_of_convergence(method, order):
+    """The end of a free oscillation against the matrix exponential, and the least cost of a linear-quadratic problem
+    against the Riccati equation. The method of order 6 reaches the rounding errors of the solver."""
+    within = 0.1  # of the order
+    exact = scipy.linalg.expm(2.0 * np.array([[0.0, 1.0], [-4.0, -0.3]])) @ FIRST
+    start = dict(zip(("x", "v"), FIRST, strict=True))
+    free = [solve(Problem(SPRUNG, 2.0, controls=[], start=start), intervals=n, method=method, tolerance=None)
+            for n in (8, 16)]  # fmt: skip
+    errors = [np.linalg.norm([*plan.state().q, *plan.state().u] - exact) for plan in free]
+    assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=within)
+    if order < 6:
+        least = FIRST @ riccati(2.0) @ FIRST
+        errors = [abs(regulated(intervals=n, method=method, tolerance=None).cost - least) for n in (8, 16)]
+        assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2)
+    else:
+        assert regulated(intervals=12, method=method, tolerance=None).cost == pytest.approx(3.1584649082719, rel=1e-8)
+
+
+def test_linear_quadratic_problem_against_riccati():
+    """Cost, control and multipliers. The tolerance 1e-6 bounds the error of each interval."""
+    rtol = 3e-6
+    plan, P = regulated(intervals=10), riccati(2.0)
+    assert plan.ok
+    assert plan.cost == pytest.approx(FIRST @ P @ FIRST, rel=rtol)
+    slopes = [plan.multipliers[name][0] for name in ("x", "v")]
+    np.testing.assert_allclose(slopes, 2 * P @ FIRST, rtol=1e-4)
+    assert float(plan["force"][0]) == pytest.approx(-(P @ FIRST)[1], rel=5e-3)  # of order 3
+    assert np.max(plan.errors) <= 1e-6
+
+
+def test_multipliers_are_derivatives_of_the_least_cost():
+    """By finite differences: of a start, an end, a bound, a condition, a path constraint and the duration's bound."""
+    rtol, step = 1e-4, 1e-3
+    given = {"x": 0.2, "end": 1.0, "force": 3.3, "mean": 0.3, "fast": 0.8, "duration": 2.0}
+
+    def least(**shifts):
+        at = {k: x + shifts.get(k, 0.0) for k, x in given.items()}
+        problem = Problem(
+            SPRUNG, (0.5, at["duration"]), controls={"force": (None, at["force"])}, cost=effort,
+            start={"x": at["x"], "v": 0.0}, end={"x": at["end"]},
+            conditions=lambda first, last, duration: {"mean": (last["v"], at["mean"], at["mean"])},
+            path=lambda t, now: {"fast": (now["v"], None, at["fast"])},
+        )  # fmt: skip
+        plan = solve(problem, intervals=20, tolerance=None, options={"tol": 1e-11})
+        assert plan.ok
+        return plan
+
+    plan = least()
+    found = {
+        "x": plan.multipliers["x"][0], "end": plan.multipliers["x"][-1], "force": plan.multipliers["force"].sum(),
+        "mean": plan.multipliers["mean"], "fast": plan.multipliers["fast"].sum(),
+        "duration": plan.multipliers["duration"],
+    }  # fmt: skip
+    for name, slope in found.items():
+        difference = (least(**{name: step}).cost - least(**{name: -step}).cost) / (2 * step)
+        assert slope == pytest.approx(difference, rel=rtol, abs=1e-5), name
+
+
+def test_free_parameter():
+    """Energy 12 m^2 / m^4 of the scaled force, and the mass itself: m^3 = 24."""
+    rtol = 1e-7
+
+    def cost(t, now):
+        return (now["force"] / now.system.mass**2) ** 2 + now.system.mass
+
+    problem = Problem(Sled(), 1.0, controls=["force"], cost=cost, free=["mass"], **REST_TO_REST)
+    plan = solve(problem, intervals=5)
+    assert plan.ok
+    assert plan.estimates["mass"] == pytest.approx(24 ** (1 / 3), rel=rtol)
+    assert float(plan.system.mass) == plan.estimates["mass"]
+    assert "mass" in repr(plan)
+    again = solve(problem, plan, intervals=5)
+    assert again.iterations <= 3
+    assert again.estimates["mass"] == pytest.approx(24 ** (1 / 3), rel=rtol)
+
+
+class Hypersensitive(Sled):
+    """v_dot = -v^3 + force."""
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force((inputs["force"] - u["v"] ** 3) * motion.N.x, motion["sled"])
+
+
+def test_hypersensitive_problem():
+    """J. T. Betts, Practical Methods for Optimal Control, example 10.7: 6.7241 over 10 000 s, which is at rest but for
+    the first and last seconds."""
+    problem = Problem(
+        Hypersensitive(), 1e4, controls=["force"], cost=lambda t, now: now["v"] ** 2 + now["force"] ** 2,
+        start={"v": 1.0}, end={"v": 1.5},
+    )  # fmt: skip
+    plan = solve(problem, intervals=20)
+    assert plan.ok, plan.reason
+    assert plan.cost == pytest.approx(6.7241, abs=2e-4)
+    assert len(plan.mesh) - 1 <= 120
+
+
+class Chute(jk.System):
+    """A bead that slides along its heading without friction, N.y down: v_dot = g sin(heading)."""
+
+    coordinates, speeds, inputs = ("x", "y", "heading"), ("v", "turn"), ("torque",)
+
+    def q_dot(self, t, q, u):
+        return u["v"] * jnp.cos(q["heading"]), u["v"] * jnp.sin(q["heading"]), u["turn"]
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["heading"], u["turn"], "A")
+        bead = O.moving(q["x"] * N.x + q["y"] * N.y, u["v"] * A.x)
+        return jk.Motion([jk.Body(1.0, (0.0, 0.0, 1.0), bead, A, name="bead")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, 9.81 * motion.N.y), jk.Torque(inputs["torque"] * motion.N.z, motion["bead"])
+
+
+def test_brachistochrone():
+    """A cycloid of radius 1 m down to the parameter 2: its time is 2 sqrt(1 / 9.81) s. Its heading turns steadily."""
+    rtol = 1e-5
+    angle, start = 2.0, {"x": 0.0, "y": 0.0, "v": 0.0}
+    problem = Problem(
+        Chute(), (0.1, 3.0), controls={"torque": (-50.0, 50.0)}, final_cost=time, start=start,
+        end={"x": angle - math.sin(angle), "y": 1.0 - math.cos(angle)},
+    )  # fmt: skip
+    plan = solve(problem, {"heading": 1.0, "v": lambda t: 5.0 * t, "duration": 1.0}, intervals=20)
+    assert plan.ok, plan.reason
+    assert plan.duration == pytest.approx(angle / math.sqrt(9.81), rel=rtol)
+
+
+BICYCLE = jk.catalog.WhippleBicycle.benchmark()
+
+
+@pytest.mark.slow
+def test_lane_change_of_notebook_9():
+    """1.941733 N^2 m^2 s in the notebook, by CasADi's symbolic derivatives and 200 intervals."""
+    rolling = jk.assemble(BICYCLE, {}, {"rear_wheel_rate": -6.0 / float(BICYCLE.rR)})
+    end = dict.fromkeys(("roll", "steer", "yaw", "roll_rate", "steer_rate"), 0.0) | {"y": 1.5}
+    problem = Problem(
+        BICYCLE, 3.0, controls=["steer_torque"], cost=lambda t, now: now["steer_torque"] ** 2, start=rolling, end=end
+    )
+    plan = solve(problem, intervals=200, tolerance=None)
+    assert plan.cost == pytest.approx(1.941733, abs=1e-6)
+    refined = solve(problem, intervals=50)
+    assert refined.ok
+    assert refined.cost == pytest.approx(1.9417327, abs=1e-6)
+    assert refined.deviation(refined.replay()) < 1e-4
+
+
+@pytest.mark.slow
+def test_gait_of_the_compass_walker():
+    """A phase that its own heel strike leads back to its start is the periodic orbit."""
+    rtol = 1e-8
+    walker, first = jk.catalog.CompassGait(), jk.State([-0.22, 0.32, 0.0], [1.1, 0.4])
+    orbit = periodic(walker, first, section="heel_strike")
+    step = Problem(walker, (0.4, 1.2), controls=[], start={"foot": 0.0})
+    guess = jk.simulate(walker, first, jnp.linspace(0.0, 0.7, 50))
+    plan = solve(Phases([step], links=["heel_strike"]), [guess], intervals=20, method="lobatto", tolerance=1e-8)
+    assert plan.ok, plan.reason
+    assert plan.duration == pytest.approx(float(orbit.period), rel=rtol)
+    np.testing.assert_allclose(plan.state(0).q, orbit.state.q, atol=1e-7)
+    np.testing.assert_allclose(plan.state(0).u, orbit.state.u, atol=1e-6)
