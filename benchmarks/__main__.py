@@ -9,6 +9,7 @@
     from_description  from the description to the first trajectory: SymPy's ways
     chains            three-dimensional chains of 2 to 40 links: MuJoCo, Pinocchio, MJX, JaxSim
     gpu               65 536 rides on a GPU, where there is one
+    walkers           20 steps of ten thousand walkers, and families of gaits: SciPy with events around C
     eigenvalues       eigenvalues of ten thousand bicycles: BicycleParameters, numpy
     identification    fits of the bicycle, and whether they can be trusted (four minutes)
     million           a million bicycles, killed on the way (five minutes)
@@ -51,6 +52,7 @@ SETTINGS = {
     "from_description": (XLA, NATIVE),
     "chains": (XLA, NATIVE),
     "gpu": TWO[:1],
+    "walkers": (XLA, NATIVE),
     "million": TWO[1:],
     "swing_up": (XLA,),
 }

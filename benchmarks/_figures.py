@@ -38,7 +38,7 @@ class Figure:
         return f"{digits(self.value)} {_UNITS.get(self.unit, self.unit)}".strip()
 
 
-_UNITS = {"x": "", "rides/s": "rides a second"}
+_UNITS = {"x": "", "rides/s": "rides a second", "walks/s": "walks a second"}
 
 
 def digits(x: float) -> str:

@@ -21,6 +21,7 @@ TITLES = {
     "chains": "Three-dimensional chains of n links",
     "gpu": "On a GPU",
     "million": "A million bicycles",
+    "walkers": "Walkers: 20 steps, and families of gaits",
     "eigenvalues": "Eigenvalues of ten thousand bicycles",
     "identification": "Identification",
     "swing_up": "Optimal control: a double pendulum swung up",

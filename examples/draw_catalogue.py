@@ -278,6 +278,21 @@ def wheel_at_a_kerb(system, motion, s):
     s.trace(BLUE, wheel.center.position + system.radius * W.x)
 
 
+def woodpecker(system, motion, s):
+    N, sleeve, bird = motion.N, motion["sleeve"].frame, motion["bird"].frame
+    G, r, h = motion["sleeve"].center.position, system.sleeve_radius, system.half_height
+    for x in (-1.0, 1.0):
+        s.line(GREY, x * system.pole_radius * N.x - 0.05 * N.y, x * system.pole_radius * N.x + 0.03 * N.y)
+        s.line(GOLD, *(G + x * r * sleeve.x + y * h * sleeve.y for y in (-1.0, 1.0)))
+    spring = G + system.sleeve_to_spring * sleeve.x
+    center = spring + system.spring_to_bird * bird.x
+    beak = center - system.beak_length * bird.x + system.beak_height * bird.y
+    s.line(WHITE, G + r * sleeve.x, spring)
+    s.line(BLUE, spring, center, beak, spring)
+    s.trace(BLUE, beak)
+    s.trace(GOLD, G)
+
+
 @dataclasses.dataclass(frozen=True)
 class Picture:
     """How a system is shown: figure, seconds, flashes, from where [degrees], the axis that points up; and the speed and
@@ -320,6 +335,7 @@ PICTURES = {
     "KerbWheel": Picture(wheel_at_a_kerb, 1.1, 5, **PLANAR, speed=0.5, watched=2.0),
     "Backlash": Picture(coupling_with_play, 1.0, 4, **PLANAR, up="y"),
     "Belt": Picture(block_on_a_belt, 3.6, 4, **PLANAR, up="y", watched=9.0),
+    "Woodpecker": Picture(woodpecker, 0.25, 5, **PLANAR, speed=0.1, watched=0.7),
     "BouncingBall": Picture(ball, 1.0, 10, **PLANAR, speed=0.5, watched=3.0),
 }
 

@@ -237,44 +237,14 @@ def case(name):
     return system, 0.7, np.array(q), np.array(u), np.linspace(-0.4, 0.9, len(system.inputs))
 
 
-class BouncingBall(jk.System):
-    """A ball in air over a floor."""
+class BouncingBall(jk.catalog.BouncingBall):
+    """The ball of the catalogue with a contact instead of an event."""
 
-    restitution: Scalar = parameter(0.8, within=(0.0, 1.0))
-    drag: Scalar = parameter(0.1, unit="kg/m")
-    coordinates, speeds = ("h",), ("v",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        ball = jk.Body(1.0, 0.0, O.moving(q["h"] * N.y, u["v"] * N.y), name="ball")
-        return jk.Motion([ball])
-
-    def loads(self, t, q, u, motion, inputs):
-        resistance = -self.drag * u["v"] * jnp.abs(u["v"]) * motion.N.y
-        return jk.weight(motion, -9.81 * motion.N.y), jk.Force(resistance, motion["ball"])
+    def events(self, t, q, u):
+        return {}
 
     def contacts(self, t, q, u, motion):
-        return {"floor": jk.Contact(gap=q["h"], restitution=self.restitution)}
-
-
-class Belt(jk.System):
-    """A block on a moving belt, held by a spring."""
-
-    stiffness: Scalar = parameter(4.0, unit="N/m")
-    speed: Scalar = parameter(0.5, unit="m/s")
-    kinetic: Scalar = parameter(2.5, positive=True, unit="N")
-    static: Scalar = parameter(4.0, positive=True, unit="N")
-    coordinates, speeds = ("x",), ("x_dot",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["x_dot"] * N.x), name="block")])
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.Force(-self.stiffness * q["x"] * motion.N.x, motion["block"])
-
-    def contacts(self, t, q, u, motion):
-        return {"belt": jk.DryFriction(u["x_dot"] - self.speed, self.kinetic, static=self.static)}
+        return {"floor": jk.Contact(gap=q["height"], restitution=self.restitution)}
 
 
 class KerbWheel(jk.System):
@@ -309,57 +279,6 @@ class KerbWheel(jk.System):
             "road": jk.Contact(rim, N.z, friction=self.friction),
             "kerb": jk.Contact(edge, away, gap=distance - self.radius, friction=self.friction),  # upright wheel
         }
-
-
-class Backlash(jk.System):
-    """A motor and a load with play between them."""
-
-    play: Scalar = parameter(0.02, unit="rad")
-    coordinates, speeds = ("motor", "load"), ("motor_rate", "load_rate")
-    inputs = ("torque",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        M = N.rotate(3, q["motor"], u["motor_rate"], "M")
-        L = N.rotate(3, q["load"], u["load_rate"], "L")
-        bodies = [jk.Body(0.1, (0.0, 0.0, 1e-3), O, M, name="rotor"), jk.Body(1.0, (0.0, 0.0, 5e-3), O, L, name="arm")]
-        return jk.Motion(bodies)
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.Torque(inputs["torque"] * motion.N.z, motion["rotor"])
-
-    def contacts(self, t, q, u, motion):
-        lead = q["motor"] - q["load"]
-        return {
-            "drive": jk.Contact(gap=0.5 * self.play - lead, restitution=0.3),
-            "coast": jk.Contact(gap=0.5 * self.play + lead, restitution=0.3),
-        }
-
-
-class TwoCornerBlock(jk.System):
-    """A block that rocks, slides and jumps on a floor: two corners."""
-
-    width: Scalar = parameter(0.4, unit="m")
-    height: Scalar = parameter(1.2, unit="m")
-    friction: Scalar = parameter(0.6)
-    restitution: Scalar = parameter(0.0)
-    coordinates, speeds = ("x", "y", "angle"), ("x_dot", "y_dot", "rate")
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        B = N.rotate(3, q["angle"], u["rate"], "B")
-        center = O.moving(q["x"] * N.x + q["y"] * N.y, u["x_dot"] * N.x + u["y_dot"] * N.y)
-        I = (self.width**2 + self.height**2) / 12
-        down = -0.5 * self.height * B.y
-        left, right = (center.fixed(down + s * self.width * B.x) for s in (-0.5, 0.5))
-        return jk.Motion([jk.Body(1.0, (I, I, I), center, B, name="block")], points={"left": left, "right": right})
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -9.81 * motion.N.y)
-
-    def contacts(self, t, q, u, motion):
-        law = {"restitution": self.restitution, "friction": self.friction}
-        return {name: jk.Contact(motion[name], motion.N.y, **law) for name in ("left", "right")}
 
 
 class SliderCrank(jk.System):

@@ -31,7 +31,14 @@ def axes_of(sequence: str) -> tuple[int, ...]:
 
 def simple_rotation(axis: int, angle: Component) -> Matrix:
     """[R] of a right-hand rotation by `angle` [rad] about axis 0, 1 or 2."""
-    return _simple(axis, jnp.cos(angle), jnp.sin(angle))
+    return _simple(axis, *cosine_and_sine(angle))
+
+
+def cosine_and_sine(angle: Component) -> tuple[Component, Component]:
+    """Those of an exact angle are exact numbers, which need no operation of JAX."""
+    if is_exact(angle) and math.isfinite(angle):
+        return math.cos(angle), math.sin(angle)
+    return jnp.cos(angle), jnp.sin(angle)
 
 
 def _simple(axis: int, c: Component, s: Component) -> Matrix:

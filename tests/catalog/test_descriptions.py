@@ -40,6 +40,7 @@ def test_every_system_is_exported_and_listed():
         "RockingBlock",  # Housner
         "KerbWheel",  # Irodov
         "Rattleback",
+        "Woodpecker",  # Leine
         "RimlessWheel",
         "Backlash",  # Nordin
         "Belt",  # Popp

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane.catalog import Backlash, Belt, KerbWheel, RockingBlock, SliderCrankWithClearance
+from jaxkane.catalog import Backlash, Belt, KerbWheel, RockingBlock, SliderCrankWithClearance, Woodpecker
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
@@ -107,3 +107,21 @@ def test_a_wheel_rolls_over_the_edge():
     expected = v0**2 + 4.0 / 3.0 * g * (R + kerb - ride["y"][on_edge])
     np.testing.assert_allclose(squares, expected, rtol=1e-8)
     np.testing.assert_allclose(ride["spin"][on_edge], np.sqrt(squares) / R, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_woodpecker_hops_down_its_pole():
+    """The period of Leine et al. (2003) is 0.146 s. The sleeve jams in each period, so one multiplier is not zero."""
+    jammed = jk.assemble(Woodpecker(), {"bird": -0.2788}, {"bird_rate": -7.4583, "climb": -0.3411}, touching=("lower",))
+    ride = jk.simulate(Woodpecker(), jammed, jnp.linspace(0.0, 0.6, 601), rtol=1e-10, atol=1e-12)
+    flies = np.max([ride.contacts[name] for name in ride.contact_names], axis=0) == 0
+    i = np.flatnonzero(flies)[-10]
+    orbit = jk.stability.periodic(Woodpecker(), jk.State(ride.q[i], ride.u[i]), period=0.146)
+    np.testing.assert_allclose(orbit.period, 0.1459760651, rtol=1e-9)
+    np.testing.assert_allclose(orbit.multipliers, [-0.839155653, 0.0, 0.0, 0.0], atol=1e-8)
+    # In the simulation, the deviation of the period from its limit changes by the multiplier in each hop.
+    events, jumps = ride.jumps.event[: int(ride.jumps.count)], ride.jumps
+    strikes = [i for i, event in enumerate(events) if jumps.names[int(event)] == "beak" and jumps.impulses[i, 0] > 0]
+    periods = np.diff(jumps.t[np.array(strikes)])
+    ratios = (periods[1:] - orbit.period) / (periods[:-1] - orbit.period)
+    np.testing.assert_allclose(ratios[-1], orbit.multipliers[0].real, rtol=0.1)

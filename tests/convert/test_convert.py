@@ -16,19 +16,6 @@ RTOL = 1e-10
 FIGURES = json.loads((Path(__file__).parents[1] / "data" / "mujoco_tree.json").read_text())
 needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="needs MuJoCo: pip install mujoco")
 
-ELBOW = """<robot name="elbow">
- <link name="upper"><inertial><mass value="0.37"/>
-  <inertia ixx="6e-4" ixy="1e-5" ixz="0" iyy="6.2e-4" iyz="0" izz="5e-4"/></inertial>
-  <visual><geometry><mesh filename="package://nowhere/upper.stl"/></geometry></visual></link>
- <link name="lower"><inertial><origin xyz="0.035 0 0" rpy="0.1 0.2 0.3"/><mass value="0.3"/>
-  <inertia ixx="6e-4" ixy="0" ixz="0" iyy="6e-4" iyz="0" izz="7e-4"/></inertial></link>
- <link name="tool.tip"/>
- <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
-  <origin xyz="-0.035 0.06 0" rpy="0 0.5 0"/><axis xyz="0 1 0"/><dynamics damping="0.02"/></joint>
- <joint name="flange" type="fixed"><parent link="lower"/><child link="tool.tip"/><origin xyz="0.1 0 0"/></joint>
- <drake:collision_filter_group name="g"/>
-</robot>"""
-
 LOOP = """<mujoco model="fourbar"><option><flag contact="disable"/></option><worldbody>
  <body name="a"><joint name="j1" axis="0 1 0" damping="0.1"/><geom type="capsule" fromto="0 0 0 0 0 0.3" size=".02"/>
   <body name="b" pos="0 0 0.3"><joint name="j2" axis="0 1 0" armature="0.01"/>
@@ -79,31 +66,6 @@ def test_a_file_is_read_by_its_path_and_sites_are_points(tmp_path):
     mujoco.mj_kinematics(model, data)
     tip = system.motion(0.0, q, np.zeros(len(system.speeds)))["tip"].position
     np.testing.assert_allclose(tip.to(tip.frame.root), data.site("tip").xpos, rtol=1e-12)
-
-
-@needs_mujoco
-@pytest.mark.parametrize("floating", [True, False])
-def test_a_urdf_with_and_without_a_base_that_flies(floating):
-    import mujoco
-
-    system = jk.convert.from_urdf(ELBOW, floating=floating, strict=True)
-    assert set(system.mass) == ({"upper", "lower"} if floating else {"lower"})
-    assert "tool_tip" in system.motion(0.0, [0.1] * len(system.coordinates), [0.0] * len(system.speeds)).points
-    base = '<body name="upper"><freejoint/>' if floating else '<body name="upper">'
-    text = f"""<mujoco><compiler angle="radian" eulerseq="XYZ"/><worldbody>{base}
-     <inertial pos="0 0 0" mass="0.37" fullinertia="6e-4 6.2e-4 5e-4 1e-5 0 0"/>
-     <body name="lower" pos="-0.035 0.06 0" euler="0 0.5 0"><joint axis="0 1 0" damping="0.02"/>
-      <inertial pos="0.035 0 0" euler="0.1 0.2 0.3" mass="0.3" diaginertia="6e-4 6e-4 7e-4"/></body>
-    </body></worldbody></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(text)
-    data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
-    data.qvel[:] = rng.normal(size=model.nv)
-    mujoco.mj_forward(model, data)
-    q = np.array(data.qpos)
-    if floating:
-        q[3:7] = np.roll(q[3:7], -1)
-    np.testing.assert_allclose(jk.accelerations(system, 0.0, q, data.qvel), data.qacc, rtol=RTOL, atol=RTOL)
 
 
 @needs_mujoco
@@ -168,18 +130,6 @@ def test_a_loop_is_closed_where_the_file_places_its_bodies(equality):
 
 @needs_mujoco
 def test_joints_that_follow_others():
-    hinge = '<link name="{0}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="{1}" ixy="0" ixz="0" iyz="0"/>'
-    hinge += '</inertial></link><joint name="j{0}" type="revolute"><parent link="base"/><child link="{0}"/>'
-    hinge += '<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/>{2}</joint>'
-    mimic = '<mimic joint="ja" multiplier="-3" offset="0.1"/>'
-    text = f'<robot name="r"><link name="base"/>{hinge.format("a", 0.2, "")}{hinge.format("b", 0.3, mimic)}</robot>'
-    with pytest.warns(UserWarning, match="omitted.*limits of joints"):
-        system = jk.convert.from_urdf(text)
-    assert (system.speeds, system.dependent_speeds) == (("ja_rate",), ("jb_rate",))
-    with pytest.warns(UserWarning, match="omitted.*limits of joints"):  # that of jb
-        limited = jk.convert.from_urdf(text, stops=["ja"])
-    assert {name: float(limited.lower[name]) for name in limited.lower} == {"ja": -1.0}
-    np.testing.assert_allclose(jk.mass_matrix(system, 0.0, [0.2, 0.1 - 0.6], [0.0]), [[0.2 + 9 * 0.3]], rtol=1e-12)
     degree = '<equality><joint joint1="k" joint2="j" polycoef="0 2 0.5 0 0"/></equality>'
     two = BODY.format("") + BODY.replace('"a"', '"b"').replace('"j"', '"k"').format("")
     text = mjcf(two, "<option><flag contact='disable'/></option>" + degree)
@@ -298,8 +248,6 @@ def test_two_names_that_become_one_are_refused(first, second):
     motors = f'<actuator><motor name="{first}" joint="j"/><motor name="{second}" joint="j"/></actuator>'
     with pytest.raises(ValueError, match=f"the actuators '{first}' and '{second}' would both be 'j_1'"):
         jk.convert.from_mjcf(mjcf(BODY.format(""), motors))
-    with pytest.raises(ValueError, match=r"the bodies 'tool_tip' and 'tool.tip' would both be 'tool_tip'"):
-        jk.convert.from_urdf(ELBOW.replace('"lower"', '"tool_tip"'))
 
 
 @needs_mujoco
@@ -311,11 +259,15 @@ def test_a_name_of_the_file_is_not_given_to_what_has_none():
 
 
 @needs_mujoco
-def test_friction_of_zero_is_none():
-    smooth = ELBOW.replace('damping="0.02"', 'damping="0.02" friction="0"')
-    assert jk.convert.from_urdf(smooth, strict=True).left_out == ()
-    with pytest.raises(ValueError, match="not supported: friction of joints"):
-        jk.convert.from_urdf(smooth.replace('friction="0"', 'friction="0.1"'), strict=True)
+def test_friction_of_joints_becomes_dry_friction():
+    rough = BODY.format(' frictionloss="0.1"').replace("<geom ", '<geom contype="0" ')
+    with pytest.warns(UserWarning, match="friction of joints"):
+        jk.convert.from_mjcf(mjcf(rough))
+    system = jk.convert.from_mjcf(mjcf(rough), friction=["j"], strict=True)
+    friction = system.contacts(0.0, [0.0], [0.3], None)["j friction"]
+    assert (float(friction.slip), float(friction.kinetic)) == (0.3, 0.1)
+    off = "<option><flag frictionloss='disable'/></option>"
+    assert not jk.convert.from_mjcf(mjcf(rough, off), friction=True, strict=True).friction
 
 
 @needs_mujoco
@@ -384,16 +336,6 @@ def test_a_file_that_is_not_there():
         jk.convert.from_mjcf("nowhere.xml")
 
 
-@needs_mujoco
-def test_a_urdf_that_is_none():
-    with pytest.raises(ValueError, match="not a URDF"):
-        jk.convert.from_urdf("<robot><link>")
-    with pytest.raises(ValueError, match=r"not a URDF.*<mujoco>"):
-        jk.convert.from_urdf(mjcf(""))
-    with pytest.raises(ValueError, match=r"one root link.*a, b"):
-        jk.convert.from_urdf('<robot name="r"><link name="a"/><link name="b"/></robot>')
-
-
 @pytest.mark.slow
 @needs_mujoco
 def test_a_mass_that_was_brought_over_has_a_derivative():
@@ -404,8 +346,38 @@ def test_a_mass_that_was_brought_over_has_a_derivative():
     np.testing.assert_allclose(slope, (alpha(1.4 + 1e-5) - alpha(1.4 - 1e-5)) / 2e-5, rtol=1e-6)
 
 
-@pytest.mark.parametrize("read", [jk.convert.from_mjcf, jk.convert.from_urdf])
-def test_without_mujoco_the_remedy_is_named(read, monkeypatch):
+def test_without_mujoco_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ImportError, match="pip install mujoco"):
-        read("<mujoco/>")
+        jk.convert.from_mjcf("<mujoco/>")
+
+
+TRUSS = """<mujoco model="truss"><option><flag contact="disable"/></option><worldbody>
+ <body name="a"><joint name="j1" axis="0 1 0" ref="10"/><geom type="capsule" fromto="0 0 0 0 0 .3" size=".02"/>
+  <body name="b" pos="0 0 .3"><joint name="j2" axis="0 1 1e-5"/>
+   <geom type="capsule" fromto="0 0 0 .5 0 .1" size=".02"/></body></body>
+ <body name="c" pos=".5 0 0"><joint name="j3" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 .4" size=".02"/></body>
+ <body name="d" pos="0 2 0"><joint name="s" type="ball"/><geom size=".1"/></body>
+</worldbody><equality><connect name="pin" body1="b" body2="c" anchor=".5 0 .1"/></equality>
+<keyframe><key name="bent" qpos=".1 .1 -.1 .5 .5 .5 .5"/></keyframe></mujoco>"""
+
+
+@needs_mujoco
+def test_poses_of_a_file_and_a_residual_that_nearly_depends_on_the_others():
+    """An axis of five digits: the residual normal to the plane would lock the loop."""
+    with pytest.warns(UserWarning, match=r"Loop\('pin_1', 'pin_2'\) \(.*\).*") as told:
+        system = jk.convert.from_mjcf(TRUSS, pose="bent", independent=["j2"])
+    assert "nearly depend" in str(told[0].message)
+    assert system.dependent_speeds == ("j1_rate", "j3_rate")
+    assert {name: list(pose.values()) for name, pose in system.poses.items()} == {
+        "qpos0": [np.deg2rad(10.0), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+        "bent": [0.1, 0.1, -0.1, 0.5, 0.5, 0.5, 0.5],
+    }
+    start = jk.assemble(system, system.poses["bent"])
+    assert float(start.q[1]) == 0.1
+    assert np.abs(start.q - np.array([*system.poses["bent"].values()])).max() < 0.05
+    h = np.array([float(x) for x in system.configuration_constraints(0.0, start.q)])
+    np.testing.assert_allclose(h, 0.0, atol=1e-12)
+    with pytest.raises(ValueError, match="`pose` is 'flat', but the poses of the file are qpos0, bent"):
+        jk.convert.from_mjcf(TRUSS, pose="flat")

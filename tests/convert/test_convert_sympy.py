@@ -230,6 +230,66 @@ def test_what_is_prescribed_in_time_is_an_expression_of_time(me):
     np.testing.assert_allclose(jk.accelerations(system, 0.4, [0.1], [0.2]), [0.3 * 4 * np.sin(0.8)], rtol=1e-13)
 
 
+def pendulum_on_a_shaker(me, sm):
+    """A bar with J about its mass centre, whose pivot moves along N.x by z(t)."""
+    q, u, z = me.dynamicsymbols("q u z")
+    m, l, g, I, J = sm.symbols("m l g I J")
+    N, O = me.ReferenceFrame("N"), me.Point("O")
+    O.set_vel(N, 0)
+    pivot = O.locatenew("pivot", z * N.x)
+    pivot.set_vel(N, z.diff() * N.x)
+    A = N.orientnew("A", "Axis", [q, N.z])
+    A.set_ang_vel(N, u * N.z)
+    P = pivot.locatenew("P", l * A.x)
+    P.v2pt_theory(pivot, N, A)
+    bar = me.RigidBody("bar", P, A, m, (me.inertia(A, I, I, J), P))
+    kane = me.KanesMethod(N, [q], [u], [q.diff() - u], bodies=[bar], forcelist=[(P, m * g * N.x)])
+    return kane, z, O
+
+
+def test_a_prescribed_motion_is_an_expression_or_a_function(me):
+    """(J + m l^2) u_dot = -m g l sin(q) + m l sin(q) z_dot_dot. The moments I are not read and need no value."""
+    import sympy as sm
+
+    kane, z, O = pendulum_on_a_shaker(me, sm)
+    values, t = {"m": 1.2, "l": 0.5, "g": 9.81, "J": 0.02}, me.dynamicsymbols._t
+    w = sm.symbols("w")
+    systems = [
+        jk.convert.from_sympy(kane, values | {w: 3.0}, origin=O, prescribed={z: 0.1 * sm.sin(w * t)}),
+        jk.convert.from_sympy(kane, values, origin=O, prescribed={"z": lambda t: 0.1 * jnp.sin(3.0 * t)}),
+    ]
+    force = 1.2 * 0.5 * np.sin(0.3) * (-0.9 * np.sin(1.2) - 9.81)
+    for system in systems:
+        found = jk.accelerations(system, 0.4, [0.3], [0.2])
+        np.testing.assert_allclose(found, [force / (0.02 + 1.2 * 0.25)], rtol=RTOL)
+        assert float(system.I) == 0.0
+    place = jk.positions(systems[1], 0.4, [0.3], [0.2])["P"]
+    np.testing.assert_allclose(place, [0.1 * np.sin(1.2) + 0.5 * np.cos(0.3), 0.5 * np.sin(0.3), 0.0], rtol=RTOL)
+    for prescribed, error, words in (
+        ({"y": t, z: t}, ValueError, r"contains y\(t\), which is not part"),
+        ({"q": t, z: t}, ValueError, r"contains q\(t\), a coordinate"),
+        ({w: t}, TypeError, "must name functions of time"),
+        ({z: kane.q[0]}, TypeError, "must depend on time and constants"),
+    ):
+        with pytest.raises(error, match=words):
+            jk.convert.from_sympy(kane, values, prescribed=prescribed)
+    with pytest.raises(ValueError, match="no value for J, m"):
+        jk.convert.from_sympy(kane, {"l": 0.5, "g": 9.81}, prescribed={z: t})
+
+
+def test_a_lagrangian_with_a_prescribed_motion(me):
+    import sympy as sm
+
+    q, z = me.dynamicsymbols("q z")
+    m, l, g = sm.symbols("m l g")
+    velocity = z.diff() - l * sm.sin(q) * q.diff(), l * sm.cos(q) * q.diff()
+    L = m * (velocity[0] ** 2 + velocity[1] ** 2) / 2 + m * g * (z + l * sm.cos(q))
+    given = {"z": lambda t: 0.1 * jnp.sin(3.0 * t)}
+    system = jk.convert.from_sympy(me.LagrangesMethod(L, [q]), {m: 1.2, l: 0.5, g: 9.81}, prescribed=given)
+    expected = np.sin(0.3) / 0.5 * (-0.9 * np.sin(1.2) - 9.81)
+    np.testing.assert_allclose(jk.accelerations(system, 0.4, [0.3], [0.2]), [expected], rtol=RTOL)
+
+
 def test_what_a_model_does_not_say_is_named(me):
     import sympy as sm
 

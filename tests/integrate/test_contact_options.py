@@ -19,7 +19,8 @@ END = [0.016894590512326443, 0.22459525490753116]
 
 def drop(height=1.0, restitution=0.8, drag=0.1, ts=TS, **options):
     h = jnp.asarray(height)
-    system = BouncingBall(jnp.asarray(restitution, h.dtype), jnp.asarray(drag, h.dtype))
+    numbers = {"mass": 1.0, "drag": drag, "restitution": restitution, "gravity": 9.81}
+    system = BouncingBall(**{name: jnp.asarray(x, h.dtype) for name, x in numbers.items()})
     return jk.simulate(system, jk.State(h[None], jnp.zeros_like(h)[None]), ts, **{**TIGHT, **options})
 
 
@@ -65,7 +66,7 @@ def test_gradients_of_a_sweep():
     """Of the mean height of a batch by its common restitution, and of each member by its own height."""
 
     def mean(restitution, heights):
-        system = BouncingBall(restitution, jnp.array(0.0))
+        system = BouncingBall(drag=jnp.array(0.0), restitution=restitution)
         batch = jk.sweep.sweep(
             system, jk.State(heights[:, None], jnp.zeros((3, 1))), jnp.linspace(0.0, 1.0, 6), **TIGHT
         )
@@ -125,7 +126,7 @@ def test_float32():
 def test_a_simulation_that_continues_with_contact_states():
     """From the state at the end of another one. The contacts of a ball at rest remain closed."""
     first = drop(0.2, 0.5, 0.0)
-    again = jk.simulate(BouncingBall(0.5, 0.0), first.state(-1), TS, **TIGHT)
+    again = jk.simulate(BouncingBall(drag=0.0, restitution=0.5), first.state(-1), TS, **TIGHT)
     assert int(again.jumps.count) == 0
     np.testing.assert_array_equal(again.contacts["floor"], 1)
     np.testing.assert_array_equal(again.q, 0.0)
@@ -199,16 +200,16 @@ def test_misuse_is_explained(case):
 def test_an_event_and_a_contact_need_different_names():
     class Both(BouncingBall):
         def events(self, t, q, u):
-            return {"floor": jk.falling(q["h"])}
+            return {"floor": jk.falling(q["height"])}
 
     with pytest.raises(ValueError, match="'floor' is used twice"):
-        jk.simulate(Both(), jk.State({"h": 1.0}, {}), TS)
+        jk.simulate(Both(), jk.State({"height": 1.0}, {}), TS)
 
 
 def test_what_does_not_contain_contacts_says_so(tmp_path):
     with pytest.raises(ValueError, match="contact"):
-        jk.estimate.Filter(BouncingBall(), {"h": 0.01})
+        jk.estimate.Filter(BouncingBall(), {"height": 0.01})
     with pytest.raises(ValueError, match="contact"):
         jk.simulate(
-            BouncingBall(), jk.State({"h": 1.0}, {}), TS, controller=diffrax.PIDController(rtol=1e-6, atol=1e-6)
+            BouncingBall(), jk.State({"height": 1.0}, {}), TS, controller=diffrax.PIDController(rtol=1e-6, atol=1e-6)
         )

@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
+from jaxkane._kane.checks import _Consistency
+from jaxkane._system.parameters import parameter_info
+from jaxkane._system.system import with_class
 from jaxkane.fit.problem.from_declarations import parameters_of
 from jaxkane.joints import (
     Actuator,
@@ -27,6 +30,7 @@ from jaxkane.joints import (
     slide,
     universal,
 )
+from jaxkane.joints._loops import _Trial
 
 RTOL = 1e-11
 DATA = Path(__file__).parents[1] / "data"
@@ -150,6 +154,35 @@ def test_a_spring_on_a_ball_joint_is_smooth_where_it_rests_and_takes_the_shorter
     np.testing.assert_allclose(slope, -4.0, rtol=1e-9)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("base", [free("base"), planar("base"), [ball("s"), slide("x", (1, 2, 0))]])
+def test_the_methods_of_a_tree_of_joints_agree(base):
+    """`check_description` relies on this and does not check trees."""
+    links = [
+        Link("trunk", None, base, **BAR),
+        Link("leg", "trunk", universal("hip", anchor=(0, 0, 0.1)), (0.1, 0, 0), **BAR),
+        Link("foot", "leg", [slide("x2", (0, 0, 1)), ball("ankle", anchor=(0, 0.1, 0))], (0, 0, -0.2), **BAR),
+    ]
+    system = mechanism(links, sites=[Site("toe", "foot", (0.1, 0, 0))])
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-0.5, 0.5, len(system.coordinates))
+    for i, name in enumerate(system.coordinates):
+        if name.endswith("_e4"):
+            q[i - 3 : i + 1] /= np.linalg.norm(q[i - 3 : i + 1])
+    assert _Consistency(system, np.zeros(()), q, rng).check()
+
+
+def test_a_class_that_inherits_from_a_mechanism_is_checked():
+    base = mechanism(pendulums(1))
+
+    class Wrong(type(base)):
+        def q_dot(self, t, q, u):
+            return [2.0 * u["q0_rate"]]
+
+    with pytest.raises(ValueError, match="by the rates of its coordinates"):
+        jk.accelerations(with_class(base, Wrong), 0.0, [0.3], [0.2])
+
+
 # Loops
 
 
@@ -187,6 +220,51 @@ def test_what_is_dependent_is_found_and_may_be_assembled():
     guess = np.array([state["q"][c] + (0.0 if c == held else 0.05) for c in system.coordinates])
     found = jk.assemble(system, guess, [0.3])
     np.testing.assert_allclose(found.q, [state["q"][c] for c in system.coordinates], rtol=1e-10)
+
+
+@pytest.mark.parametrize("kept", ["q1", "q2", "q3"])
+def test_a_named_joint_is_independent(kept):
+    pose = FOUR_BAR["states"][0]["q"]
+    system = four_bar(independent=[kept], pose=pose, poses={"start": pose})
+    assert system.speeds == (f"{kept}_rate",)
+    assert system.poses == {"start": pose}
+    assert pickle.loads(pickle.dumps(system)).poses == system.poses
+    np.testing.assert_allclose(jk.assemble(system, pose).q, [pose[c] for c in system.coordinates], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"independent": ["q1", "q2"]}, "2 independent residuals, and cannot be solved without .*: q1, q2. Name fewer"),
+        ({"independent": ["q4"]}, "`independent`: .*'q4'"),
+        ({"independent": "q1"}, "`independent` must be a list of names"),
+        ({"independent": ["q2"], "dependent": ["q2", "q3"]}, "both name 'q2'"),
+        ({"pose": {"q": 1.0}}, "`pose`: .*'q'"),
+        ({"poses": {"start": {"q1": 1.0}}}, "the pose 'start' needs one value per coordinate; see 'q2'"),
+    ],
+)
+def test_choices_of_loops_that_are_refused(more, words):
+    with pytest.raises((ValueError, TypeError), match=words):
+        four_bar(**more)
+
+
+def test_a_loop_is_closed_by_its_own_links_only():
+    """A four-bar linkage at the end of a chain, whose links do not affect the loop."""
+    side = [Link("left", "link4", hinge("l", (0, 1, 0)), **BAR), Link("right", "link4", hinge("r", (0, 1, 0)), **BAR)]
+    links = [*pendulums(5), *side, Link("coupler", "left", hinge("c", (0, 1, 0)), (0, 0, -0.4), **BAR)]
+    sites = [Site("end", "coupler", (0.3, 0, 0.1)), Site("pin", "right", (0.3, 0, -0.3))]
+    system = mechanism(links, sites=sites, loops=[Loop("end", "pin")])
+    assert len(system.dependent_speeds) == 2
+    fields = [(name, info.positive, info.unit) for name, info in parameter_info(type(system)).items()]
+    loops = tuple(loop._replace(independent=(0, 1, 2)) for loop in system.structure.loops)
+    trial = _Trial(
+        system.structure._replace(loops=loops), tuple(fields), {name: getattr(system, name) for name, *_ in fields}
+    )
+    assert trial.closures[0].coordinates == ("l", "r", "c")
+    q = trial.start(None)
+    step = 1e-6 * np.random.default_rng(0).normal(size=q.shape)
+    change = trial.residuals(q + step) - trial.residuals(q - step)
+    np.testing.assert_allclose(trial.slopes(q) @ (2 * step), change, atol=1e-14)
 
 
 def test_a_loop_in_a_plane_that_ends_beside_its_beginning_is_refused():
@@ -516,6 +594,18 @@ def test_stops_are_contacts_of_a_mechanism():
 def test_stops_are_two_limits(stops):
     with pytest.raises(ValueError, match="stops of 'q' must be a lower and a larger upper limit"):
         hinge("q", stops=stops)
+
+
+def test_dry_friction_is_a_contact_of_a_mechanism():
+    arm = mechanism(pendulums(2, friction=0.3))
+    assert parameters_of(arm, ["friction.q0"]).units == ("N m",)
+    contacts = arm.replace({"friction.q1": 0.4}).contacts(0.0, [0.1, 0.3], [1.0, 2.0], None)
+    assert {name: (float(x.slip), float(x.kinetic)) for name, x in contacts.items()} == {
+        "q0 friction": (1.0, 0.3),
+        "q1 friction": (2.0, 0.4),
+    }
+    slider = mechanism([Link("cart", None, slide("x", friction=2.0), mass=1.0)])
+    assert parameters_of(slider, ["friction.x"]).units == ("N",)
 
 
 def test_a_mechanism_has_four_stops():

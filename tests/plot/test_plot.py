@@ -16,6 +16,7 @@ import pytest
 from systems import POSED, TRIAL, Track
 
 import jaxkane as jk
+from jaxkane._integrate.jumps import JumpTable
 from jaxkane._system.parameters import parameter_info
 from jaxkane._system.system import unit_of, units_of
 from jaxkane.plot._stability import stable_ranges
@@ -97,6 +98,31 @@ def test_trajectories_have_names_units_and_an_end(style):
     assert again is not axes
     assert all(a is b for a, b in zip(again, axes))
     assert axes[2].get_legend().get_texts()[-1].get_text() == "the other"
+
+
+def test_a_line_has_a_gap_at_each_jump():
+    """The values before and after it are those of the jump, not of the samples around it. A batch has its own jumps."""
+    at = np.array([[0.52, 1.0, np.nan], [1.27, np.nan, np.nan]])
+    before, after = (jk.State(sign * np.stack([at, at], axis=-1), (sign * at)[..., None]) for sign in (1.0, -1.0))
+    inputs = tuple({"steer_torque": sign * at} for sign in (2.0, 3.0))
+    events, count = np.where(np.isfinite(at), 0, -1), np.array([2, 1])
+    jumps = JumpTable(at, events, before, after, at, at[..., None], inputs, count, ("bump",))
+    rides = dataclasses.replace(
+        trajectory(status=np.array([0, 0]), t_end=np.array([2.0, 2.0]), batch=(2,)), jumps=jumps
+    )
+    axes = jk.plot.trajectories(rides, ["yaw_rate", "roll", "steer_torque"], degrees=True)
+    degrees = np.degrees((1.0, -1.0))
+    for ax, sides in zip(axes, (degrees, degrees, (2.0, 3.0))):
+        for k, line in enumerate(ax.lines):
+            t, y = (np.asarray(x) for x in line.get_data())
+            gaps = np.flatnonzero(np.isnan(y))
+            times = at[k, : count[k]]
+            np.testing.assert_array_equal(t[gaps[:, None] + np.arange(-1, 2)], np.repeat(times[:, None], 3, axis=1))
+            np.testing.assert_allclose(y[gaps - 1], sides[0] * times)
+            np.testing.assert_allclose(y[gaps + 1], sides[1] * times)
+            assert np.all(np.diff(t) >= 0)
+            assert len(t) == 41 + 3 * count[k]
+    plt.close("all")
 
 
 ODD = ("a$_{b$", "$c")

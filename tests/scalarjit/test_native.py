@@ -16,6 +16,7 @@ from jaxkane._kane.kanes_method import _motion_rates, motion_rates
 from jaxkane._scalarjit import program as programs
 from jaxkane._scalarjit.backends import llvm
 from jaxkane._scalarjit.backends import native as native_kernels
+from jaxkane._scalarjit.graph import depth_first, graph_of, needed, reads
 from jaxkane._scalarjit.program import Program
 from jaxkane._scalarjit.scalar_function import ScalarFunction
 
@@ -78,10 +79,12 @@ def test_a_member_does_not_depend_on_its_place():
 
 
 @pytest.mark.usefixtures("native")
+@pytest.mark.parametrize("long", [10_000, 3])
 @pytest.mark.parametrize("made", [ScalarFunction, ScalarFunction.compile_cheaply], ids=["optimized", "once"])
-def test_a_kernel_of_many_blocks(made, native, monkeypatch):
-    """What all lanes share, what differs from lane to lane, and both."""
+def test_a_kernel_of_many_blocks(made, long, native, monkeypatch):
+    """What all lanes share, what differs from lane to lane, and both; in the order of the program and depth first."""
     monkeypatch.setattr(llvm, "_BLOCK", 2)
+    monkeypatch.setattr(llvm, "_LONG", long)
 
     def f(a, x):
         shared = jnp.sin(a) * a[::-1] + a**2
@@ -94,6 +97,19 @@ def test_a_kernel_of_many_blocks(made, native, monkeypatch):
         jax.tree.map(lambda got, want: np.testing.assert_allclose(got, want, rtol=1e-14, atol=1e-14), found, expected)
     jax.tree.map(lambda got, want: np.testing.assert_allclose(got, want, rtol=1e-14), program(a, x[0]), f(a, x[0]))
     assert program.is_native(a, x[0])
+
+
+def test_the_order_depth_first():
+    """Two sums of products: each product is computed just before its sum, not all products first."""
+    program = jax.make_jaxpr(lambda a, b: (a * b, a * a, b * b, a * b + a * a, b * b + a))(1.0, 2.0)
+    graph, outputs = graph_of(program)
+    nodes = set(needed(graph.nodes, outputs))
+    order = depth_first(graph.nodes, nodes, [int(x) for x in (outputs[4], outputs[3])])
+    assert set(order) == nodes
+    assert len(order) == len(nodes)
+    place = {k: i for i, k in enumerate(order)}
+    assert all(place[i] < place[k] for k in nodes for i in reads(graph.nodes[k]))
+    assert place[int(outputs[4])] < place[int(outputs[0])]
 
 
 def test_batches_of_batches():

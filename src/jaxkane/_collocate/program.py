@@ -66,9 +66,11 @@ def _pattern(function: BlockFunction, data: Any, x: Array) -> Pattern:
     return Pattern(*(tuple(i.tolist()) for i in places))
 
 
-def _padded(size: int) -> int:
-    """The next power of two. Other numbers of intervals then use the same compiled program."""
-    return 1 << max(0, (size - 1).bit_length())
+def padded(x: Any) -> np.ndarray:
+    """Rows up to the next power of two: the last one is repeated. Other sizes then use the same compiled program."""
+    x = np.asarray(x)
+    more = (1 << max(0, (len(x) - 1).bit_length())) - len(x)
+    return np.concatenate([x, np.repeat(x[-1:], more, axis=0)]) if more else x
 
 
 class EvaluatedBlock:
@@ -76,13 +78,8 @@ class EvaluatedBlock:
 
     def __init__(self, block: Block, dtype: Any = jnp.float64):
         self.block, (self.B, n) = block, block.columns.shape
-        padded = _padded(self.B) - self.B
-
-        def with_padding(x: Any) -> np.ndarray:  # the last place is repeated
-            return np.concatenate([x, np.repeat(x[-1:], padded, axis=0)]) if padded else np.asarray(x)
-
-        self.data = jax.tree.map(lambda x: jnp.asarray(with_padding(np.asarray(x))), block.data)
-        self.columns = with_padding(block.columns)
+        self.data = jax.tree.map(lambda x: jnp.asarray(padded(x)), block.data)
+        self.columns = padded(block.columns)
         one = jax.tree.map(lambda x: jnp.asarray(x[0]), block.data), jnp.zeros(n, dtype)
         self.pattern = kept(_PATTERNS, (block.function, *one), lambda: _pattern(block.function, *one))
 
@@ -98,9 +95,9 @@ class EvaluatedBlock:
         """The entries (B, e) of the Hessian of the values weighted by `weights` (B, m)."""
         if not self.pattern.hessian_rows:
             return np.zeros((self.B, 0))
-        padded = np.zeros((len(self.columns), self.block.size))
-        padded[: self.B] = weights
-        entries = _hessian(self.block.function, self.pattern, self.data, x[self.columns], padded)
+        rows = np.zeros((len(self.columns), self.block.size))
+        rows[: self.B] = weights
+        entries = _hessian(self.block.function, self.pattern, self.data, x[self.columns], rows)
         return np.asarray(entries)[: self.B]
 
 

@@ -92,12 +92,14 @@ class Change(NamedTuple):
     - `delay` [s]: the rest of the bounces of a contact that rests now.
     - `impulses` (c, r): of the impact, zero without one [N s].
     - `is_determined`: whether the contact laws have a solution.
+    - `is_smooth`: whether derivatives afterwards are correct.
     """
 
     y: Array
     delay: Array
     impulses: Array
     is_determined: Array
+    is_smooth: Array
 
 
 def changed_contacts(
@@ -163,16 +165,23 @@ def changed_contacts(
     is_apart &= ~((fall > 0) & ((2.0 * rise < rest * fall) | (0.5 * rise**2 <= fall * (errors / 16))))
     candidates = takes_part & ~is_apart & ~event.opens & ~(is_impact & (hit.states == OPEN) & strikes & (e > 0))
     sticks = jnp.where(is_impact & ~bearing, hit.states == STICKS, jnp.zeros_like(closed))
+    delays = jnp.where(rests, bounces, 0.0)
     new, is_determined = _states_by_accelerations(
-        layout, after, memory, candidates, sticks, event, negligible, tolerances
+        layout, after, memory, candidates, sticks, event, negligible, tolerances, delays
     )
     u = projected_speeds(layout, after, new, u)
     n_q, n_u = len(system.coordinates), len(system.speeds)
     # Gaps of closed contacts drift by the error of the solver.
     q = without_gaps(after, takes_part & (event.touches | near | closed) & ~event.is_start, state.q)
     y = jnp.concatenate([q, u, y[n_q + n_u : y.size - layout.memory_size], new.packed()])
-    delay = jnp.max(jnp.where(rests & (new.states != OPEN), bounces, 0.0), initial=0.0)
-    return Change(y, delay, impulses, is_determined & (~is_impact | hit.determined))
+    delay = jnp.max(jnp.where(new.states != OPEN, delays, 0.0), initial=0.0)
+    is_smooth = jnp.array(True)
+    if layout.d == 2:
+        # A slip that begins without an acceleration is stiff. The error estimate does not contain the derivatives:
+        # those of a particle were 21 instead of 3.
+        begins = (new.slow[:, 0] > 0) & (memory.states != SLIDES)
+        is_smooth = ~jnp.any(begins & (after.laws.static <= after.laws.friction))
+    return Change(y, delay, impulses, is_determined & (~is_impact | hit.determined), is_smooth)
 
 
 def _negligible(terms: ContactTerms) -> Array:
@@ -197,6 +206,7 @@ def _states_by_accelerations(
     event: ContactEvent,
     negligible: Array,
     tolerances: tuple[Any, Any],
+    delays: Array,
 ) -> tuple[ContactMemory, Array]:
     """The contact states between jumps, and whether the contact laws have a solution.
 
@@ -205,10 +215,11 @@ def _states_by_accelerations(
     - `terms`: after the impact. `memory`: before it.
     - `candidates` (c,): contacts that neither approach nor separate. `sticks` (c,): those that stick after the impact.
     - `event`, `tolerances`: see `changed_contacts`. `negligible` (c, r): velocities that are rounding errors.
+    - `delays` (c,): the times that pass before contacts rest [s].
     """
     bearing, G, a, kinetic, d = jnp.asarray(layout.is_bearing), terms.delassus, terms.a, terms.laws.friction, layout.d
     candidates, known, directions = candidates | bearing, None, memory.directions
-    is_still = slip = jnp.zeros(0)
+    is_still = slip = stops = slow = jnp.zeros(0)
     if d:
         # A bearing is a contact with a normal force of its own: G_NN = 1 and a_N = -(the largest friction).
         corner = np.zeros((1 + d, 1 + d))
@@ -224,12 +235,14 @@ def _states_by_accelerations(
         rtol, atol = tolerances
         errors = atol * jnp.sum(jnp.abs(terms.C), axis=1).reshape(terms.v.shape) + rtol * terms.size
         is_slow = speed <= 100 * jnp.sum(errors[:, 1:], axis=1)
+        slow = jnp.sum(errors[:, 1:], axis=1) / jnp.sqrt(jnp.maximum(rtol, float(jnp.finfo(v.dtype).eps)))
         if d == 2:
             # In space, the slip need not vanish where its component along its first direction does.
             stops &= is_slow
         # Both corners of a block stop at the same time.
         stops |= jnp.any(stops) & is_slow & (memory.states == SLIDES) & ~bearing
         is_still = stops | sticks | (speed <= jnp.max(negligible[:, 1:], axis=1))
+        is_still |= _stops_within(delays, terms, jax.lax.stop_gradient(v), speed)
         # If one corner of a block is at its limit, both slip when the other one reaches its limit.
         slips = event.slips | (jnp.any(event.slips) & (memory.states == SLIDES) & is_still & ~stops)
         slip = v / jnp.where(is_still, 1.0, jnp.where(speed > 0, speed, 1.0))[:, None]
@@ -251,7 +264,27 @@ def _states_by_accelerations(
         else:
             signs = jnp.sign(start[:, :1]) * np.array([[1.0, 0.0, 0.0]])
             directions = jnp.where(bearing[:, None], signs, jnp.sum(start[:, :, None] * terms.tangents, axis=1))
-    return ContactMemory(states, directions), found.determined
+    kept = memory.slow
+    if d == 2:
+        goes_on = (memory.states == SLIDES) & ~event.stops
+        kept = jnp.where(is_still, slow, jnp.where(goes_on, memory.slow[:, 0], 0.0))
+        kept = jax.lax.stop_gradient(jnp.where((states == SLIDES) & ~bearing, kept, 0.0))[:, None]
+    return ContactMemory(states, directions, kept), found.determined
+
+
+def _stops_within(delays: Array, terms: ContactTerms, v: Array, speed: Array) -> Array:
+    """Whether the slip `v` (c, d) of each contact vanishes within the time that passes before the contact rests (c,).
+
+    Otherwise the slip would be reversed after this time by up to 1e-7 m/s, and no event function would cross zero.
+    """
+    n, G, a = len(speed), terms.delassus, terms.a
+    own = jnp.stack([G[i, :, i] for i in range(n)])  # (c, r, r): the other contacts are neglected
+    way = v / jnp.where(speed > 0, speed, 1.0)[:, None]
+    # F_T = -mu F_N way,  v_N_dot = 0
+    push = own[:, :, 0] - terms.laws.friction[:, None] * jnp.sum(own[:, :, 1:] * way[:, None, :], axis=2)
+    normal = -a[:, 0] / jnp.where(push[:, 0] > 0, push[:, 0], 1.0)
+    slows = jnp.sum(way * (a[:, 1:] + push[:, 1:] * normal[:, None]), axis=1)
+    return (delays > 0) & (push[:, 0] > 0) & (speed + slows * delays <= 0)
 
 
 def _unit_rows(x: Array) -> Array:

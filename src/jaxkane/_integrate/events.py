@@ -473,9 +473,18 @@ def next_point(system: System, origin, point: EventPoint, y_dot, read_rates, rea
 
 
 def moved_to_event(
-    quantities: EventValues, point: EventPoint, y_dot: Array, reach: Array, which: Array, happened: Array
+    quantities: EventValues,
+    point: EventPoint,
+    y_dot: Array,
+    reach: Array,
+    which: Array,
+    happened: Array,
+    instant: Array | float = 0.0,
 ) -> EventPoint:
-    """`next_point`, with the event functions at the point."""
+    """`next_point`, with the event functions at the point.
+
+    `instant`: a gap of the size of its rounding errors may vanish within this time of the point [s].
+    """
     g, g_dot = quantities.values[0], quantities.rates[0]
     for i in range(1, len(quantities.values)):
         g, g_dot = (jnp.where(which == i, x[i], x0) for x, x0 in ((quantities.values, g), (quantities.rates, g_dot)))
@@ -483,8 +492,11 @@ def moved_to_event(
     limit = jnp.abs(g_dot) * reach
     if quantities.noise is not None:
         noise = sum(jnp.where(which == i, x, 0.0) for i, x in enumerate(quantities.noise))
-        limit += jnp.minimum(2 * noise, 1e6 * limit)
+        # `reach` is proportional to the time. At the start it is 1e-27 s, and a gap of 4e-17 m would be too far away.
+        limit += jnp.minimum(2 * noise, 1e6 * limit + jnp.abs(g_dot) * instant)
     is_small = jnp.abs(g) <= limit
     moves = happened & is_small & (g_dot != 0)
     step = jnp.where(moves, -g / jnp.where(moves, g_dot, jnp.ones_like(g_dot)), jnp.zeros_like(g))
-    return EventPoint(point.t + step, point.y + step * y_dot, step, point.smooth & is_small)
+    t = point.t + step
+    t = jnp.where(t < 0, t - jax.lax.stop_gradient(t), t)  # no step can begin before the start
+    return EventPoint(t, point.y + step * y_dot, step, point.smooth & is_small)

@@ -275,7 +275,7 @@ class Problem(NamedTuple):
             read = y_dot if self.events.read_rates else None
             if self.events.layout.names:
                 quantities = self.event_values(point.t, point.y, args, y_dot)
-                return moved_to_event(quantities, point, y_dot, reach, event, happened)
+                return moved_to_event(quantities, point, y_dot, reach, event, happened, REST * self.taus[-1])
             return next_point(args.system, args.origin, point, y_dot, read, reach, event, happened)
 
         near = stepped(EventPoint(t, y, jnp.zeros_like(t), jnp.array(True)))
@@ -346,6 +346,7 @@ class Problem(NamedTuple):
         after = change.y + change.delay * self.rates()(jump.t, change.y, args)
         is_finite = jnp.all(jnp.isfinite(after))
         status = jnp.where(change.is_determined & is_finite, jump.status, float(Status.UNDETERMINED_CONTACT))
+        jump = jump._replace(smooth=jnp.where(change.is_smooth, jump.smooth, jnp.zeros_like(jump.smooth)))
         return jump._replace(t=jump.t + change.delay, after=after, impulses=change.impulses.reshape(-1), status=status)
 
     def _changed_contacts(self, t: Array, y: Array, what: ContactEvent, reach: Array) -> Change:

@@ -21,6 +21,7 @@ from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
 from .._system.system import NamedVector, State, System, has_outputs, packed, unpacked
 from .arguments import Inputs, Row, as_row, inputs_of
+from .constraint_residuals import configuration_residual
 from .contact import forces_in_contact, has_multipliers, layout_of
 from .description import jvp
 from .kanes_method import KaneEquations, motion_rates
@@ -305,6 +306,17 @@ def reads_time(system: System, dtype: Any) -> bool:
     if has_outputs(system):
         programs.append(_outputs_at.program(system, t, q, u, values_of(system, x, {}), u)[1])
     return any(program is None or program.reads[place] for program in programs)
+
+
+def parameters_read(system: System) -> list[bool]:
+    """For each leaf of a system, whether the right-hand side or the configuration constraints depend on it. True if
+    they are not programs of scalars."""
+    q, u, x = (jnp.zeros(len(names)) for names in (system.coordinates, system.speeds, system.states))
+    t, n = jnp.zeros(()), len(jax.tree.leaves(system))
+    programs = [_vector_field.program(system, t, packed(State(q, u, x)), {})[1]]
+    if jax.eval_shape(configuration_residual, system, t, q).size:  # a program without numbers seems to read the first
+        programs.append(configuration_residual.program(system, t, q)[1])
+    return [any(program is None or program.reads[i] for program in programs) for i in range(n)]
 
 
 def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dict[str, Any]:

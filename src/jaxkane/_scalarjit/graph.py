@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -322,6 +322,27 @@ def _reduced(
     for axis in sorted(axes, reverse=True):
         x = functools.reduce(lambda a, b: each(operation, a, b), [*first, *np.moveaxis(x, axis, 0)])
     return x
+
+
+def depth_first(nodes: Sequence[Node], within: Set[int], roots: Iterable[int]) -> list[int]:
+    """The nodes of a set in an order in which each follows its operands closely, so that few values are alive at once.
+
+    **Arguments:**
+
+    - `nodes`: all nodes of the graph.
+    - `within`: those to order.
+    - `roots`: nodes that are computed first, with their operands.
+    """
+    ordered: dict[int, None] = {}
+    waiting = [*sorted(within, reverse=True), *reversed([k for k in roots if k in within])]
+    while waiting:
+        k = waiting[-1]
+        missing = [i for i in reads(nodes[k]) if i in within and i not in ordered]
+        if missing and k not in ordered:
+            waiting += reversed(missing)
+        else:
+            ordered.setdefault(waiting.pop())
+    return list(ordered)
 
 
 def needed(nodes: Sequence[Node], outputs: Iterable[np.ndarray]) -> list[int]:

@@ -312,8 +312,7 @@ class Frame:
         angle, rate = component(angle), component(rate)
         if isinstance(axis, Vector):
             direction = axis.normalize().components_in(self)
-            c, s = jnp.cos(angle), jnp.sin(angle)
-            rotation = rotations.rodrigues_matrix(direction, c, s)
+            rotation = rotations.rodrigues_matrix(direction, *rotations.cosine_and_sine(angle))
         else:
             if isinstance(axis, bool) or not isinstance(axis, (int, np.integer)) or axis not in (1, 2, 3):
                 raise ValueError(

@@ -35,3 +35,4 @@ from .slider_crank_with_clearance import SliderCrankWithClearance as SliderCrank
 from .slider_with_pinned_bar import SliderWithPinnedBar as SliderWithPinnedBar
 from .spatial_double_pendulum import SpatialDoublePendulum as SpatialDoublePendulum
 from .spinning_top import SpinningTop as SpinningTop
+from .woodpecker import Woodpecker as Woodpecker

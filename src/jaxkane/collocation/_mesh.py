@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._collocate.functions import Integrand
 from .._collocate.lobatto import Lobatto
-from .._collocate.program import Block, EvaluatedBlock
+from .._collocate.program import Block, EvaluatedBlock, padded
 from .._collocate.transcription import Layout, Motion
 from .._integrate.simulate import simulate
 from .._scalarjit.cache import Cache
@@ -185,7 +185,7 @@ def quadrature_errors(layout: Layout, x: np.ndarray, motion: Motion, method: Lob
         return np.zeros(len(layout.mesh) - 1)
     points, weights = np.polynomial.legendre.leggauss(2 * len(method.c))
     steps = np.diff(layout.mesh)
-    inside = (layout.mesh[:-1, None] + steps[:, None] * (points + 1) / 2).ravel()
+    inside = (padded(layout.mesh[:-1])[:, None] + padded(steps)[:, None] * (points + 1) / 2).ravel()
     fine = interpolated(motion, layout.mesh, method, inside)
 
     def values(s: np.ndarray, motion: Motion) -> np.ndarray:
@@ -198,5 +198,5 @@ def quadrature_errors(layout: Layout, x: np.ndarray, motion: Motion, method: Lob
     at_nodes, every = values(layout.s, motion), len(method.c) - 1
     inside_nodes = (np.arange(len(steps)) * every)[:, None] + np.arange(every + 1)
     coarse = at_nodes[inside_nodes] @ method.b
-    exact = values(inside, fine).reshape(len(steps), -1) @ (weights / 2)
+    exact = (values(inside, fine).reshape(-1, len(weights)) @ (weights / 2))[: len(steps)]
     return np.abs(exact - coarse) * steps

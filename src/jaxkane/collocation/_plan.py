@@ -14,6 +14,7 @@ import scipy.linalg
 from jaxtyping import Array, Float
 
 from .._collocate.lobatto import Lobatto
+from .._collocate.program import padded
 from .._collocate.transcription import Motion
 from .._integrate.simulate import simulate
 from .._integrate.status import Status
@@ -22,6 +23,7 @@ from .._kane.api import _dependent_speeds
 from .._kane.constraint_residuals import configuration_residual
 from .._kane.right_hand_side import outputs_at, values_of, vector_field
 from .._scalarjit.cache_key import jit
+from .._scalarjit.compat import on_device
 from .._system.prints import wrapped
 from .._system.system import State, System, has_outputs, names_of, units_of, unpacked
 from ._mesh import ControlPolynomial, coefficients_of, interpolated, with_controls, without_events
@@ -327,16 +329,16 @@ def _drift(system: System, t: Array, q: Array) -> Array:
 def trajectory_of(system: System, problem: Problem, motion: Motion, origin: float = 0.0) -> Trajectory:
     """A motion as a `Trajectory` at its nodes."""
     t = origin + motion.s * motion.duration
-    q, u, x, u_dep, inputs, outputs = _along(
-        system, problem.signals, tuple(problem.bounds_of_controls), jnp.asarray(t), motion.Y, motion.W
-    )
+    controls = tuple(problem.bounds_of_controls)
+    along = _along(system, problem.signals, controls, *(padded(a) for a in (t, motion.Y, motion.W)))
+    q, u, x, u_dep, inputs, outputs = jax.tree.map(lambda a: on_device(np.asarray(a)[: len(t)]), along)
     count = jnp.asarray(0)
-    end = State(q[-1], u[-1], x[-1] if system.states else None)
+    ends = (on_device(np.asarray(a)[-1]) for a in ((q, u, x) if system.states else (q, u)))
     return Trajectory(
-        t=jnp.asarray(t), q=q, u=u, u_dep=u_dep, x=x, inputs=inputs, outputs=outputs,
-        status=jnp.asarray(int(Status.COMPLETED)), t_end=jnp.asarray(t[-1]),
+        t=on_device(t), q=q, u=u, u_dep=u_dep, x=x, inputs=inputs, outputs=outputs,
+        status=jnp.asarray(int(Status.COMPLETED)), t_end=on_device(t[-1]),
         stats={"steps": count, "accepted": count, "rejected": count}, names=names_of(system), events=(),
-        adjoint="none", units=tuple(units_of(system).items()), end=end,
+        adjoint="none", units=tuple(units_of(system).items()), end=State(*ends),
     )  # fmt: skip
 
 

@@ -1,29 +1,38 @@
-"""MJCF and URDF files as mechanisms of joints. MuJoCo compiles them; it is not needed afterwards."""
+"""MJCF files as mechanisms of joints. MuJoCo compiles them; it is not needed afterwards."""
 
 from __future__ import annotations
 
 import os
-import re
-import warnings
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Sequence
-from pathlib import Path as FilePath
+from collections.abc import Iterator, Mapping, Sequence
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from ..joints import Actuator, Coupling, Joint, Link, Loop, Mechanism, Site, ball, free, hinge, mechanism, slide
-
-Path = str | os.PathLike[str]
+from ._reading import (
+    Path,
+    Selection,
+    check_distinct,
+    check_exists,
+    is_text,
+    report_left_out,
+    selected,
+    unused_name,
+    unused_names,
+    without_dots,
+)
 
 
 def from_mjcf(
     model: Path,
     *,
     strict: bool = False,
-    stops: Sequence[str] | Literal[True] = (),
+    stops: Selection = (),
+    friction: Selection = (),
     dependent: Sequence[str] | None = None,
+    independent: Sequence[str] = (),
+    pose: str | Mapping[str, float] | None = None,
     name: str | None = None,
 ) -> Mechanism:
     """The mechanism of an MJCF file.
@@ -43,58 +52,28 @@ def from_mjcf(
     - `stops`: names of hinges and sliders whose limits become contacts without restitution, `NAME lower` and
         `NAME upper`, with the parameters `lower.NAME`, `upper.NAME`. True: all that have a range. At most four contacts
         are possible, so name the joints that reach their limits.
+    - `friction`: names of hinges and sliders whose `frictionloss` becomes dry friction, the contact `NAME friction`
+        with the parameter `friction.NAME`. True: all that have friction.
     - `dependent`: hinges and sliders that are solved for in closed loops, as in `jaxkane.joints.mechanism`.
+    - `independent`: joints that are not solved for, e.g. those with motors.
+    - `pose`: where loops are closed approximately: the name of a key frame, "qpos0", or coordinates by name.
+        Independent residuals and dependent joints are chosen there.
     - `name`: of the class; the model's name by default.
 
     **Returns:** a `jaxkane.joints.Mechanism` with the names of the file. Its coordinates are `qpos`, except for the
     order of the Euler parameters, which are scalar-last here. Its speeds are `qvel`, its inputs `ctrl`. A dot in a name
     becomes an underscore. An actuator or a site whose name is already used gets the suffix `_input` or `_site`. Masses
-    and inertias are those that MuJoCo compiles, also from geoms and meshes.
+    and inertias are those that MuJoCo compiles, also from geoms and meshes. `poses` has the coordinates `qpos0` and
+    those of the key frames, from which `jk.assemble(system, system.poses["qpos0"])` starts.
 
     **Raises:** `ImportError` without MuJoCo; `ValueError` for a file that MuJoCo cannot read, one without a moving
     body, two names that differ only by a dot, `stops` without a limit, more than four contacts, and with `strict` for
     unsupported elements.
     """
     mujoco = _mujoco()
-    return _ModelReader(mujoco, _compiled(mujoco, model), name, stops).mechanism(strict, dependent)
-
-
-def from_urdf(
-    model: Path,
-    *,
-    floating: bool = False,
-    strict: bool = False,
-    stops: Sequence[str] | Literal[True] = (),
-    gravity: Any = (0.0, 0.0, -9.81),
-    dependent: Sequence[str] | None = None,
-    name: str | None = None,
-) -> Mechanism:
-    """The mechanism of a URDF file, with the names of its links and joints.
-
-    A link without an `inertial` has no mass, whatever its shapes. `mimic` becomes a coupling. Joint damping is
-    supported.
-
-    **Arguments:**
-
-    - `floating`: the root link moves freely, by a free joint named `root`. Default: it is fixed to the ground.
-    - `gravity` (3,) [m/s^2]: in the inertial frame.
-    - the others as in `from_mjcf`.
-
-    **Returns:** as `from_mjcf`.
-
-    **Raises:** as `from_mjcf`.
-    """
-    mujoco = _mujoco()
-    text = str(model) if _is_text(model) else FilePath(model).read_text(encoding="utf-8")
-    robot = _robot_of(text)
-    couplings = _mimics(robot)
-    has_friction = any(float(dynamics.get("friction", 0.0)) for dynamics in robot.findall("joint/dynamics"))
-    compiled = _compiled(mujoco, _for_mujoco(text, floating))
-    reader = _ModelReader(mujoco, compiled, name or robot.get("name"), stops)
-    reader.gravity = gravity
-    reader.left_out += ["friction of joints"] * has_friction
-    reader.loops += couplings
-    return reader.mechanism(strict, dependent)
+    return _ModelReader(mujoco, _compiled(mujoco, model), name, stops, friction).mechanism(
+        strict, dependent, independent, pose
+    )
 
 
 def _mujoco() -> ModuleType:
@@ -102,101 +81,28 @@ def _mujoco() -> ModuleType:
         import mujoco  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError(
-            "Reading MJCF and URDF files needs MuJoCo: `pip install mujoco`, or `pip install 'jaxkane[mujoco]'`."
+            "Reading MJCF files needs MuJoCo: `pip install mujoco`, or `pip install 'jaxkane[mujoco]'`."
         ) from error
     return mujoco
 
 
-def _is_text(model: Path) -> bool:
-    return isinstance(model, str) and model.lstrip().startswith("<")
-
-
 def _compiled(mujoco: ModuleType, model: Path) -> Any:
-    is_text = _is_text(model)
-    if not is_text and not os.path.exists(model):
-        raise FileNotFoundError(f"The file {os.fspath(model)!r} does not exist. The text of a model begins with '<'.")
+    from_text = is_text(model)
+    if not from_text:
+        check_exists(model)
     try:
-        spec = mujoco.MjSpec.from_string(model) if is_text else mujoco.MjSpec.from_file(os.fspath(model))
+        spec = mujoco.MjSpec.from_string(model) if from_text else mujoco.MjSpec.from_file(os.fspath(model))
         spec.compiler.fusestatic = False
         return spec.compile()
     except ValueError as error:
-        where = "the text" if is_text else repr(os.fspath(model))
+        where = "the text" if from_text else repr(os.fspath(model))
         raise ValueError(f"MuJoCo cannot read {where}: {error}") from error
-
-
-def _robot_of(text: str) -> ElementTree.Element:
-    try:
-        robot = ElementTree.fromstring(re.sub(r"<(/?)\w+:", r"<\1", text))  # extensions with an undeclared prefix
-    except ElementTree.ParseError as error:
-        raise ValueError(f"The model is not a URDF: {error}.") from error
-    if robot.tag != "robot":
-        raise ValueError(f"The model is not a URDF: its root must be <robot>, got <{robot.tag}>.")
-    return robot
-
-
-def _for_mujoco(text: str, floating: bool) -> str:
-    """Remove shapes, because a URDF's masses do not depend on them, and connect the root link to the ground."""
-    robot = _robot_of(text)
-    links = [link.get("name", "") for link in robot.findall("link")]
-    children = [child.get("link") for child in robot.findall("joint/child")]
-    roots = [name for name in links if name not in children]
-    if len(roots) != 1:
-        raise ValueError(f"A URDF must have one root link; this one has {', '.join(roots) or 'none'}.")
-    for part in list(robot):
-        if part.tag not in ("link", "joint"):
-            robot.remove(part)
-    for link in robot.findall("link"):
-        for shape in [*link.findall("visual"), *link.findall("collision")]:
-            link.remove(shape)
-    for inertial in robot.findall("link/inertial"):
-        _turn_back(inertial)
-    if floating or roots[0] != "world":
-        if "world" in links:
-            why = "is the ground: omit floating=True" if roots[0] == "world" else "is not the root: rename it"
-            raise ValueError(f"The link 'world' of a URDF {why}.")
-        ElementTree.SubElement(robot, "link", name="world")
-        joint = ElementTree.SubElement(robot, "joint", name="root", type="floating" if floating else "fixed")
-        ElementTree.SubElement(joint, "parent", link="world")
-        ElementTree.SubElement(joint, "child", link=roots[0])
-    compiler = ElementTree.SubElement(ElementTree.SubElement(robot, "mujoco"), "compiler")
-    compiler.attrib |= {"fusestatic": "false", "balanceinertia": "false", "discardvisual": "false"}
-    return ElementTree.tostring(robot, encoding="unicode")
-
-
-def _turn_back(inertial: ElementTree.Element) -> None:
-    """Resolve an inertia along the link's axes, because some versions of MuJoCo ignore the angles of its frame."""
-    origin, tensor = inertial.find("origin"), inertial.find("inertia")
-    angles = [float(x) for x in origin.get("rpy", "0 0 0").split()] if origin is not None else []
-    if origin is None or tensor is None or not any(angles):
-        return
-    c, s = np.cos(angles), np.sin(angles)
-    about_x = np.array([[1, 0, 0], [0, c[0], -s[0]], [0, s[0], c[0]]])
-    about_y = np.array([[c[1], 0, s[1]], [0, 1, 0], [-s[1], 0, c[1]]])
-    about_z = np.array([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
-    R = about_z @ about_y @ about_x
-    I = np.array([[float(tensor.get(f"i{min(a, b)}{max(a, b)}", 0.0)) for b in "xyz"] for a in "xyz"])
-    turned = R @ I @ R.T
-    for i, a in enumerate("xyz"):
-        for j, b in enumerate("xyz"[i:], start=i):
-            tensor.set(f"i{a}{b}", repr(float(turned[i, j])))
-    origin.set("rpy", "0 0 0")
-
-
-def _mimics(robot: ElementTree.Element) -> list[Loop | Coupling]:
-    couplings: list[Loop | Coupling] = []
-    for joint in robot.findall("joint"):
-        mimic = joint.find("mimic")
-        if mimic is not None:
-            numbers = float(mimic.get("offset", 0.0)), float(mimic.get("multiplier", 1.0))
-            names = [str(x).replace(".", "_") for x in (joint.get("name"), mimic.get("joint"))]
-            couplings.append(Coupling(names[0], names[1], numbers))
-    return couplings
 
 
 class _ModelReader:
     """Reads a compiled model into links, sites, actuators and loops of a mechanism, and lists omitted elements."""
 
-    def __init__(self, mujoco: ModuleType, model: Any, name: str | None, stops: Sequence[str] | Literal[True]):
+    def __init__(self, mujoco: ModuleType, model: Any, name: str | None, stops: Selection, friction: Selection):
         self.m, self.kinds = model, mujoco
         self.name = name or _model_name(model) or "Mechanism"
         self.left_out: list[str] = []
@@ -206,6 +112,7 @@ class _ModelReader:
         self.bodies = self._names("body", model.nbody)
         self.joints = self._names("joint", model.njnt)
         self.stops = self._joints_with_stops(stops)
+        self.friction = self._joints_with_friction(friction)
         self.sites: list[Site] = []
         self.loops: list[Loop | Coupling] = []
 
@@ -215,63 +122,53 @@ class _ModelReader:
         return any(int(self.m.opt.disableflags) & bit for bit in bits)
 
     def _names(self, kind: str, n: int) -> list[str]:
-        """The file's names. Elements without a name are numbered, without using these names.
-
-        **Raises:** `ValueError` for two names that become equal, because parts could then not be distinguished.
-        """
+        """The file's names. Elements without a name are numbered, without using these names."""
         given = [getattr(self.m, kind)(i).name for i in range(n)]
-        names = [name.replace(".", "_") for name in given]
-        for i, name in enumerate(names):
-            if name and name in names[:i]:
-                raise ValueError(
-                    f"{self.name}: the {_PLURALS.get(kind, kind + 's')} {given[names.index(name)]!r} and {given[i]!r} "
-                    f"would both be {name!r}, because a dot becomes an underscore. Rename one in the file."
-                )
+        check_distinct(self.name, _PLURALS.get(kind, kind + "s"), given)
+        names = [without_dots(name) for name in given]
         for i, name in enumerate(names):
             if not name:
-                names[i] = _unused_name(f"{kind}{i}", names, "_")
+                names[i] = unused_name(f"{kind}{i}", names, "_")
         return names
 
-    def _joints_with_stops(self, stops: Sequence[str] | Literal[True]) -> list[str]:
+    def _joints_with_stops(self, stops: Selection) -> list[str]:
         """The names of the joints whose limits become contacts."""
-        types, m = self.kinds.mjtJoint, self.m
-        with_axis = int(types.mjJNT_HINGE), int(types.mjJNT_SLIDE)
-        limited = [] if self._is_off("LIMIT", "CONSTRAINT") else range(m.njnt)
-        limited = [self.joints[j] for j in limited if m.jnt_limited[j] and int(m.jnt_type[j]) in with_axis]
-        if stops is True:
-            return limited
-        if isinstance(stops, str):
-            raise TypeError(f"{self.name}: `stops` must be a list of names, e.g. [{stops!r}]; got {stops!r}.")
-        names = [name.replace(".", "_") for name in stops]
-        wrong = [name for name in names if name not in limited]
-        if wrong:
-            raise ValueError(
-                f"{self.name}: `stops` contains {wrong[0]!r}, which is not a hinge or a slider with a range. Those "
-                f"with a range are: {', '.join(limited) or 'none'}."
-            )
-        return names
+        m = self.m
+        limited = [] if self._is_off("LIMIT", "CONSTRAINT") else self._with_axis()
+        limited = [self.joints[j] for j in limited if m.jnt_limited[j]]
+        return selected("stops", stops, limited, "a range", self.name)
 
-    def mechanism(self, strict: bool, dependent: Sequence[str] | None) -> Mechanism:
+    def _joints_with_friction(self, friction: Selection) -> list[str]:
+        """The names of the joints whose friction becomes dry friction."""
+        m = self.m
+        rough = [] if self._is_off("FRICTIONLOSS", "CONSTRAINT") else self._with_axis()
+        rough = [self.joints[j] for j in rough if m.dof_frictionloss[m.jnt_dofadr[j]]]
+        return selected("friction", friction, rough, "friction", self.name)
+
+    def _with_axis(self) -> list[int]:
+        types = self.kinds.mjtJoint
+        return [j for j in range(self.m.njnt) if int(self.m.jnt_type[j]) in (types.mjJNT_HINGE, types.mjJNT_SLIDE)]
+
+    def mechanism(
+        self,
+        strict: bool,
+        dependent: Sequence[str] | None,
+        independent: Sequence[str],
+        pose: str | Mapping[str, float] | None,
+    ) -> Mechanism:
         m = self.m
         if not m.nv:
             raise ValueError(f"{self.name}: the file has no joint, so nothing can move.")
         links = [self._link(i) for i in range(1, m.nbody)]
         used = {*self.bodies, *(f"{j} joint" for j in self.joints)}
-        for i, name in enumerate(_unused_names(self._names("site", m.nsite), used, "_site")):
+        for i, name in enumerate(unused_names(self._names("site", m.nsite), used, "_site")):
             self.sites.append(
                 Site(name, self._carrier(m.site_bodyid[i]), _floats(m.site_pos[i]), _euler(m.site_quat[i]))
             )
         self._read_equalities({*used, *(site.name for site in self.sites)})
         actuators = list(self._actuators())
         self.left_out += self._left_out_effects()
-        left_out = tuple(dict.fromkeys(self.left_out))
-        if left_out:
-            listed = "; ".join(left_out)
-            if strict:
-                raise ValueError(
-                    f"{self.name}: these elements are not supported: {listed}. Pass strict=False to omit them."
-                )
-            warnings.warn(f"{self.name}: omitted, because not supported: {listed}.", UserWarning, stacklevel=3)
+        left_out = report_left_out(self.name, self.left_out, strict, stacklevel=3)
         return mechanism(
             links,
             gravity=self.gravity,
@@ -279,9 +176,37 @@ class _ModelReader:
             sites=self.sites,
             loops=self.loops,
             dependent=dependent,
+            independent=[without_dots(joint) for joint in independent],
+            pose=self._pose(pose),
+            poses=self._poses(),
             name=self.name,
             left_out=left_out,
         )
+
+    def _poses(self) -> dict[str, dict[str, float]]:
+        """The coordinates of the file and of its key frames, by name."""
+        rows = [self.m.qpos0, *self.m.key_qpos]
+        return dict(zip(["qpos0", *self._names("key", self.m.nkey)], map(self._coordinates, rows), strict=True))
+
+    def _coordinates(self, qpos: np.ndarray) -> dict[str, float]:
+        types, values = self.kinds.mjtJoint, {}
+        for j, name in enumerate(self.joints):
+            own = qpos[int(self.m.jnt_qposadr[j]) :]
+            if int(self.m.jnt_type[j]) in (types.mjJNT_HINGE, types.mjJNT_SLIDE):
+                values[name] = float(own[0])
+                continue
+            start = 3 if int(self.m.jnt_type[j]) == types.mjJNT_FREE else 0
+            values |= {f"{name}_{x}": float(own[i]) for i, x in enumerate("xyz"[:start])}
+            values |= {f"{name}_e{i + 1}": x for i, x in enumerate(_euler(own[start : start + 4]))}
+        return values
+
+    def _pose(self, pose: str | Mapping[str, float] | None) -> Mapping[str, float] | None:
+        if not isinstance(pose, str):
+            return pose
+        poses = self._poses()
+        if pose not in poses:
+            raise ValueError(f"{self.name}: `pose` is {pose!r}, but the poses of the file are {', '.join(poses)}.")
+        return poses[pose]
 
     def _carrier(self, body: int) -> str | None:
         return None if body == 0 else self.bodies[body]
@@ -319,6 +244,7 @@ class _ModelReader:
             common |= {"reference": float(m.qpos0[place])}
             common |= {"rest": float(m.qpos_spring[place])} if common["stiffness"] else {}
             common |= {"stops": _floats(m.jnt_range[j])} if name in self.stops else {}
+            common |= {"friction": float(m.dof_frictionloss[dof])} if name in self.friction else {}
             if kind == int(types.mjJNT_SLIDE):
                 return slide(name, _floats(m.jnt_axis[j]), **common)
             return hinge(name, _floats(m.jnt_axis[j]), anchor=_floats(m.jnt_pos[j]), **common)
@@ -338,7 +264,7 @@ class _ModelReader:
             if m.jnt_type[j] in (int(kinds.mjtJoint.mjJNT_HINGE), int(kinds.mjtJoint.mjJNT_SLIDE)):
                 used.add(f"{name}_rate")
         names = self._names("actuator", int(m.nu))
-        for i, name in enumerate([] if self._is_off("ACTUATION") else _unused_names(names, used, "_input")):
+        for i, name in enumerate([] if self._is_off("ACTUATION") else unused_names(names, used, "_input")):
             group = int(m.actuator_group[i])
             if 0 <= group <= 30 and int(m.opt.disableactuator) >> group & 1:
                 continue
@@ -410,7 +336,7 @@ class _ModelReader:
             turned = (_euler(data[6:10]), None) if rigid else (None, None)
             names = []
             for k, (body, place, orientation) in enumerate(zip((first, second), ends, turned, strict=True)):
-                end = _unused_name(f"{name}_{k + 1}", used, "_end")
+                end = unused_name(f"{name}_{k + 1}", used, "_end")
                 used.add(end)
                 names.append(end)
                 self.sites.append(Site(end, self._carrier(body), _floats(place), orientation))
@@ -442,7 +368,7 @@ class _ModelReader:
         effects = {
             "contacts": (collides or m.npair > 0) and not off("CONTACT"),
             "limits of joints": np.sum(m.jnt_limited) > len(self.stops) and not off("LIMIT"),
-            "friction of joints": has("dof_frictionloss") and not off("FRICTIONLOSS"),
+            "friction of joints": np.count_nonzero(m.dof_frictionloss) > len(self.friction) and not off("FRICTIONLOSS"),
             "limits of controls and forces": has("jnt_actfrclimited") and m.nu > 0,
             "tendons": m.ntendon > 0,
             "nonlinear damping or stiffness": any(has(n) for n in ("dof_dampingpoly", "jnt_stiffnesspoly")),
@@ -459,17 +385,6 @@ class _ModelReader:
 def _model_name(model: Any) -> str:
     name = bytes(model.names[:200]).split(b"\0", 1)[0].decode("utf-8", "replace")
     return "" if name == "MuJoCo Model" else name  # the name of a file without a name
-
-
-def _unused_name(name: str, used: Any, ending: str) -> str:
-    while name in used:
-        name += ending
-    return name
-
-
-def _unused_names(names: Sequence[str], used: Any, ending: str) -> list[str]:
-    """The names; a name that is already used gets a suffix that makes it unique."""
-    return [_unused_name(name + ending, {*used, *names}, ending) if name in used else name for name in names]
 
 
 _PLURALS = {"body": "bodies"}

@@ -6,19 +6,28 @@ import dataclasses
 import functools
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from .._common.lookup import as_names, hint
+from .._kane.right_hand_side import parameters_read
 from .._scalarjit.components import ZERO3, Component, Scalar, add, dot, is_exact, is_zero, mul, sub
 from .._system.kinematics import Frame, Point, Vector, inertial
 from .._system.motion import Body, Force, Motion, Torque
 from .._system.parameters import parameter
 from .._system.system import System
-from ._sympy_expressions import ExtractedModel, ExtractedVector, Extractor, function, imported, name_of
+from ._sympy_expressions import (
+    ExtractedModel,
+    ExtractedVector,
+    Extractor,
+    function,
+    imported,
+    name_of,
+    prescribed_motions,
+)
 from ._sympy_model import model_data
 
 
@@ -28,6 +37,7 @@ def from_sympy(
     *,
     origin: Any = None,
     dependent: Sequence[str] = (),
+    prescribed: Mapping[Any, Any] | None = None,
     name: str = "SympyModel",
 ) -> System:
     """The system of a model of `sympy.physics.mechanics`.
@@ -40,10 +50,15 @@ def from_sympy(
     - `model`: a `KanesMethod`, a `System`, or a `LagrangesMethod`. Its bodies and loads are used, or those that were
         passed to `kanes_equations`. Its equations need not have been formed. A Lagrangian without `bodies` gives the
         motion, but neither points nor frames.
-    - `parameters`: a number for each constant symbol, by symbol or by name. They become the system's parameters.
+    - `parameters`: a number for each constant symbol, by symbol or by name. They become the system's parameters. A
+        symbol on which no equation depends needs no number and is zero, e.g. a moment of inertia about an axis about
+        which the body does not turn.
     - `origin`: the point from which positions are measured, for `jk.positions` and animations. Default: the fixed point
         of a `System`; for other models positions are then not available.
     - `dependent`: for a `LagrangesMethod` with constraints, the names of the coordinates that these determine.
+    - `prescribed`: motions that are given in time, by function of the model (e.g. v(t)) or by its name. Each is an
+        expression of SymPy in time and constants, or a function of time [s] that JAX can differentiate. Rates of a
+        prescribed function are its derivatives.
     - `name`: of its class.
 
     **Returns:** a `System`. Coordinates and speeds have the names of the dynamic symbols. The speeds of Lagrange's
@@ -56,16 +71,18 @@ def from_sympy(
 
     **Raises:** `ImportError` without SymPy; `TypeError` for another kind of model. `ValueError` for a symbol without a
     value or a value without a symbol, a KanesMethod without bodies, and a point without a velocity. Also for a function
-    of time in the motion that is neither coordinate nor speed, and a Lagrangian that is not quadratic in the rates.
+    of time in the motion that is neither coordinate nor speed nor prescribed, and a Lagrangian that is not quadratic in
+    the rates.
     """
     sympy = imported()
-    data = model_data(sympy, model, as_names(dependent), name)
+    motions = prescribed_motions(sympy, prescribed or {}, name)
+    data = model_data(sympy, model, as_names(dependent), name, tuple(motions))
     if origin is not None and not data.bodies:
         raise ValueError(
             f"{name}: positions from {origin} are not available, because this Lagrangian has no bodies. Omit `origin`, "
             "or pass the bodies: LagrangesMethod(L, qs, bodies=bodies, frame=N, ...)."
         )
-    extractor = Extractor(sympy, data, origin if origin is not None else data.origin)
+    extractor = Extractor(sympy, data, origin if origin is not None else data.origin, motions)
     model = extractor.model()
     values = _values(extractor, model, parameters)
     return class_of(model)(**values)
@@ -75,6 +92,9 @@ def _values(extractor: Extractor, model: ExtractedModel, parameters: Mapping[Any
     numbers = {str(symbol): value for symbol, value in parameters.items()}
     names = [str(symbol) for symbol in model.constants]
     missing = [name for name in names if name not in numbers]
+    if missing:
+        numbers |= dict.fromkeys(_unread(model, missing), 0.0)
+        missing = [name for name in missing if name not in numbers]
     if missing:
         raise ValueError(f"{model.name}: no value for {', '.join(missing)}. `parameters` needs a number per symbol.")
     unknown = [name for name in numbers if name not in names]
@@ -88,6 +108,20 @@ def _values(extractor: Extractor, model: ExtractedModel, parameters: Mapping[Any
         )
     basic = extractor.sympy.Basic
     return {name: float(numbers[name]) if isinstance(numbers[name], basic) else numbers[name] for name in names}
+
+
+def _unread(model: ExtractedModel, names: Sequence[str]) -> list[str]:
+    """Which of these constants affect neither the equations nor a position."""
+    if any(hasattr(SympySystem, name) for name in names):
+        return []
+    kind = class_of(model)
+    fields = [field.name for field in dataclasses.fields(kind)]
+    ones = {field: jnp.ones(()) for field in fields}
+    read = dict(zip(fields, parameters_read(kind(**ones)), strict=True))
+    positions = [point.position for point in model.points if point.position is not None]
+    shown = {i for position in positions for _, places in position for i in places}
+    in_positions = {str(x) for i in shown for x in model.of_motion[i].free_symbols}
+    return [name for name in names if not read[name] and name not in in_positions]
 
 
 class _SympyMotion(Motion):
@@ -114,7 +148,7 @@ class SympySystem(System):
         model = self._model
         missing = len(model.u) + len(model.u_dep) + len(model.u_aux) - len(u)
         numbers = [getattr(self, str(x)) for x in model.constants]
-        return _functions_of(model)[0](t, *q, *u, *(0.0,) * missing, *numbers)
+        return _functions_of(model)[0](t, *q, *u, *(0.0,) * missing, *_given(model, t), *numbers)
 
     def q_dot(self, t, q, u):
         values = self._read(q, u, t)
@@ -171,7 +205,8 @@ class SympySystem(System):
         if not isinstance(motion, _SympyMotion):
             motion = self.motion(t, q, u)
         numbers = [getattr(self, str(x)) for x in model.constants]
-        values = _functions_of(model)[1](t, *q, *u, *(inputs[name_of(x)] for x in model.inputs), *numbers)
+        given = (*(inputs[name_of(x)] for x in model.inputs), *_given(model, t))
+        values = _functions_of(model)[1](t, *q, *u, *given, *numbers)
         loads: list[Any] = []
         for load, body in zip(model.loads, motion.under_torque, strict=True):
             vector = _vector(motion.model_frames, values, load.vector)
@@ -218,8 +253,23 @@ def _functions_of(model: ExtractedModel) -> tuple[Any, Any]:
     """The expressions of the motion and of the loads, as functions of time, coordinates, speeds (and inputs) and
     constants."""
     state = (model.t, *model.q, *model.u, *model.u_dep, *model.u_aux)
-    of_loads = function((*state, *model.inputs, *model.constants), model.of_loads)
-    return function((*state, *model.constants), model.of_motion), of_loads
+    given = tuple(symbol for symbol, _, _ in model.prescribed)
+    of_loads = function((*state, *model.inputs, *given, *model.constants), model.of_loads)
+    return function((*state, *given, *model.constants), model.of_motion), of_loads
+
+
+def _given(model: ExtractedModel, t: Component) -> list[Any]:
+    """The values of the prescribed functions and of their derivatives."""
+    values = []
+    for _, motion, order in model.prescribed:
+        for _ in range(order):
+            motion = functools.partial(_rate, motion)
+        values.append(jnp.asarray(motion(jnp.asarray(t, float) if is_exact(t) else t)))
+    return values
+
+
+def _rate(motion: Callable[[Any], Any], t: Any) -> Any:
+    return jax.jvp(lambda t: jnp.asarray(motion(t)), (t,), (jnp.ones_like(t),))[1]
 
 
 @functools.lru_cache(maxsize=100)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -47,6 +47,7 @@ class ExtractedModel(NamedTuple):
     q_dep: tuple[str, ...]
     inputs: tuple[Any, ...]
     constants: tuple[Any, ...]
+    prescribed: tuple[tuple[Any, Callable[[Any], Any], int], ...]  # symbol; function of time; order of its derivative
     t: Any
     of_motion: tuple[Any, ...]
     of_loads: tuple[Any, ...]
@@ -65,8 +66,11 @@ class ExtractedModel(NamedTuple):
 class Extractor:
     """Extracts the expressions of a model, each once."""
 
-    def __init__(self, sympy: ModuleType, data: ModelData, origin: Any):
+    def __init__(self, sympy: ModuleType, data: ModelData, origin: Any, prescribed: Mapping[Any, Any]):
         self.sympy, self.data, self.origin = sympy, data, origin
+        self.prescribed = prescribed
+        self.replaced: set[Any] = set()  # prescribed functions that occur
+        self.derivatives: dict[Any, tuple[Any, Callable[[Any], Any], int]] = {}  # of prescribed functions that are used
         self.t = sympy.physics.mechanics.dynamicsymbols._t
         self.of_motion: dict[Any, int] = {}
         self.of_loads: dict[Any, int] = {}
@@ -92,6 +96,7 @@ class Extractor:
             "inertia": tuple(tuple(map(place, row)) for row in data.inertia.M),
             "inertia_rates": tuple(tuple(map(in_loads, row)) for row in data.inertia.M_dot),
         }
+        self._check_prescribed()
         inputs, constants = self._symbols()
         return ExtractedModel(
             name=data.name,
@@ -102,6 +107,7 @@ class Extractor:
             q_dep=tuple(name_of(c) for c in data.q_dep),
             inputs=inputs,
             constants=constants,
+            prescribed=tuple(self.derivatives.values()),
             t=self.t,
             of_motion=tuple(self.of_motion),
             of_loads=tuple(self.of_loads),
@@ -114,7 +120,37 @@ class Extractor:
         """The index of an expression, in which rates of coordinates are replaced by speeds."""
         among = self.of_motion if among is None else among
         expression = self.sympy.physics.mechanics.msubs(self.sympy.sympify(expression), self.data.rates)
+        expression = self._with_prescribed(expression)
         return among.setdefault(expression, len(among))
+
+    def _with_prescribed(self, expression: SymPyObject) -> SymPyObject:
+        """The expression, in which prescribed functions and their derivatives are replaced."""
+        if not self.prescribed:
+            return expression
+        replaced = {}
+        for x in expression.atoms(self.sympy.Derivative, self.sympy.core.function.AppliedUndef):
+            is_derivative = isinstance(x, self.sympy.Derivative)
+            motion, order = x.expr if is_derivative else x, x.derivative_count if is_derivative else 0
+            if motion not in self.prescribed:
+                continue
+            given = self.prescribed[motion]
+            if isinstance(given, self.sympy.Basic):
+                replaced[x] = given.diff(self.t, order)
+                continue
+            symbol = motion if not order else self.sympy.Function(f"{motion.func}_rate_{order}")(self.t)
+            self.derivatives[x] = symbol, given, order
+            replaced[x] = symbol
+        self.replaced |= {x.expr if isinstance(x, self.sympy.Derivative) else x for x in replaced}
+        return expression.xreplace(replaced)
+
+    def _check_prescribed(self) -> None:
+        """**Raises:** `ValueError` for prescribed functions that the model does not contain, or solves for."""
+        data = self.data
+        for x in self.prescribed:
+            if x in (*data.q, *data.u, *data.u_dep, *data.u_aux):
+                raise ValueError(f"{data.name}: `prescribed` contains {x}, a coordinate or a speed of the model.")
+            if x not in self.replaced:
+                raise ValueError(f"{data.name}: `prescribed` contains {x}, which is not part of the model.")
 
     def _vector(self, vector: Any, among: dict[Any, int] | None = None) -> ExtractedVector:
         parts = [] if vector == 0 else vector.args
@@ -182,14 +218,17 @@ class Extractor:
     def _symbols(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """Inputs and constants, sorted by name."""
         data, name = self.data, self.data.name
-        known = {*data.q, *data.u, *data.u_dep, *data.u_aux}
+        known = {*data.q, *data.u, *data.u_dep, *data.u_aux, *(symbol for symbol, _, _ in self.derivatives.values())}
 
         def atoms(kind: Sequence[Any], among: Iterable[Any]) -> set[Any]:
             return {x for e in among for x in e.atoms(*kind)}
 
         derivatives = atoms([self.sympy.Derivative], (*self.of_motion, *self.of_loads))
         if derivatives:
-            raise ValueError(f"{name}: no kinematic equation of the model determines {_listed(derivatives)}.")
+            raise ValueError(
+                f"{name}: no kinematic equation of the model determines {_listed(derivatives)}. For a prescribed "
+                "motion, pass prescribed={...: an expression or a function of time}."
+            )
         applied = self.sympy.core.function.AppliedUndef
         unknown = {
             x.func.__name__
@@ -201,8 +240,8 @@ class Extractor:
         undeclared = atoms([applied], self.of_motion) - known
         if undeclared:
             raise ValueError(
-                f"{name}: {_listed(undeclared)} in the motion is neither a coordinate nor a speed. Write a prescribed "
-                "motion as an expression of time. Inputs can occur in loads only."
+                f"{name}: {_listed(undeclared)} in the motion is neither a coordinate nor a speed. Pass "
+                "prescribed={...: an expression or a function of time}. Inputs can occur in loads only."
             )
         inputs = sorted(atoms([applied], self.of_loads) - known, key=str)
         odd = [x for x in inputs if tuple(x.args) != (self.t,)]
@@ -216,6 +255,26 @@ class Extractor:
                 f"{name}: two symbols named {_listed(twice)} have different assumptions, e.g. positive=True. Use one."
             )
         return tuple(inputs), tuple(sorted(symbols, key=str))
+
+
+def prescribed_motions(sympy: ModuleType, prescribed: Mapping[Any, Any], name: str) -> dict[Any, Any]:
+    """Prescribed motions by SymPy's function of time: expressions of SymPy, or functions.
+
+    **Raises:** `TypeError` for a key or a motion of another kind.
+    """
+    t, motions = sympy.physics.mechanics.dynamicsymbols._t, {}
+    for key, motion in prescribed.items():
+        symbol = sympy.Function(key)(t) if isinstance(key, str) else key
+        if not isinstance(symbol, sympy.core.function.AppliedUndef) or symbol.args != (t,):
+            raise TypeError(f"{name}: `prescribed` must name functions of time, e.g. dynamicsymbols('v'); got {key!r}.")
+        if isinstance(motion, sympy.Basic) or not callable(motion):  # symbols of SymPy are callable
+            motion = sympy.sympify(motion)
+        if isinstance(motion, sympy.Basic) and motion.atoms(sympy.core.function.AppliedUndef):
+            raise TypeError(
+                f"{name}: the prescribed motion of {symbol} must depend on time and constants, got {motion}."
+            )
+        motions[symbol] = motion
+    return motions
 
 
 def name_of(x: SymPyObject) -> str:

@@ -47,7 +47,9 @@ class ModelData(NamedTuple):
     origin: Any = None
 
 
-def model_data(sympy: ModuleType, model: Any, dependent: tuple[str, ...], name: str) -> ModelData:
+def model_data(
+    sympy: ModuleType, model: Any, dependent: tuple[str, ...], name: str, prescribed: tuple[Any, ...] = ()
+) -> ModelData:
     mechanics = sympy.physics.mechanics
     kinds = [getattr(mechanics, kind, ()) for kind in ("KanesMethod", "System", "LagrangesMethod")]
     if isinstance(model, kinds[0]):
@@ -55,7 +57,7 @@ def model_data(sympy: ModuleType, model: Any, dependent: tuple[str, ...], name: 
     if isinstance(model, kinds[1]):
         return _of_system(mechanics, model, name)
     if isinstance(model, kinds[2]):
-        return _of_lagrange(sympy, model, dependent, name)
+        return _of_lagrange(sympy, model, dependent, name, prescribed)
     raise TypeError(f"from_sympy needs a KanesMethod, a System or a LagrangesMethod of SymPy, got {model!r}.")
 
 
@@ -103,7 +105,9 @@ def _of_system(mechanics: ModuleType, system: Any, name: str) -> ModelData:
     return _of_kane(kane, name, system.fixed_point)
 
 
-def _of_lagrange(sympy: ModuleType, lagrange: Any, dependent: tuple[str, ...], name: str) -> ModelData:
+def _of_lagrange(
+    sympy: ModuleType, lagrange: Any, dependent: tuple[str, ...], name: str, prescribed: tuple[Any, ...]
+) -> ModelData:
     bodies = list(lagrange._bodies or ())
     if bodies and lagrange.inertial is None:
         raise ValueError(f"{name}: the inertial frame of the bodies is missing. Pass LagrangesMethod(..., frame=N).")
@@ -124,7 +128,7 @@ def _of_lagrange(sympy: ModuleType, lagrange: Any, dependent: tuple[str, ...], n
     if bodies:
         inertia = Inertia(forces=_forces_of_potential(sympy, lagrange, bodies, to_speeds, of_speeds, name))
     else:
-        inertia = inertia_of(sympy, lagrange, of_speeds, name)
+        inertia = inertia_of(sympy, lagrange, of_speeds, name, prescribed)
     holonomic = list(lagrange._hol_coneqs)
     return ModelData(
         name,
@@ -154,7 +158,9 @@ def _forces_of_potential(
     return [-potential.diff(c) for c in of_speeds]
 
 
-def inertia_of(sympy: ModuleType, lagrange: Any, speeds: dict[Any, Any], name: str) -> Inertia:
+def inertia_of(
+    sympy: ModuleType, lagrange: Any, speeds: dict[Any, Any], name: str, prescribed: tuple[Any, ...] = ()
+) -> Inertia:
     """Inertia and forces of a `LagrangesMethod` without bodies.
 
     **Arguments:**
@@ -163,6 +169,7 @@ def inertia_of(sympy: ModuleType, lagrange: Any, speeds: dict[Any, Any], name: s
     - `lagrange`: the `LagrangesMethod`.
     - `speeds`: the coordinates with their speeds, in the order of the speeds.
     - `name`: of the model, for messages.
+    - `prescribed`: functions of time that L may contain, with their derivatives.
 
     **Raises:** `ValueError` if L is not a quadratic function of the rates, for a load without an inertial frame for its
     velocity, and for one whose velocity does not follow from the rates of the coordinates. `TypeError` for a load that
@@ -175,11 +182,11 @@ def inertia_of(sympy: ModuleType, lagrange: Any, speeds: dict[Any, Any], name: s
         return x.diff(t).xreplace(to_speeds)
 
     L, u = lagrange._L[0].xreplace(to_speeds), list(speeds.values())
-    strange = sorted(map(str, L.atoms(sympy.Derivative)))
+    strange = sorted(str(x) for x in L.atoms(sympy.Derivative) if x.expr not in prescribed)
     if strange:
         raise ValueError(
             f"{name}: the Lagrangian contains {strange[0]}. It may contain only first derivatives of the coordinates. "
-            "Write a prescribed motion as an expression of time."
+            "Pass prescribed motions as prescribed={...}."
         )
     M = [[_without(sympy, L.diff(x, y), u, name) for y in u[: i + 1]] for i, x in enumerate(u)]
     # The momenta in addition to M u: L may contain terms of the first order in the rates, e.g. for a moving frame.

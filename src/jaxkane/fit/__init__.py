@@ -5,7 +5,6 @@ from ._bicycle import bicycle_rides as bicycle_rides
 from ._bicycle import fit_bicycle as fit_bicycle
 from ._bicycle import frame_inertia as frame_inertia
 from .collocated._fit import Collocation as Collocation
-from .collocated._fit import CollocationFit as CollocationFit
 from .extend.candidates import Candidate as Candidate
 from .extend.selection import forward_selection as forward_selection
 from .inverse.base_parameters import base_parameters as base_parameters

@@ -83,6 +83,7 @@ class JointType:
     axis: Triple = (0.0, 0.0, 1.0)
     reference: float = 0.0  # the coordinate at the link's initial position and orientation
     has_stops: tuple[bool, bool] = (False, False)  # a lower and an upper limit of the coordinate
+    has_friction: bool = False  # dry friction
 
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = ()  # ending of the name, unit
     speeds: ClassVar[tuple[tuple[str, str], ...]] = ()
@@ -260,6 +261,7 @@ def hinge(
     armature: Component = 0.0,
     reference: float = 0.0,
     stops: Stops = (None, None),
+    friction: Component = 0.0,
 ) -> Joint:
     """A hinge: the coordinate `name` [rad], the speed `name_rate` [rad/s].
 
@@ -274,13 +276,13 @@ def hinge(
     - `reference` [rad]: the coordinate at the link's `position` and `orientation`. An exact number, not a parameter.
     - `stops` [rad]: the lower and the upper limit of the coordinate; None for no limit. Each limit is a
         `jaxkane.Contact` without restitution: `name lower`, `name upper`. At most four contacts are possible.
+    - `friction` [N m]: of dry friction, a `jaxkane.DryFriction` with the name `name friction`. It is one of the
+        contacts.
     """
-    values = _numbers(name, damping=damping, stiffness=stiffness, rest=rest, armature=armature)
+    values = _numbers(name, damping=damping, stiffness=stiffness, rest=rest, armature=armature, friction=friction)
     has_stops, limits = _limits(stops, name)
-    return Joint(
-        (Hinge(name, unit_vector(axis, name), _reference(reference, name), has_stops),),
-        values | limits | components(f"anchor.{name}", anchor),
-    )
+    hinge_type = Hinge(name, unit_vector(axis, name), _reference(reference, name), has_stops, _is_rough(values))
+    return Joint((hinge_type,), values | limits | components(f"anchor.{name}", anchor))
 
 
 def slide(
@@ -293,15 +295,21 @@ def slide(
     armature: Component = 0.0,
     reference: float = 0.0,
     stops: Stops = (None, None),
+    friction: Component = 0.0,
 ) -> Joint:
     """A slider along `axis` of the link's frame: the coordinate `name` [m], the speed `name_rate` [m/s].
 
     **Arguments** as of `hinge`: `damping` [N s/m], `stiffness` [N/m], `rest` [m], `armature` [kg], `reference` [m],
-    `stops` [m].
+    `stops` [m], `friction` [N].
     """
-    values = _numbers(name, damping=damping, stiffness=stiffness, rest=rest, armature=armature)
+    values = _numbers(name, damping=damping, stiffness=stiffness, rest=rest, armature=armature, friction=friction)
     has_stops, limits = _limits(stops, name)
-    return Joint((Slide(name, unit_vector(axis, name), _reference(reference, name), has_stops),), values | limits)
+    slide_type = Slide(name, unit_vector(axis, name), _reference(reference, name), has_stops, _is_rough(values))
+    return Joint((slide_type,), values | limits)
+
+
+def _is_rough(values: Mapping[str, Any]) -> bool:
+    return any(name.startswith("friction.") for name in values)
 
 
 def _limits(stops: Any, name: str) -> tuple[tuple[bool, bool], dict[str, Any]]:

@@ -15,7 +15,7 @@ from .._kane.unilateral import MOST_CONTACTS
 from .._scalarjit.compat import Tracer
 from ..rotations import Matrix
 from ._joints import Hinge, Joint, JointType, Slide, components, exact, exact_numbers, is_structural_zero
-from ._loops import with_dependent
+from ._loops import LoopChoices, with_dependent
 from ._mechanism import (
     MOMENTS,
     ActuatorStructure,
@@ -136,6 +136,9 @@ def mechanism(
     sites: Sequence[Site] = (),
     loops: Sequence[Loop | Coupling] = (),
     dependent: Sequence[str] | None = None,
+    independent: Sequence[str] = (),
+    pose: Mapping[str, float] | None = None,
+    poses: Mapping[str, Mapping[str, float]] | None = None,
     name: str = "Mechanism",
     left_out: Sequence[str] = (),
 ) -> Mechanism:
@@ -153,6 +156,11 @@ def mechanism(
     - `loops`: closed loops, `Loop` and `Coupling`. They become configuration constraints and velocity residuals.
     - `dependent`: the hinges and sliders that are solved for, one for each residual. Default: the best-conditioned
         choice at trial coordinates.
+    - `independent`: joints that are not solved for, e.g. those with motors.
+    - `pose`: coordinates by name at which loops are closed approximately. Independent residuals and dependent joints
+        are chosen there. Default: near zero coordinates. Residuals that nearly depend on others there are omitted with
+        a warning.
+    - `poses`: further poses by name, which `system.poses` returns. Each has a value for every coordinate.
     - `name`: of its class, for messages.
     - `left_out`: elements of a file that were not imported.
 
@@ -173,8 +181,9 @@ def mechanism(
                 f"mechanism: `{what}` must be a list, e.g. [{kind}(...), ...], also for one element; got a "
                 f"{type(given).__name__}."
             )
-    if isinstance(dependent, str):
-        raise TypeError(f"mechanism: `dependent` must be a list of names, e.g. [{dependent!r}]; got {dependent!r}.")
+    for what, names in (("dependent", dependent), ("independent", independent)):
+        if isinstance(names, str):
+            raise TypeError(f"mechanism: `{what}` must be a list of names, e.g. [{names!r}]; got {names!r}.")
     if not isinstance(name, str):
         raise TypeError(f"mechanism: `name` must be a string, got {name!r}.")
     values: dict[str, Any] = components("gravity", gravity)
@@ -201,7 +210,17 @@ def mechanism(
         couplings=tuple(x for x in closures if isinstance(x, CouplingStructure)),
     )
     fields = tuple(_field(name, joints) for name in values)
-    return class_of(with_dependent(structure, fields, values, dependent), fields)(**values)
+    structure = with_dependent(structure, fields, values, LoopChoices(dependent, tuple(independent), pose))
+    return class_of(structure._replace(poses=_poses(structure, poses or {})), fields)(**values)
+
+
+def _poses(structure: Structure, poses: Mapping[str, Mapping[str, float]]) -> tuple[tuple[str, tuple[float, ...]], ...]:
+    names = [name for joint in structure.joints for name in joint.names(joint.coordinates)]
+    for label, pose in poses.items():
+        if set(pose) != set(names):
+            wrong = sorted(set(pose) ^ set(names))
+            raise ValueError(f"{structure.name}: the pose {label!r} needs one value per coordinate; see {wrong[0]!r}.")
+    return tuple((label, tuple(float(pose[name]) for name in names)) for label, pose in poses.items())
 
 
 def _checked(part: Any, kind: type) -> Any:
@@ -356,10 +375,14 @@ def _check_names(structure: Structure) -> None:
 
 def _check_stops(structure: Structure) -> None:
     stops = [joint.name for joint in structure.joints for has in joint.has_stops if has]
-    if len(stops) > MOST_CONTACTS:
+    rough = [joint.name for joint in structure.joints if joint.has_friction]
+    if len(stops) + len(rough) > MOST_CONTACTS:
+        kinds = (("the limits of", stops, "stops"), ("the dry friction of", rough, "friction"))
+        parts = [f"{what} {', '.join(dict.fromkeys(names))}" for what, names, _ in kinds if names]
+        options = [f"`{option}`" for _, names, option in kinds if names]
         raise ValueError(
-            f"{structure.name} has {len(stops)} contacts, which are the limits of {', '.join(dict.fromkeys(stops))}. "
-            f"At most {MOST_CONTACTS} are possible. Name fewer joints in `stops`, or use MuJoCo."
+            f"{structure.name} has {len(stops) + len(rough)} contacts, which are {' and '.join(parts)}. At most "
+            f"{MOST_CONTACTS} are possible. Name fewer joints in {' and '.join(options)}, or use MuJoCo."
         )
 
 
@@ -367,8 +390,9 @@ _UNITS = {"mass": "kg", "inertia": "kg m^2", "gravity": "m/s^2"} | dict.fromkeys
     ("center", "position", "anchor", "site"), "m"
 )
 _OF_HINGES = {"damping": "N m s/rad", "stiffness": "N m/rad", "rest": "rad", "armature": "kg m^2"}
-_OF_HINGES |= {"lower": "rad", "upper": "rad"}
-_OF_SLIDERS = {"damping": "N s/m", "stiffness": "N/m", "rest": "m", "armature": "kg", "lower": "m", "upper": "m"}
+_OF_HINGES |= {"lower": "rad", "upper": "rad", "friction": "N m"}
+_OF_SLIDERS = {"damping": "N s/m", "stiffness": "N/m", "rest": "m", "armature": "kg"}
+_OF_SLIDERS |= {"lower": "m", "upper": "m", "friction": "N"}
 
 
 def _field(name: str, joints: Mapping[str, JointType]) -> Field:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -12,34 +13,48 @@ import scipy.linalg
 from .._common.lookup import as_names, not_there
 from .._scalarjit.compat import Tracer
 from ._joints import JointType
-from ._mechanism import Field, Structure, class_of, loop_residuals
+from ._mechanism import Field, LinkStructure, LoopStructure, Structure, class_of, loop_residuals, polynomial
+
+NEARLY_REDUNDANT = 1e-4
+"""Files have coordinates of five digits. The axes of a plane loop are then parallel up to 1e-5, and the residual normal
+to its plane is not exactly redundant. As a constraint, it would lock the loop."""
+
+
+class LoopChoices(NamedTuple):
+    """How loops are solved.
+
+    - `dependent`: hinges and sliders that are solved for. None: the best-conditioned choice.
+    - `independent`: joints that must not be solved for.
+    - `pose`: coordinates by name, at which the choice is made. None: near the reference.
+    """
+
+    dependent: Sequence[str] | None = None
+    independent: Sequence[str] = ()
+    pose: Mapping[str, float] | None = None
 
 
 def with_dependent(
-    structure: Structure, fields: tuple[Field, ...], values: dict[str, Any], dependent: Sequence[str] | None
+    structure: Structure, fields: tuple[Field, ...], values: dict[str, Any], choices: LoopChoices
 ) -> Structure:
     """The structure with its dependent speeds and coordinates, and with the independent residuals."""
     norms = [joint.name + joint.coordinates[-1][0] for joint in structure.joints if len(joint.coordinates) > 1]
-    dependent = None if dependent is None else as_names(dependent)
+    choices = _checked_choices(structure, choices)
     if not (structure.loops or structure.couplings):
-        if dependent:
+        if choices.dependent:
             raise ValueError(
-                f"`dependent` names {', '.join(dependent)}, but the mechanism has no loop. Omit `dependent`."
+                f"`dependent` names {', '.join(choices.dependent)}, but the mechanism has no loop. Omit `dependent`."
             )
         return structure._replace(dependent_coordinates=tuple(norms))
     with jax.ensure_compile_time_eval():  # trial numbers must be concrete also inside `jax.jit`
         trial = _Trial(structure, fields, values)
-        q = trial.start()
-        rows = _independent_rows(trial.velocity_slopes(q))
-        closed = trial.closed(q, rows)
-        if closed is not None:
-            q = closed
-            if not any(isinstance(x, Tracer) or np.ndim(x) for x in values.values()):
-                trial.check_implied(q, rows)
-        speeds, coordinates = _dependent_names(trial, q, rows, dependent, norms)
+        is_concrete = not any(isinstance(x, Tracer) or np.ndim(x) for x in values.values())
+        q, rows, redundant = _independent_residuals(trial, choices.pose, is_concrete)
+        speeds, coordinates = _dependent_names(trial, q, rows, choices, norms)
     first, loops = 0, []
     for loop in structure.loops:
-        loops.append(loop._replace(independent=tuple(i - first for i in rows if first <= i < first + loop.size)))
+        own = range(first, first + loop.size)
+        independent, dropped = (tuple(i - first for i in own if i in places) for places in (rows, redundant))
+        loops.append(loop._replace(independent=independent, dropped=dropped))
         first += loop.size
     return structure._replace(
         loops=tuple(loops),
@@ -49,45 +64,172 @@ def with_dependent(
     )
 
 
+def _checked_choices(structure: Structure, choices: LoopChoices) -> LoopChoices:
+    """**Raises:** `ValueError` for unknown names."""
+    coordinates = [name for joint in structure.joints for name in joint.names(joint.coordinates)]
+    joints = [joint.name for joint in structure.joints]
+    for what, names, known, kind in (
+        ("independent", choices.independent, joints, "the joints"),
+        ("pose", choices.pose or (), coordinates, "the coordinates"),
+    ):
+        wrong = [name for name in names if name not in known]
+        if wrong:
+            raise ValueError(f"`{what}`: " + str(not_there(wrong[0], known, kind).args[0]))
+    dependent = None if choices.dependent is None else as_names(choices.dependent)
+    both = [name for name in dependent or () if name in choices.independent]
+    if both:
+        raise ValueError(f"`dependent` and `independent` both name {both[0]!r}. Name it in one of them.")
+    return choices._replace(dependent=dependent)
+
+
+def _independent_residuals(
+    trial: _Trial, pose: Mapping[str, float] | None, is_concrete: bool
+) -> tuple[np.ndarray, list[int], list[int]]:
+    """Coordinates at which the loops are closed, the residuals that are independent there, and those that nearly depend
+    on them, which are omitted.
+    """
+    q = trial.start(pose)
+    size, order = _pivots(trial.velocity_slopes(q))
+    rows = [i for i, pivot in zip(order, size, strict=False) if pivot > max(1e-9 * size[0], 1e-13)]
+    good = [i for i, pivot in zip(order, size, strict=False) if i in rows and pivot > NEARLY_REDUNDANT * size[0]]
+    closed = trial.closed(q, sorted(good))
+    if closed is not None:
+        size, order = _pivots(trial.velocity_slopes(closed)[rows])
+        regular = [rows[i] for i, pivot in zip(order, size, strict=False) if pivot > NEARLY_REDUNDANT * size[0]]
+        if len(regular) > len(good):  # q is close to a singular configuration
+            good, closed = regular, trial.closed(q, sorted(regular))
+    redundant = sorted(set(rows) - set(good))
+    if closed is None:
+        return q, sorted(good), redundant
+    if is_concrete:
+        trial.check_implied(closed, good, redundant)
+    return closed, sorted(good), redundant
+
+
 def _dependent_names(
-    trial: _Trial, q: np.ndarray, rows: list[int], dependent: Sequence[str] | None, norms: list[str]
+    trial: _Trial, q: np.ndarray, rows: list[int], choices: LoopChoices, norms: list[str]
 ) -> tuple[list[str], list[str]]:
     """Speeds and coordinates for which the residuals can be solved, including those for the `norms` of Euler
     parameters."""
     structure, C = trial.structure, trial.velocity_slopes(q)[rows]  # (k,n)
-    if dependent is not None:
-        simple = [joint.name for joint in structure.joints if len(joint.speeds) == 1]
-        wrong = [name for name in dependent if name not in simple]
-        if wrong:
-            raise ValueError("`dependent`: " + str(not_there(wrong[0], simple, "the hinges and sliders").args[0]))
-        if len(set(dependent)) != len(rows):
-            raise ValueError(
-                f"`dependent` names {len(set(dependent))} joints, but the loops have {len(rows)} independent "
-                "residuals. Name one joint for each."
-            )
-        speeds = [f"{name}_rate" for name in dependent]
-        columns = C[:, [trial.speeds.index(name) for name in speeds]]
-        if np.linalg.svd(columns, compute_uv=False)[-1] < 1e-9 * np.abs(C).max():
-            raise ValueError(f"`dependent`: the loops cannot be solved for {', '.join(dependent)}. Name other joints.")
-        return speeds, [*dependent, *norms]
+    if choices.dependent is not None:
+        return _named_dependent(trial, C, choices.dependent, norms)
     follows = [f"{x.first}_rate" for x in structure.couplings]
     # The first joint of a coupling follows the second one, so its rate should be the dependent one.
     preferred = C * [1e3 if name in follows else 1.0 for name in trial.speeds]
-    groups = _by_joints(structure, trial.speeds, lambda joint: joint.speeds)
-    speeds = [trial.speeds[i] for i in _best_columns(preferred, groups)]
+    groups = _by_joints(structure, trial.speeds, lambda joint: joint.speeds, choices.independent)
+    chosen = _best_columns(preferred, groups)
+    if len(chosen) < len(rows):
+        raise ValueError(
+            f"{structure.name}: the loops have {len(rows)} independent residuals, and cannot be solved without the "
+            f"joints that `independent` names: {', '.join(choices.independent)}. Name fewer."
+        )
+    speeds = [trial.speeds[i] for i in chosen]
     if all(name.endswith("_rate") for name in speeds):
         return speeds, [*(name.removesuffix("_rate") for name in speeds), *norms]
     G = np.concatenate([trial.slopes(q)[rows], trial.norm_slopes(q)])
-    groups = _by_joints(structure, trial.coordinates, lambda joint: joint.coordinates)
+    groups = _by_joints(structure, trial.coordinates, lambda joint: joint.coordinates, choices.independent)
+    # The norms of Euler parameters of an independent ball joint remain constraints.
+    groups.append([i for i, name in enumerate(trial.coordinates) if name in norms])
     return speeds, [trial.coordinates[i] for i in _best_columns(G, groups)]
+
+
+def _named_dependent(
+    trial: _Trial, C: np.ndarray, dependent: Sequence[str], norms: list[str]
+) -> tuple[list[str], list[str]]:
+    simple = [joint.name for joint in trial.structure.joints if len(joint.speeds) == 1]
+    wrong = [name for name in dependent if name not in simple]
+    if wrong:
+        raise ValueError("`dependent`: " + str(not_there(wrong[0], simple, "the hinges and sliders").args[0]))
+    if len(set(dependent)) != len(C):
+        raise ValueError(
+            f"`dependent` names {len(set(dependent))} joints, but the loops have {len(C)} independent residuals. Name "
+            "one joint for each."
+        )
+    speeds = [f"{name}_rate" for name in dependent]
+    columns = C[:, [trial.speeds.index(name) for name in speeds]]
+    if np.linalg.svd(columns, compute_uv=False)[-1] < 1e-9 * np.abs(C).max():
+        raise ValueError(f"`dependent`: the loops cannot be solved for {', '.join(dependent)}. Name other joints.")
+    return speeds, [*dependent, *norms]
+
+
+class _Closure:
+    """A loop in a mechanism of its own: the links from the last link that carries both of its ends, which is fixed.
+
+    The residuals of a loop depend on these links only. The time for all loops is then linear in the number of links.
+    """
+
+    def __init__(self, structure: Structure, fields: tuple[Field, ...], numbers: dict[str, float], loop: LoopStructure):
+        links = {link.name: link for link in structure.links}
+        sites = [next(site for site in structure.sites if site.name == end) for end in (loop.first, loop.second)]
+        chains = [_chain_to(links, site.link) for site in sites]
+        common = sum(a == b for a, b in zip(*chains, strict=False))
+        own = [name for name in links if name in chains[0][common:] + chains[1][common:]]
+        parts = {*own, loop.first, loop.second, *(joint.name for name in own for joint in links[name].joints)}
+        kinematic = [
+            field for field in fields if field[0].split(".")[0] in _KINEMATIC and field[0].split(".")[1] in parts
+        ]
+        alone = Structure(
+            structure.name,
+            tuple(links[x]._replace(parent=_within(own, links[x].parent), has_mass=False) for x in own),
+            tuple(site._replace(link=_within(own, site.link)) for site in sites),
+            loops=(loop,),
+        )
+        self.mechanism = class_of(alone, tuple(kinematic))(**{name: numbers[name] for name, *_ in kinematic})
+        # Python numbers, because JAX would compile every operation
+        self.mechanism = jax.tree.map(float, self.mechanism)
+        self.coordinates, self.speeds, self.size = self.mechanism.coordinates, self.mechanism.speeds, loop.size
+        places = [abs(numbers[name]) for name, _, unit in kinematic if unit == "m"]
+        self.length = max(places, default=0.0) or 1.0  # [m]
+
+    def residuals(self, q: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals of the configuration and of the velocities [m and rad]."""
+        q_row, u_row = list(map(float, q)), list(map(float, u))
+        by_name = dict(zip(self.coordinates, q_row, strict=True)), dict(zip(self.speeds, u_row, strict=True))
+        h, c = loop_residuals(self.mechanism, self.mechanism.sites_at(*by_name), *by_name)
+        return np.array([float(x) for x in h]), np.array([float(x) for x in c])
+
+    def velocity_slopes(self, q: np.ndarray) -> np.ndarray:
+        rest = np.zeros(len(self.speeds))
+        # Velocity residuals are affine in the speeds, so differences are their exact derivatives, whatever the step.
+        at_rest = self.residuals(q, rest)[1]
+        return np.array([self.residuals(q, e)[1] - at_rest for e in np.eye(len(rest))]).reshape(-1, self.size).T
+
+    def slopes(self, q: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        rest = np.zeros(len(self.speeds))
+
+        def h(step: np.ndarray) -> np.ndarray:
+            return self.residuals(q + step, rest)[0]
+
+        # Central differences, because JAX would compile the residuals of each mechanism. Rounding limits their error
+        # to about 1e-10.
+        columns = [(h(d * e) - h(-d * e)) / (2.0 * d) for d, e in zip(1e-6 * steps, np.eye(len(q)), strict=True)]
+        return np.array(columns).reshape(-1, self.size).T
+
+
+_KINEMATIC = ("position", "anchor", "site")
+
+
+def _chain_to(links: Mapping[str, LinkStructure], name: str | None) -> list[str]:
+    """The names of the links from the ground to a link."""
+    chain: list[str] = []
+    while name is not None:
+        chain.append(name)
+        name = links[name].parent
+    return chain[::-1]
+
+
+def _within(names: Sequence[str], name: str | None) -> str | None:
+    return name if name in names else None
 
 
 class _Trial:
     """A mechanism with trial numbers for traced or batched parameters, because the independence of residuals is
     structural.
 
-    Residuals are those of the loops and couplings, in their order. Lengths are in units of the largest length of the
-    mechanism. Coordinates, speeds and residuals in m and in rad can then be compared, at any scale.
+    Residuals are those of the loops and couplings, in their order. Coordinates are in units of the largest length of
+    the mechanism, residuals of a loop in units of the largest length of this loop. Coordinates, speeds and residuals in
+    m and in rad can then be compared, at any scale.
     """
 
     def __init__(self, structure: Structure, fields: tuple[Field, ...], values: dict[str, Any]):
@@ -101,54 +243,80 @@ class _Trial:
 
         self.structure = structure
         numbers = {name: number(x) for name, x in values.items()}
-        self.mechanism = class_of(structure, fields)(**numbers)
-        # Python numbers, because JAX would compile every operation
-        self.mechanism = jax.tree.map(float, self.mechanism)
-        self.coordinates = self.mechanism.coordinates
-        self.speeds = (*self.mechanism.speeds, *self.mechanism.dependent_speeds)
+        names = [(joint, joint.names(joint.coordinates), joint.names(joint.speeds)) for joint in structure.joints]
+        self.coordinates = tuple(name for _, coordinates, _ in names for name in coordinates)
+        self.speeds = tuple(name for _, _, speeds in names for name in speeds)
         places = [abs(numbers[name]) for name, _, unit in fields if unit == "m"]
         places += [abs(joint.reference) for joint in structure.joints if joint.coordinates[0][1] == "m"]
         self.length = max(places, default=0.0) or 1.0  # [m]
 
-        def in_unit(unit: Any) -> float:
-            return self.length if unit == "m" else 1.0
+        def in_unit(unit: str) -> float:
+            return self.length if unit in ("m", "m/s") else 1.0
 
-        units = self.mechanism.units
-        self.coordinate_units = np.array([in_unit(units.get(name)) for name in self.coordinates])
-        self.speed_units = np.array([in_unit("m" if units.get(name) == "m/s" else "") for name in self.speeds])
-        loops = [self.length if i < 3 else 1.0 for loop in structure.loops for i in range(loop.size)]
-        first = [in_unit(units.get(x.first)) for x in structure.couplings]
+        self.coordinate_units = np.array([in_unit(unit) for joint in structure.joints for _, unit in joint.coordinates])
+        self.speed_units = np.array([in_unit(unit) for joint in structure.joints for _, unit in joint.speeds])
+        self.closures = [_Closure(structure, fields, numbers, loop) for loop in structure.loops]
+        self.in_q = [[self.coordinates.index(name) for name in closure.coordinates] for closure in self.closures]
+        self.in_u = [[self.speeds.index(name) for name in closure.speeds] for closure in self.closures]
+        loops = [closure.length if i < 3 else 1.0 for closure in self.closures for i in range(closure.size)]
+        first = [self.coordinate_units[self.coordinates.index(x.first)] for x in structure.couplings]
         self.residual_units = np.array([*loops, *first])
-        self.rest = np.zeros(len(self.speeds))
         joints = [joint for joint in structure.joints if len(joint.coordinates) > 1]
         last = [self.coordinates.index(joint.name + joint.coordinates[-1][0]) for joint in joints]
         self.euler_parameters = [slice(i - 3, i + 1) for i in last]
 
-    def residuals(self, q: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals of the configuration and of the velocities."""
-        q_row, u_row = list(map(float, q * self.coordinate_units)), list(map(float, u * self.speed_units))
-        motion: Any = self.mechanism.motion(0.0, q_row, u_row)
-        by_name = dict(zip(self.coordinates, q_row, strict=True)), dict(zip(self.mechanism.speeds, u_row, strict=True))
-        h, c = loop_residuals(self.mechanism, motion.sites, *by_name)
-        return tuple(np.array([float(x) for x in row]) / self.residual_units for row in (h, c))  # type: ignore
+    def residuals(self, q: np.ndarray) -> np.ndarray:
+        """Residuals of the configuration."""
+        q = q * self.coordinate_units
+        rows = [
+            closure.residuals(q[places], np.zeros(len(closure.speeds)))[0]
+            for closure, places in zip(self.closures, self.in_q, strict=True)
+        ]
+        for coupling in self.structure.couplings:
+            value = polynomial(coupling.coefficients, self._of(q, coupling.second))[0]
+            rows.append(np.array([self._of(q, coupling.first) - value]))
+        return np.concatenate(rows) / self.residual_units
+
+    def _of(self, q: np.ndarray, name: str | None) -> float:
+        return float(q[self.coordinates.index(name)]) if name else 0.0
 
     def velocity_slopes(self, q: np.ndarray) -> np.ndarray:
-
-        def velocity_residuals(u: np.ndarray) -> np.ndarray:
-            return self.residuals(q, u)[1]
-
-        # Velocity residuals are affine in the speeds, so differences are their exact derivatives, whatever the step.
-        at_rest = velocity_residuals(self.rest)
-        return np.array([velocity_residuals(e) - at_rest for e in np.eye(len(self.rest))]).T
+        """Derivatives of the velocity residuals with respect to the speeds (residuals, n)."""
+        q = q * self.coordinate_units
+        parts = [
+            (places, closure.velocity_slopes(q[own]))
+            for closure, own, places in zip(self.closures, self.in_q, self.in_u, strict=True)
+        ]
+        return self._assembled(parts, q, self.speeds, "_rate", self.speed_units)
 
     def slopes(self, q: np.ndarray) -> np.ndarray:
+        """Derivatives of the residuals with respect to the coordinates (residuals, n_q)."""
+        q, units = q * self.coordinate_units, self.coordinate_units
+        parts = [
+            (places, closure.slopes(q[places], units[places]))
+            for closure, places in zip(self.closures, self.in_q, strict=True)
+        ]
+        return self._assembled(parts, q, self.coordinates, "", units)
 
-        def h(step: np.ndarray) -> np.ndarray:
-            return self.residuals(q + step, self.rest)[0]
-
-        # Central differences, because JAX would compile the residuals of each mechanism. Rounding limits their error
-        # to about 1e-10.
-        return np.array([(h(1e-6 * e) - h(-1e-6 * e)) / 2e-6 for e in np.eye(len(q))]).T
+    def _assembled(
+        self,
+        parts: list[tuple[list[int], np.ndarray]],
+        q: np.ndarray,
+        names: Sequence[str],
+        ending: str,
+        units: np.ndarray,
+    ) -> np.ndarray:
+        """One matrix of the derivatives of loops, each with respect to its own variables, and of couplings."""
+        matrix, first = np.zeros((len(self.residual_units), len(names))), 0
+        for places, slopes in parts:
+            matrix[first : first + len(slopes), places] = slopes
+            first += len(slopes)
+        for row, coupling in zip(matrix[first:], self.structure.couplings, strict=True):
+            row[names.index(coupling.first + ending)] = 1.0
+            if coupling.second:
+                slope = polynomial(coupling.coefficients, self._of(q, coupling.second))[1]
+                row[names.index(coupling.second + ending)] -= float(slope)
+        return matrix * units / self.residual_units[:, None]
 
     def norm_slopes(self, q: np.ndarray) -> np.ndarray:
         """Derivatives of the norms of Euler parameters with respect to all coordinates (norms, n_q)."""
@@ -162,15 +330,16 @@ class _Trial:
             q[e] /= np.linalg.norm(q[e])
         return q
 
-    def start(self) -> np.ndarray:
-        rng = np.random.default_rng(1)
+    def start(self, pose: Mapping[str, float] | None) -> np.ndarray:
         q = np.array([1.0 if name.endswith("_e4") else 0.0 for name in self.coordinates])
         for joint in self.structure.joints:
             if len(joint.coordinates) == 1:
-                place = self.coordinates.index(joint.name)
-                q[place] = joint.reference / self.coordinate_units[place]
+                q[self.coordinates.index(joint.name)] = joint.reference
+        for name, value in (pose or {}).items():
+            q[self.coordinates.index(name)] = value
+        q /= self.coordinate_units
         # Not at the reference: residuals that are independent elsewhere may be dependent there, if links are in line.
-        return self.normalized(q + rng.uniform(-0.2, 0.2, q.shape))
+        return self.normalized(q if pose is not None else q + np.random.default_rng(1).uniform(-0.2, 0.2, q.shape))
 
     def closed(self, q: np.ndarray, rows: list[int]) -> np.ndarray | None:
         """Coordinates near q at which these residuals are zero; None if Newton's method does not converge."""
@@ -178,7 +347,7 @@ class _Trial:
         for i, group in enumerate(_by_joints(self.structure, self.coordinates, lambda joint: joint.coordinates)):
             weights[group] = max(0.1**i, 1e-3)
         for _ in range(50):
-            h = self.residuals(q, self.rest)[0][rows]
+            h = self.residuals(q)[rows]
             if np.abs(h).max(initial=0.0) < 1e-9:
                 return q
             norms = 0.5 * self.norm_slopes(q)
@@ -188,39 +357,51 @@ class _Trial:
             q = self.normalized(q + step / max(1.0, 2.0 * np.linalg.norm(step)))
         return None  # not closed from there: `assemble` reports it
 
-    def check_implied(self, q: np.ndarray, rows: list[int]) -> None:
-        """Check that residuals that depend on the independent ones are zero where those are.
+    def check_implied(self, q: np.ndarray, rows: list[int], redundant: list[int]) -> None:
+        """Check that residuals that depend on the independent ones are zero where those are. Those that nearly depend
+        on them may be slightly different from zero, and are reported.
 
         **Raises:** `ValueError` for one that is not zero, e.g. if the sites of a planar loop are not in one plane.
         """
-        h = np.abs(self.residuals(q, self.rest)[0])
+        h = np.abs(self.residuals(q))
         h[rows] = 0.0
-        worst = int(np.argmax(h))
-        if h[worst] > 1e-6:
+        origins = [f"Loop({x.first!r}, {x.second!r})" for x in self.structure.loops for _ in range(x.size)]
+        origins += [f"Coupling({x.first!r}, {x.second!r})" for x in self.structure.couplings]
+        allowed = np.array([1e-2 if i in redundant else 1e-6 for i in range(len(h))])
+        worst = int(np.argmax(h / allowed))
+        if h[worst] > allowed[worst]:
             off = h[worst] * self.residual_units[worst]
-            origins = [f"Loop({x.first!r}, {x.second!r})" for x in self.structure.loops for _ in range(x.size)]
-            origins += [f"Coupling({x.first!r}, {x.second!r})" for x in self.structure.couplings]
             raise ValueError(
                 f"{self.structure.name}: {origins[worst]} cannot be satisfied: its residual is {off:.3g} for all "
                 "positions of the joints that satisfy the other loops. In a plane loop, place all sites in one plane. "
                 "Two constraints on one joint must agree."
             )
+        if redundant:
+            listed = ", ".join(f"{origins[i]} ({h[i] * self.residual_units[i]:.2g})" for i in redundant)
+            warnings.warn(
+                f"{self.structure.name}: these loops have residuals that nearly depend on the others and are omitted "
+                f"(their sizes at trial coordinates in brackets): {listed}.",
+                UserWarning,
+                stacklevel=2,
+            )
 
 
-def _independent_rows(C: np.ndarray) -> list[int]:
+def _pivots(C: np.ndarray) -> tuple[np.ndarray, list[int]]:
+    """The sizes of the rows of C, each without its part along those before it, in the returned order."""
     R, order = _qr(C.T)
-    rank = int(
-        np.sum(np.abs(np.diag(R)) > max(1e-9 * abs(R[0, 0]), 1e-13))
-    )  # 1e-13: all entries may be rounding errors
-    return sorted(int(i) for i in order[:rank])
+    return np.abs(np.diag(R)), [int(i) for i in order]
 
 
 def _by_joints(
-    structure: Structure, names: Sequence[str], endings: Callable[[JointType], tuple[tuple[str, str], ...]]
+    structure: Structure,
+    names: Sequence[str],
+    endings: Callable[[JointType], tuple[tuple[str, str], ...]],
+    without: Sequence[str] = (),
 ) -> list[list[int]]:
     """Indices in the order in which they are solved for. Balls and free links come first, those at the end of the tree
     first, so that a welded free link depends as a whole. Hinges and sliders follow."""
-    groups = [[names.index(x) for x in joint.names(endings(joint))] for joint in reversed(structure.joints)]
+    joints = [joint for joint in reversed(structure.joints) if joint.name not in without]
+    groups = [[names.index(x) for x in joint.names(endings(joint))] for joint in joints]
     return [group for group in groups if len(group) > 1] + [[i for group in groups if len(group) == 1 for i in group]]
 
 
@@ -230,7 +411,8 @@ def _best_columns(A: np.ndarray, groups: list[list[int]]) -> list[int]:
     chosen, size = [], np.linalg.norm(A, axis=0)
     # A column that nearly depends on the chosen ones would be solved for with a large error. Only the last pass takes
     # it, if there is no other.
-    for group, threshold in (*((group, 1e-2) for group in groups), (range(A.shape[1]), 0.0)):
+    every = [i for group in groups for i in group]
+    for group, threshold in (*((group, 1e-2) for group in groups), (every, 0.0)):
         rest = [i for i in group if i not in chosen]
         if rest and len(chosen) < len(A):
             Q = np.linalg.qr(A[:, chosen])[0]

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from .._common.lookup import hint, not_there
-from .._kane.contact import Contact
+from .._kane.contact import Contact, DryFriction
 from .._scalarjit.components import (
     ZERO3,
     Component,
@@ -63,6 +63,7 @@ class LoopStructure(NamedTuple):
     second: str
     rigid: bool
     independent: tuple[int, ...]  # indices of its independent residuals
+    dropped: tuple[int, ...] = ()  # those that nearly depend on these, and are omitted
 
     @property
     def size(self) -> int:
@@ -88,6 +89,7 @@ class Structure(NamedTuple):
     dependent_speeds: tuple[str, ...] = ()
     dependent_coordinates: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+    poses: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
     @property
     def joints(self) -> tuple[JointType, ...]:
@@ -96,7 +98,7 @@ class Structure(NamedTuple):
 
 _OWNERS = {
     **dict.fromkeys(("mass", "center", "inertia", "position"), "links"),
-    **dict.fromkeys(("anchor", "damping", "stiffness", "rest", "armature", "lower", "upper"), "joints"),
+    **dict.fromkeys(("anchor", "damping", "stiffness", "rest", "armature", "lower", "upper", "friction"), "joints"),
     **dict.fromkeys(("gain", "offset", "position_gain", "velocity_gain"), "actuators"),
     "site": "sites",
 }
@@ -148,6 +150,12 @@ class Mechanism(System):
     left_out: ClassVar[tuple[str, ...]] = ()
     """Elements of the file that are not part of the mechanism."""
 
+    @property
+    def poses(self) -> dict[str, dict[str, float]]:
+        """Coordinates by the name of a pose, e.g. of the key frames of a file, to start from: `jk.assemble(arm,
+        arm.poses["stand"])`."""
+        return {name: dict(zip(self.coordinates, q, strict=True)) for name, q in self.structure.poses}
+
     def __init__(self, **values: Any):
         for field in dataclasses.fields(self):  # names with a dot cannot be keyword arguments
             setattr(self, field.name, values.pop(field.name) if field.name in values else _default(self, field))
@@ -193,46 +201,52 @@ class Mechanism(System):
         kind: Any = type(self)
         return _equipped(kind, outputs, tuple(extra))(**values, **extra)
 
-    def _read(self, name: str) -> Component:
-        return getattr(self, name, 0.0)
-
-    def _triple(self, name: str) -> Triple:
-        return self._read(f"{name}.x"), self._read(f"{name}.y"), self._read(f"{name}.z")
-
-    def _of(self, joint: JointType, q: NamedVector, u: NamedVector) -> tuple[list[Component], list[Component]]:
-        """The joint's own coordinates and speeds."""
-        return [q[name] for name in joint.names(joint.coordinates)], [u[name] for name in joint.names(joint.speeds)]
-
     def q_dot(self, t, q, u):
-        return [rate for joint in self.structure.joints for rate in joint.rates(*self._of(joint, q, u))]
+        return [rate for joint in self.structure.joints for rate in joint.rates(*_own(joint, q, u))]
 
-    def motion(self, t, q, u):
-        N, O = inertial()
-        carried: dict[str | None, tuple[Frame, Point]] = {None: (N, O)}
-        bodies, points, joints = [], {}, {}
+    def _tree(self, q: Any, u: Any) -> tuple[dict[str | None, tuple[Frame, Point]], dict[str, JointKinematics]]:
+        """The frame and the origin of each link (None: the ground), and the kinematics of the joints."""
+        carried: dict[str | None, tuple[Frame, Point]] = {None: inertial()}
+        joints: dict[str, JointKinematics] = {}
         for link in self.structure.links:
             F, P = carried[link.parent]
-            P = _moved(P, F, self._triple(f"position.{link.name}"))
+            P = _moved(P, F, _triple(self, f"position.{link.name}"))
             F = _turned(F, link.orientation, link.name)
             for joint in link.joints:
-                at = joint.kinematics(F, P, *self._of(joint, q, u), self._triple(f"anchor.{joint.name}"))
+                at = joint.kinematics(F, P, *_own(joint, q, u), _triple(self, f"anchor.{joint.name}"))
                 joints[joint.name] = at
                 F, P = at.child_frame, at.child_point
             carried[link.name] = F, P
-            if link.has_mass:
-                G = _moved(P, F, self._triple(f"center.{link.name}"))
-                bodies.append(Body(self._read(f"mass.{link.name}"), self._inertia(link.name), G, F, name=link.name))
-            else:
-                points[link.name] = P.fixed(F.vector(0.0, 0.0, 0.0))
-        for joint in self.structure.joints:
-            armature = self._read(f"armature.{joint.name}")
-            if not is_zero(armature):
-                bodies += joint.rotors(N, joints[joint.name].child_point, armature, self._of(joint, q, u)[1])
+        return carried, joints
+
+    def sites_at(self, q: Any, u: Any) -> dict[str, tuple[Frame, Point]]:
+        """The frames and points of the sites."""
+        return self._sites(self._tree(q, u)[0])
+
+    def _sites(self, carried: dict[str | None, tuple[Frame, Point]]) -> dict[str, tuple[Frame, Point]]:
         sites = {}
         for site in self.structure.sites:
             F, P = carried[site.link]
-            points[site.name] = P.fixed(F.vector(*self._triple(f"site.{site.name}")))
-            sites[site.name] = _turned(F, site.orientation, site.name), points[site.name]
+            point = P.fixed(F.vector(*_triple(self, f"site.{site.name}")))
+            sites[site.name] = _turned(F, site.orientation, site.name), point
+        return sites
+
+    def motion(self, t, q, u):
+        carried, joints = self._tree(q, u)
+        N, bodies, points = carried[None][0], [], {}
+        for link in self.structure.links:
+            F, P = carried[link.name]
+            if link.has_mass:
+                G = _moved(P, F, _triple(self, f"center.{link.name}"))
+                bodies.append(Body(_read(self, f"mass.{link.name}"), _inertia(self, link.name), G, F, name=link.name))
+            else:
+                points[link.name] = P.fixed(F.vector(0.0, 0.0, 0.0))
+        for joint in self.structure.joints:
+            armature = _read(self, f"armature.{joint.name}")
+            if not is_zero(armature):
+                bodies += joint.rotors(N, joints[joint.name].child_point, armature, _own(joint, q, u)[1])
+        sites = self._sites(carried)
+        points |= {name: point for name, (_, point) in sites.items()}
         frames = {
             at.child_frame.name: at.child_frame for at in joints.values() if at.child_frame is not at.parent_frame
         }
@@ -241,12 +255,12 @@ class Mechanism(System):
         return motion
 
     def loads(self, t, q, u, motion: Any, inputs):
-        gravity = motion.N.vector(*self._triple("gravity"))
+        gravity = motion.N.vector(*_triple(self, "gravity"))
         falls = not all(is_zero(x) for x in gravity.components)
         weighed = [body for body in motion.bodies if falls and not is_zero(body.mass)]  # rotors have no weight
         loads: list[Any] = [Force(body.mass * gravity, body.center) for body in weighed]
         for joint in self.structure.joints:
-            forces = self._forces(joint, *self._of(joint, q, u), inputs)
+            forces = _forces(self, joint, *_own(joint, q, u), inputs)
             if not all(is_zero(x) for x in forces):
                 loads += joint.loads(motion.joints[joint.name], forces)
         return loads
@@ -264,53 +278,78 @@ class Mechanism(System):
 
     def implied_constraints(self, t, q):
         structure = self.structure
-        all_independent = all(len(loop.independent) == loop.size for loop in structure.loops)
+        all_independent = all(len(loop.independent) + len(loop.dropped) == loop.size for loop in structure.loops)
         if all_independent and all(coupling.is_independent for coupling in structure.couplings):
             return []
         return self._loops_at_rest(t, q, independent=False)
 
-    def stops(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion) -> dict[str, Contact]:
-        """The limits of the joints, which are the `contacts` of a mechanism that has such limits."""
-        contacts = {}
+    def stops(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion) -> dict[str, Contact | DryFriction]:
+        """The limits and the dry friction of the joints: the `contacts` of a mechanism that has these."""
+        contacts: dict[str, Contact | DryFriction] = {}
         for joint in self.structure.joints:
             has_lower, has_upper = joint.has_stops
             if has_lower:
-                gap = sub(q[joint.name], self._read(f"lower.{joint.name}"))
+                gap = sub(q[joint.name], _read(self, f"lower.{joint.name}"))
                 contacts[f"{joint.name} lower"] = Contact(gap=gap)
             if has_upper:
-                gap = sub(self._read(f"upper.{joint.name}"), q[joint.name])
+                gap = sub(_read(self, f"upper.{joint.name}"), q[joint.name])
                 contacts[f"{joint.name} upper"] = Contact(gap=gap)
+            if joint.has_friction:
+                friction = _read(self, f"friction.{joint.name}")
+                contacts[f"{joint.name} friction"] = DryFriction(u[f"{joint.name}_rate"], friction)
         return contacts
 
     def _loops_at_rest(self, t: Component, q: NamedVector, independent: bool) -> GroupedResiduals:
         rest = dict.fromkeys((*self.speeds, *self.dependent_speeds), 0.0)
-        return loop_residuals(self, self.motion(t, q, tuple(rest.values())).sites, q, rest, independent)[0]
+        return loop_residuals(self, self.sites_at(q, rest), q, rest, independent)[0]
 
-    def _forces(self, joint: JointType, q: list[Component], u: list[Component], inputs: Any) -> list[Component]:
-        """Forces along the joint's speeds [N or N m], by its spring, damper and actuators."""
-        damping, stiffness = self._read(f"damping.{joint.name}"), self._read(f"stiffness.{joint.name}")
-        forces = [mul(-1.0, mul(damping, w)) for w in u]
-        if not is_zero(stiffness):
-            rest = self._triple(f"rest.{joint.name}") if len(u) == 6 else (self._read(f"rest.{joint.name}"),)
-            forces = [sub(f, mul(stiffness, x)) for f, x in zip(forces, joint.displacement(q, rest), strict=True)]
-        for actuator in self.structure.actuators:
-            if actuator.joint == joint.name:
-                drive = self._drive(actuator, q, u, inputs[actuator.name])
-                forces = [add(f, mul(g, drive)) for f, g in zip(forces, actuator.gear, strict=True)]
-        return forces
 
-    def _drive(
-        self, actuator: ActuatorStructure, q: list[Component], u: list[Component], control: Component
-    ) -> Component:
-        gain, offset, stiff, damp = (
-            self._read(f"{kind}.{actuator.name}") for kind in ("gain", "offset", "position_gain", "velocity_gain")
-        )
-        resisted = add(mul(damp, dot(actuator.gear, u)), mul(stiff, mul(actuator.gear[0], q[0])))
-        return total(map(component, (mul(gain, control), offset, mul(-1.0, resisted))))
+# Functions and not methods: equinox makes an object of a method at each access, in a time that grows with the number of
+# parameters. For 200 links, 10 000 accesses took a sixth of the time of the first accelerations.
 
-    def _inertia(self, link: str) -> Matrix:
-        xx, yy, zz, xy, xz, yz = (self._read(f"inertia.{link}.{ij}") for ij in MOMENTS)
-        return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+
+def _read(mechanism: Mechanism, name: str) -> Component:
+    return getattr(mechanism, name, 0.0)
+
+
+def _triple(mechanism: Mechanism, name: str) -> Triple:
+    return _read(mechanism, f"{name}.x"), _read(mechanism, f"{name}.y"), _read(mechanism, f"{name}.z")
+
+
+def _own(joint: JointType, q: Any, u: Any) -> tuple[list[Component], list[Component]]:
+    """The joint's own coordinates and speeds."""
+    return [q[name] for name in joint.names(joint.coordinates)], [u[name] for name in joint.names(joint.speeds)]
+
+
+def _forces(
+    mechanism: Mechanism, joint: JointType, q: list[Component], u: list[Component], inputs: Any
+) -> list[Component]:
+    """Forces along the joint's speeds [N or N m], by its spring, damper and actuators."""
+    damping, stiffness = _read(mechanism, f"damping.{joint.name}"), _read(mechanism, f"stiffness.{joint.name}")
+    forces = [mul(-1.0, mul(damping, w)) for w in u]
+    if not is_zero(stiffness):
+        rest = _triple(mechanism, f"rest.{joint.name}") if len(u) == 6 else (_read(mechanism, f"rest.{joint.name}"),)
+        forces = [sub(f, mul(stiffness, x)) for f, x in zip(forces, joint.displacement(q, rest), strict=True)]
+    for actuator in mechanism.structure.actuators:
+        if actuator.joint == joint.name:
+            drive = _drive(mechanism, actuator, q, u, inputs[actuator.name])
+            forces = [add(f, mul(g, drive)) for f, g in zip(forces, actuator.gear, strict=True)]
+    return forces
+
+
+def _drive(
+    mechanism: Mechanism, actuator: ActuatorStructure, q: list[Component], u: list[Component], control: Component
+) -> Component:
+    gain, offset, stiff, damp = (
+        _read(mechanism, f"{kind}.{actuator.name}") for kind in ("gain", "offset", "position_gain", "velocity_gain")
+    )
+    resisted = add(mul(damp, dot(actuator.gear, u)), mul(stiff, mul(actuator.gear[0], q[0])))
+    return total(map(component, (mul(gain, control), offset, mul(-1.0, resisted))))
+
+
+def _inertia(mechanism: Mechanism, link: str) -> Matrix:
+    xx, yy, zz, xy, xz, yz = (_read(mechanism, f"inertia.{link}.{ij}") for ij in MOMENTS)
+    return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
 
 
 class MechanismMotion(Motion):
@@ -373,13 +412,14 @@ def loop_residuals(
         if loop.rigid:
             turned = _turned_apart(A, B)
             parting = (*parting, *(B.angular_velocity - A.angular_velocity).components_in(A))
-        rows = [i for i in range(loop.size) if (i in loop.independent) == independent]
+        used = [i for i in range(loop.size) if i not in loop.dropped]
+        rows = [i for i in used if (i in loop.independent) == independent]
         h.append(SomeComponents(tuple(apart[i] for i in rows if i < 3), apart))
         h.append(SomeComponents(tuple(turned[i - 3] for i in rows if i >= 3), (1.0,)))
         c += [parting[i] for i in rows]
     for coupling in mechanism.structure.couplings:
         if coupling.is_independent == independent:
-            value, slope = _polynomial(coupling.coefficients, q[coupling.second] if coupling.second else 0.0)
+            value, slope = polynomial(coupling.coefficients, q[coupling.second] if coupling.second else 0.0)
             h.append(SomeComponents((q[coupling.first] - value,), (q[coupling.first] - value,)))
             rate = mul(slope, u[f"{coupling.second}_rate"]) if coupling.second else 0.0
             c.append(sub(u[f"{coupling.first}_rate"], rate))
@@ -413,7 +453,7 @@ def _turned_apart(A: Frame, B: Frame) -> Triple:
 _HALF_A_TURN = 1e-6  # 1 + the sum of the direction cosines: within 0.06 degrees of half a turn
 
 
-def _polynomial(coefficients: tuple[float, ...], x: Component) -> tuple[Component, Component]:
+def polynomial(coefficients: tuple[float, ...], x: Component) -> tuple[Component, Component]:
     """Value and derivative."""
     value: Component = 0.0
     slope: Component = 0.0
@@ -448,8 +488,9 @@ def class_of(structure: Structure, fields: tuple[Field, ...]) -> type[Mechanism]
         "dependent_coordinates": structure.dependent_coordinates,
         "inputs": tuple(actuator.name for actuator in structure.actuators),
         "units": units,
+        "is_tree_of_joints": not (structure.loops or structure.couplings),  # see `check_description`
     }
-    if any(any(joint.has_stops) for joint in joints):
+    if any(any(joint.has_stops) or joint.has_friction for joint in joints):
         members["contacts"] = Mechanism.stops  # without it, a mechanism is simulated without contact states
     cls: Any = type(Mechanism)(structure.name, (Mechanism,), members | of_parameters)  # pyright: ignore
     return cls

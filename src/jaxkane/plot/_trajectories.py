@@ -91,8 +91,10 @@ def trajectories(
             scale, unit = scale_of(units_by_name[name], degrees)
             parts = [part for part in (label_of(name) if len(group) > 1 else "", label) if part]
             y = (scale * values[name]).reshape(n, -1)
-            line = ax.plot(t[0], y[0], label=", ".join(parts) or None, **members | style)[0]
-            ax.plot(t[1:].T, y[1:].T, **members | style | {"color": line.get_color()})
+            lines = [_with_jumps(trajectory, name, k, t[k], y[k], scale) for k in range(n)]
+            line = ax.plot(*lines[0], label=", ".join(parts) or None, **members | style)[0]
+            for points in lines[1:]:
+                ax.plot(*points, **members | style | {"color": line.get_color()})
             _mark_ends(ax, trajectory, t, y, line.get_color())
             labelled.append((name, unit))
         ax.set_ylabel(_axis_label(labelled))
@@ -101,6 +103,35 @@ def trajectories(
         _mark_t_end(panel_axes, trajectory)
     panel_axes[-1].set_xlabel("time [s]")
     return panel_axes
+
+
+def _with_jumps(
+    trajectory: Trajectory, name: str, k: int, t: np.ndarray, y: np.ndarray, scale: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times and values of member `k`, with the values before and after each jump of the state and a gap between them.
+
+    Without them, a line would slope from the last sample before a jump to the first one after it. Quantities that are
+    not in the state have a gap only.
+    """
+    jumps = trajectory.jumps
+    if jumps is None:
+        return t, y
+    count = int(np.ravel(np.asarray(jumps.count))[k])
+    times = np.reshape(np.asarray(jumps.t), (-1, np.shape(jumps.t)[-1]))[k, :count]
+    sides = np.full((2, count), np.nan)
+    if name in jumps.inputs[0]:
+        values = [np.reshape(np.asarray(x[name]), (-1, np.shape(jumps.t)[-1]))[k, :count] for x in jumps.inputs]
+        sides = scale * np.stack(values)
+    for i, names in enumerate((trajectory.names[0], trajectory.names[1], trajectory.names[3])):
+        if name in names:
+            states = [(side.q, side.u, side.x)[i] for side in (jumps.before, jumps.after)]
+            values = [np.reshape(np.asarray(x), (-1, *np.shape(x)[-2:]))[k, :count] for x in states]
+            sides = scale * np.stack(values)[:, :, names.index(name)]
+    # Before a jump, a gap, and after it; samples at the time of a jump have the value after it.
+    at = np.repeat(times, 3)
+    points = np.stack([sides[0], np.full(count, np.nan), sides[1]], axis=1).reshape(-1)
+    places = np.repeat(np.searchsorted(t, times, side="left"), 3)
+    return np.insert(t, places, at), np.insert(y, places, points)
 
 
 def scale_of(unit: str, degrees: bool) -> tuple[float, str]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..graph import LIBRARY, Graph, NotScalarError, needed, symbol
+from ..graph import LIBRARY, Graph, NotScalarError, depth_first, needed, symbol
 from .ffi_layout import LAYOUT
 
 _METADATA = 1
@@ -182,6 +182,11 @@ INTRINSICS = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "max": "maximum",
 # compiles in two thirds of the time.
 _BLOCK = 1000
 
+# Longer kernels are ordered depth first. LLVM assigns registers in a time that grows with the number of values that are
+# alive: the two kernels of a tree of 200 bodies (38 000 and 52 000 lines) compile in 5.9 s instead of 9.1 s. Shorter
+# kernels keep the order of the program, in which a batch of bicycles is 7 % faster.
+_LONG = 10_000
+
 
 class Writer:
     """The text of one function: `void it(ptr in, ptr out, i64 n)`, with pointers to n lanes of every argument.
@@ -227,7 +232,7 @@ class Writer:
                 self.lines.append(f"%{side}{i} = load ptr, ptr %{side}{i}.at")
         self.lines.append(f"%kept = alloca double, i64 {max(len(shared & read), 1)}, align 64")
         self.lines.append("%is.empty = icmp eq i64 %n, 0")
-        for k in self._in_blocks("entry", shared):
+        for k in self._in_blocks("entry", shared, outputs):
             self._node(k, 1)
             if k in read:
                 self.places[k] = len(self.places)
@@ -243,7 +248,7 @@ class Writer:
         for lane in range(self.lanes):
             self.lines.append(f"%i{lane}.open = add i64 %i, {lane}")
             self.lines.append(f"%i{lane} = call i64 @llvm.umin.i64(i64 %i{lane}.open, i64 %last)")
-        for k in self._in_blocks("lanes", wide):
+        for k in self._in_blocks("lanes", wide, outputs):
             self._node(k, self.lanes)
         self.lines += ["br label %stored", "stored:"]
         self._store_outputs(outputs, varying=True)
@@ -254,12 +259,15 @@ class Writer:
             [*sorted(self.declared), "define void @it(ptr %in, ptr %out, i64 %n) nounwind {", "entry:", body, "}", ""]
         )
 
-    def _in_blocks(self, label: str, nodes: Set[int]) -> Iterator[int]:
+    def _in_blocks(self, label: str, nodes: Set[int], outputs: Sequence[np.ndarray]) -> Iterator[int]:
         """The nodes in order. Between blocks is a branch that is never taken, so that LLVM does not join them. The
         first block has this label; `self.block` is the last one."""
         self.block = label
         size = -(-len(nodes) // max(1, len(nodes) // _BLOCK))
-        for i, k in enumerate(sorted(nodes)):
+        order = sorted(nodes)
+        if len(nodes) > _LONG:
+            order = depth_first(self.graph.nodes, nodes, (int(k) for out in outputs for k in out.flat))
+        for i, k in enumerate(order):
             if i and i % size == 0:
                 self.block = f"{label}.{i}"
                 self.lines += [f"br i1 %is.empty, label %done, label %{self.block}", f"{self.block}:"]
