@@ -13,7 +13,7 @@
     eigenvalues       eigenvalues of ten thousand bicycles: BicycleParameters, numpy
     identification    fits of the bicycle, and whether they can be trusted (four minutes)
     million           a million bicycles, killed on the way (five minutes)
-    swing_up          optimal control by CasADi and IPOPT: opty (one minute)
+    swing_up          optimal control by direct collocation: opty (one minute)
 
 Every answer is compared before it is timed; a peer that is not installed is named and left out (pip install
 'jaxkane[benchmarks]').

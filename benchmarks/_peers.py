@@ -13,7 +13,10 @@ PEERS = {
     "MJX": (("mujoco.mjx",), "pip install mujoco-mjx"),
     "Pinocchio": (("pinocchio",), "pip install pin"),
     "JaxSim": (("jaxsim", "rod"), "pip install jaxsim"),
-    "opty": (("opty", "casadi", "Cython", "setuptools", "cc"), "pip install opty casadi cython setuptools, and IPOPT"),
+    "opty": (
+        ("opty", "casadi", "Cython", "setuptools", "cc"),
+        "pip install cyipopt-wheels cython; opty --no-deps",
+    ),
     "BicycleParameters": (("bicycleparameters",), "pip install BicycleParameters"),
 }
 

@@ -79,6 +79,7 @@ MODULES = {
     "sweep": "sweeps",
     "plot": "pictures",
     "stability": "stability",
+    "collocation": "optimal_control",
     "fit": "fit",
     "data": "fit",
     "estimate": "state_estimation",
@@ -102,6 +103,7 @@ SUBJECTS = {
         "result": ("Results, uncertainty, validation", "uncertainty"),
         "extend": ("Model extensions", "model_extensions"),
         "inverse": ("Inverse dynamics", "inverse_dynamics"),
+        "collocated": ("Fits by collocation", "optimal_control"),
         "_bicycle": ("Bicycles", "bicycles_fit"),
     },
 }
@@ -115,7 +117,8 @@ equations_of_motion accelerations mass_matrix forcing configure
 CATALOG mechanism Link Loop Site Actuator Coupling hinge slide universal ball planar fixed free
 spring damper actuator torsional_spring torsional_damper dc_motor rotor friction torsional_friction drag
 sweep grid Table Sweep trajectories audit fits equilibrium steady_turn SteadyMotion linearize LinearModel eigenvalues
-Eigenvalues critical_speeds fit minimize LeastSquares Fit Trial check_records Problem Free Offset Gain Delay LowPass
+Eigenvalues critical_speeds solve Plan Phases Now continuation
+fit minimize LeastSquares Fit Trial check_records Problem Free Offset Gain Delay LowPass
 report save_report load begin predict update Filter Belief Innovation
 Bicycle Part Ground Road Slope Tyre Contact RigidRider LeaningRider Rider equations Equations c numpy casadi stablehlo
 """.split()

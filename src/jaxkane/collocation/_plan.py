@@ -278,7 +278,7 @@ class Regulator(eqx.Module):
         at = jax.lax.stop_gradient(t)
         i = jnp.clip(jnp.sum(self.mesh <= at, dtype=jnp.int32) - 1, 0, self.mesh.shape[0] - 2)
         u = (t - self.mesh[i]) / (self.mesh[i + 1] - self.mesh[i])
-        powers = u ** jnp.arange(self.Y.shape[1])
+        powers = jnp.stack([u**k for k in range(self.Y.shape[1])])  # an array of integers would be promoted
         x = () if state.x is None else (jnp.asarray(state.x),)
         y = jnp.concatenate([jnp.asarray(state.q), jnp.asarray(state.u), *x])
         w = powers @ self.W[i] - self.gains[i] @ (y - powers @ self.Y[i])

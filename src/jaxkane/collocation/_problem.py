@@ -301,7 +301,14 @@ class Problem:
         free = (self.free,) if isinstance(self.free, str) else self.free
         if isinstance(free, (tuple, list)) and not free:
             return None
-        return parameters_of(self.system, free)
+        parameters = parameters_of(self.system, free)
+        wrong = [x for x in parameters.all_entries if x.roles or x.group is not None]
+        if wrong or parameters.has_prior.any():
+            raise ValueError(
+                f"Problem: `free` accepts parameters of {self.title} with bounds. Gains, delays, `each` and priors "
+                "belong to measurements: see jaxkane.fit.fit."
+            )
+        return parameters
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,215 @@
+"""Fits by direct collocation: against windows, against the Kalman filter, and their coverage."""
+
+import dataclasses
+import itertools
+import os
+import signal
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from systems import Cart
+
+import jaxkane as jk
+from jaxkane.fit import Collocation, Delay, Free, Gain, Inertia, Offset, Trial, fit
+
+pytest.importorskip("casadi")
+
+TRUTH = Cart(mass=1.3, stiffness=5.0, damping=0.4)
+GUESS = Cart(mass=1.7, stiffness=4.0, damping=0.3)
+NAMES = ("mass", "stiffness", "damping")
+T = np.linspace(0.0, 3.0, 61)
+
+
+def known_push(t):
+    return np.sin(2.0 * t) + 0.5 * np.sin(5.3 * t)
+
+
+def exact(h, density=0.0):
+    """Exact steps of the cart from sample to sample: state, linear push; and the covariance of white noise in push."""
+    m, k, c = float(TRUTH.mass), float(TRUTH.stiffness), float(TRUTH.damping)
+    A, B = np.array([[0.0, 1.0], [-k / m, -c / m]]), np.array([0.0, 1.0 / m])
+    block = np.zeros((4, 4))
+    block[:2, :2], block[:2, 2], block[2, 3] = A, B, 1.0
+    step = scipy.linalg.expm(h * block)
+    van_loan = scipy.linalg.expm(h * np.block([[-A, density * np.outer(B, B)], [np.zeros((2, 2)), A.T]]))
+    return step[:2, :2], step[:2, 2], step[:2, 3], van_loan[2:, 2:].T @ van_loan[:2, 2:]
+
+
+def record(seed, density=0.0, sigma=(2e-3, 1e-2), t=T, **more):
+    """A record of position and speed, with a known push, white noise in the push and noise of the sensors."""
+    rng, h = np.random.default_rng(seed), t[1] - t[0]
+    F, G0, G1, Q = exact(h, density)
+    L = np.linalg.cholesky(Q) if density else np.zeros((2, 2))
+    push = known_push(t)
+    states = [np.array([0.2, 0.0])]
+    for a, b in itertools.pairwise(push):
+        states.append(F @ states[-1] + G0 * a + G1 * (b - a) / h + L @ rng.normal(size=2))
+    y = np.array(states) + rng.normal(size=(len(t), 2)) * sigma
+    return Trial(t, {"x": y[:, 0], "x_dot": y[:, 1]}, {"push": push}, sigma=dict(zip(("x", "x_dot"), sigma)), **more)
+
+
+def by_collocation(trials, free=NAMES, guess=GUESS, unknown=("x", "x_dot"), **how):
+    options = {k: how.pop(k) for k in ("priors",) if k in how}
+    return fit(guess, trials, free, unknown=unknown, transcription=Collocation(**how), **options)
+
+
+def test_equals_simulation_if_inputs_are_known():
+    """Estimates within 0.4 % and a tenth of a standard error, standard errors within 5 %."""
+    trial = record(1)
+    found, other = by_collocation(trial), fit(GUESS, trial, NAMES, unknown=("x", "x_dot"))
+    assert found.ok
+    assert found.cost == pytest.approx(other.cost, rel=1e-3)
+    for name in NAMES:
+        assert found.estimates[name] == pytest.approx(other.estimates[name], rel=4e-3)
+        assert abs(found.estimates[name] - other.estimates[name]) < 0.1 * other.standard_errors[name]
+        # `Fit` scales by the variance of the residuals.
+        formal = other.standard_errors[name] / np.sqrt(other.variance)
+        assert found.standard_errors[name] == pytest.approx(formal, rel=0.05)
+
+
+def test_equals_the_kalman_filter_if_an_input_is_unknown():
+    """A quarter of a standard error; standard errors within 15 %: observed and expected curvature differ."""
+    trial = record(2, density=0.3)
+    found = by_collocation(trial, unknown_inputs={"push": 0.3})
+    other = fit(GUESS, trial, NAMES, unknown=("x", "x_dot"), noise={"push": 0.3})
+    assert found.ok
+    for name in NAMES:
+        assert abs(found.estimates[name] - other.estimates[name]) < 0.25 * other.standard_errors[name]
+        assert found.standard_errors[name] == pytest.approx(other.standard_errors[name], rel=0.15)
+    motion = found.motions["trial"]
+    assert set(motion) == {"x", "x_dot", "push"}
+    assert np.std(motion["push"] - known_push(T)) > 0.1  # the unknown part is estimated, too
+
+
+def z_scores(seeds):
+    scores = []
+    for seed in seeds:
+        found = by_collocation(record(seed, density=0.3), unknown_inputs={"push": 0.3})
+        assert found.ok, seed
+        scores.append([(found.estimates[n] - float(getattr(TRUTH, n))) / found.standard_errors[n] for n in NAMES])
+    return np.array(scores)
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_truth():
+    """95 % intervals, 40 records of 3 parameters: at least 107 of 120, which less than 1 % of such sets miss."""
+    inside = np.abs(z_scores(range(100, 140))) < 1.96
+    assert inside.sum() >= 107
+
+
+def test_gains_offsets_priors_and_several_trials():
+    """Truth within four standard errors; a strong prior wins."""
+    trials = [record(seed, name=f"run {seed}") for seed in (3, 4)]
+    wrong = [Trial(t.t, {k: v + 0.05 * (k == "x") for k, v in t.measured.items()}, {"push": 2.0 * t.inputs["push"]},
+                   sigma=t.sigma, name=t.name) for t in trials]  # fmt: skip
+    free = (*NAMES[1:], Gain("push", bounds=(0.1, 2.0)), Offset("x", each="trial"))
+    found = by_collocation(wrong, free, dataclasses.replace(GUESS, mass=TRUTH.mass))
+    assert found.ok
+    assert abs(found.estimates["gain of push"] - 0.5) < 4 * found.standard_errors["gain of push"]
+    for row in found.nuisance().values():
+        assert row["offset of x"] == pytest.approx(0.05, abs=0.01)
+    held = by_collocation(trials, (*NAMES[1:], Free("mass", prior=(1.5, 1e-5))))
+    assert held.estimates["mass"] == pytest.approx(1.5, abs=1e-3)
+
+
+def test_delay_of_an_input():
+    """0.1 s, within four standard errors."""
+    trial = record(5)
+    late = Trial(T, trial.measured, {"push": known_push(T + 0.1)}, sigma=trial.sigma)
+    found = by_collocation(late, (*NAMES, Delay("push", bounds=(0.0, 0.3), before=0.0)))
+    assert found.ok
+    assert abs(found.estimates["delay of push"] - 0.1) < 4 * found.standard_errors["delay of push"]
+
+
+def test_bounds_of_states_are_met():
+    found = by_collocation(record(6), within={"x": (-0.1, None)}, unknown_inputs={})
+    assert found.motions["trial"]["x"].min() >= -0.1 - 1e-6
+    assert record(6).measured["x"].min() < -0.11  # the bound contradicts the data
+
+
+def test_a_gap_and_a_clock():
+    """The same estimates, 1e-6, if the clock starts at 1.7e9 s; missing samples are not used."""
+    trial = record(7)
+    gap = {k: np.where((T > 1.0) & (T < 1.3), np.nan, v) for k, v in trial.measured.items()}
+    found = by_collocation(Trial(T, gap, trial.inputs, sigma=trial.sigma))
+    late = by_collocation(Trial(T + 1.7e9, gap, trial.inputs, sigma=trial.sigma))
+    assert found.ok
+    for name in NAMES:
+        assert late.estimates[name] == pytest.approx(found.estimates[name], rel=1e-5)
+    assert np.isnan(found.residuals["trial"]["x"]).sum() == np.isnan(gap["x"]).sum()
+
+
+def test_undetermined_parameters_have_no_interval():
+    """Mass, stiffness and damping of a free motion are known up to a factor."""
+    trial = record(8)
+    still = Trial(T, trial.measured, {"push": 0.0 * T}, sigma=trial.sigma)
+    found = by_collocation(still)
+    assert not found.ok
+    assert found.status in ("undetermined", "failed")
+
+
+def test_feasible_inertia():
+    """Moments that no body has are not reached: 1.3 of the other two."""
+
+    class Spun(jk.System):
+        moments: jnp.ndarray = jk.parameter([1.0, 1.0, 1.2], positive=True, unit="kg m^2")
+        coordinates, speeds, inputs = ("a",), ("w",), ("torque",)
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            A = N.rotate(3, q["a"], u["w"])
+            return jk.Motion([jk.Body(1.0, tuple(self.moments[i] for i in range(3)), O, A, name="A")])
+
+        def loads(self, t, q, u, motion, inputs):
+            return jk.Torque(inputs["torque"] * motion.N.z, motion["A"].frame)
+
+    torque = np.ones_like(T)
+    trial = Trial(T, {"w": T / 2.5, "a": T**2 / 5.0}, {"torque": torque}, sigma={"w": 1e-3, "a": 1e-3})
+    free = Inertia(moments=("moments[0]", "moments[1]", "moments[2]"))
+    with pytest.raises(ValueError, match="moments"):
+        by_collocation(trial, free, Spun(), ("a", "w"))
+
+
+def test_interrupted_fit_keeps_its_iterate():
+    class Interrupting:
+        def __call__(self, program, z, monitor, **arguments):
+            def show(iteration, cost, violation):
+                if iteration == 1:
+                    os.kill(os.getpid(), signal.SIGINT)
+
+            monitor.show = show
+            return jk.collocation.Ipopt()(program, z, monitor, **arguments)
+
+    found = by_collocation(record(9), solver=Interrupting())
+    assert found.status == "interrupted"
+    assert not found.ok
+    assert np.isfinite([*found.estimates.values()]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"unknown_inputs": {"pull": 1.0}}, "pull"),
+        ({"unknown_inputs": {"push": -1.0}}, "unknown_inputs"),
+        ({"unknown_inputs": {"push": "much"}}, "unknown_inputs"),
+        ({"within": {"y": (0.0, 1.0)}}, "within"),
+        ({"within": {"x": (1.0, 0.0)}}, "lower bound"),
+        ({"intervals_per_sample": 0}, "intervals_per_sample"),
+        ({"method": "euler"}, "method"),
+    ],
+)
+def test_wrong_options(change, words):
+    with pytest.raises(ValueError, match=words):
+        by_collocation(record(1), **change)
+
+
+@pytest.mark.parametrize("option", [{"window": 0.5}, {"noise": {"push": 1.0}}, {"zero_order_hold": ("push",)}])
+def test_options_that_collocation_does_not_have(option):
+    with pytest.raises(ValueError, match=next(iter(option))):
+        fit(GUESS, record(1), NAMES, transcription=Collocation(), **option)
+    with pytest.raises(ValueError, match="steps"):
+        fit(GUESS, record(1), NAMES, transcription=Collocation(), steps=3)
+    with pytest.raises(ValueError, match="delay of sensor"):
+        fit(GUESS, record(1), (*NAMES, Delay("x")), transcription=Collocation())
