@@ -114,6 +114,7 @@ class Monitor:
 
 
 INTERRUPTED = "interrupted"
+NOT_FINITE = "a function or a derivative is not finite"
 
 
 class Solver(Protocol):
@@ -155,7 +156,7 @@ _IPOPT_STATUS = {
     "Search_Direction_Becomes_Too_Small": (False, "the steps became too small"),
     "Restoration_Failed": (False, "no feasible point was found near the last iterate"),
     "Error_In_Step_Computation": (False, "no step could be computed"),
-    "Invalid_Number_Detected": (False, "a function or a derivative is not finite"),
+    "Invalid_Number_Detected": (False, NOT_FINITE),
     "Not_Enough_Degrees_Of_Freedom": (False, "there are more equations than variables"),
     "User_Requested_Stop": (False, INTERRUPTED),
 }
