@@ -11,6 +11,7 @@ import dataclasses
 import importlib.util
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
@@ -466,4 +467,9 @@ def default_solver() -> Solver:
         return Ipopt()
     if importlib.util.find_spec("cyipopt") is not None:
         return Cyipopt()
+    warnings.warn(
+        "IPOPT is not installed, so SciPy's trust-constr is used, which takes many more iterations. Run "
+        "`pip install jaxkane[collocation]`, or pass solver=jaxkane.collocation.TrustConstr().",
+        stacklevel=4,
+    )
     return TrustConstr()
