@@ -85,6 +85,34 @@ def test_interrupt_between_two_meshes_keeps_the_solution(monkeypatch):
     assert plan.violation < 1e-6
 
 
+@dataclasses.dataclass
+class OnlyCoarse:
+    """A solver that fails on the second mesh."""
+
+    status: str
+    calls: int = 0
+
+    def __call__(self, program, z, monitor, **options):
+        self.calls += 1
+        solution = TrustConstr()(program, z, monitor, **options)
+        return solution if self.calls == 1 else dataclasses.replace(solution, z=0 * z, ok=False, status=self.status)
+
+
+@pytest.mark.parametrize("status", [INTERRUPTED, "the largest number of iterations was reached"])
+def test_failure_on_a_finer_mesh_keeps_the_solution(status):
+    """The energy of a sled with a spring, whose mesh of one interval is too coarse."""
+    problem = Problem(
+        Sled(stiffness=4.0), 1.0, controls=["force"], cost=lambda t, now: now["force"] ** 2,
+        start={"x": 0.0, "v": 0.0}, end={"x": 1.0, "v": 0.0},
+    )  # fmt: skip
+    plan = solve(problem, intervals=1, solver=OnlyCoarse(status))
+    assert not plan.ok
+    assert plan.reason == (status if status == INTERRUPTED else f"solved, but not on a finer mesh: {status}")
+    assert (len(plan.mesh), len(plan.costs)) == (2, 1)
+    assert float(plan["x"][-1]) == 1.0
+    assert np.max(plan.errors) > 1e-6
+
+
 def test_an_error_in_a_function_is_not_hidden():
     """Solvers would report an exception in a callback as a number that is not finite."""
 

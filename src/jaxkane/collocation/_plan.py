@@ -42,7 +42,7 @@ class Plan:
     - `problem`: the problem that was solved.
     - `ok`: whether the solver found a local minimum and the local errors are below the tolerance.
     - `reason`: the result in words.
-    - `cost`: the cost. `duration`: [s].
+    - `cost`: the cost, of all phases together. `duration`: [s].
     - `estimates`: the values of the free parameters by name. `system`: the system with these values.
     - `trajectory`: the `Trajectory` at the nodes; None for phases with different states.
     - `mesh` (N + 1,): the ends of the intervals [s].

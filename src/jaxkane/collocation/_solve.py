@@ -221,19 +221,21 @@ class _Search:
         iterations, is_warm = 0, isinstance(guesses[0][0], Plan)
         sizes = [_sizes(p, guess) for p, (guess, _) in zip(problems, guesses, strict=True)]
         transcription = self._transcribed(meshes, motions, theta, sizes)
-        sizes = transcription.sizes
+        sizes, solved = transcription.sizes, None  # the solution on the mesh before, which must not be lost
         while True:
             solution = self._solved(transcription, is_warm)
+            iterations += solution.iterations
+            if solved is not None and not solution.ok:
+                return self._unrefined(*solved, solution.status, costs, iterations)
             program, x = transcription.program, solution.z * transcription.x_scale
             costs.append(program.objective(solution.z) * program.f_scale)
-            iterations += solution.iterations
             motions, theta = transcription.motions(x), transcription.theta(x)
             errors = None
             if self.tolerance is not None and solution.ok:
                 try:
                     errors = self._errors(transcription, x)
-                except KeyboardInterrupt:  # the solution must not be lost
-                    solution = dataclasses.replace(solution, ok=False, status=INTERRUPTED)
+                except KeyboardInterrupt:
+                    return self._unrefined(transcription, solution, None, INTERRUPTED, costs, iterations)
             new = self._refined(meshes, errors)
             if new is None or len(costs) == MAX_MESHES or max(len(m) for m in new) > self.max_intervals + 1:
                 return self._plan(transcription, solution, errors, costs, iterations, new is not None)
@@ -241,14 +243,27 @@ class _Search:
                 interpolated(motion, mesh, self.method, nodes_of(finer, self.method))
                 for motion, mesh, finer in zip(motions, meshes, new, strict=True)
             ]
+            solved = transcription, solution, errors
             try:
                 transcription = self._transcribed(new, motions, theta, sizes)
             except (KeyboardInterrupt, ValueError) as error:  # a function may not be finite at a new node
-                stopped = isinstance(error, KeyboardInterrupt)
-                reason = INTERRUPTED if stopped else f"solved, but not on a finer mesh: {error}"
-                solution = dataclasses.replace(solution, ok=False, status=reason)
-                return self._plan(transcription, solution, errors, costs, iterations, False)
+                status = INTERRUPTED if isinstance(error, KeyboardInterrupt) else str(error)
+                return self._unrefined(*solved, status, costs, iterations)
             meshes, is_warm = new, True
+
+    def _unrefined(
+        self,
+        transcription: Transcription,
+        solution: Solution,
+        errors: Sequence[np.ndarray] | None,
+        status: str,
+        costs: Sequence[float],
+        iterations: int,
+    ) -> Plan:
+        """The plan of a solution whose mesh should be finer, with the status of the finer mesh."""
+        reason = status if status == INTERRUPTED else f"solved, but not on a finer mesh: {status}"
+        solution = dataclasses.replace(solution, ok=False, status=reason)
+        return self._plan(transcription, solution, errors, costs, iterations, False)
 
     def _transcribed(self, meshes: Any, motions: Any, theta: np.ndarray, sizes: Any) -> Transcription:
         phases, links = self.phases.phases, self.phases.links
