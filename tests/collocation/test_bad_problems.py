@@ -220,6 +220,20 @@ def test_a_problem_without_a_solution_names_its_constraints():
     assert np.all(np.isfinite(plan["x"]))
 
 
+def test_a_derivative_that_is_not_finite_is_named():
+    plan = solved(cost=lambda t, now: jnp.sqrt(now["force"] ** 2))
+    assert not plan.ok
+    assert plan.reason == "the derivative of `cost` is not finite at the last iterate"
+
+
+def test_a_function_that_is_not_finite_on_a_finer_mesh_keeps_the_solution():
+    """The speed at a new node is above the limit by the error of the interpolation."""
+    plan = solved(path=lambda t, now: {"slow": jnp.sqrt(1.3 - now["v"]) - 0.01})
+    assert plan.reason.startswith("solved, but not on a finer mesh: Problem: `path` is not finite") or plan.ok
+    assert plan.violation < 1e-6
+    assert plan.cost == pytest.approx(13.065, abs=0.2)
+
+
 def test_a_cost_without_a_lower_bound():
     plan = solved(cost=lambda t, now: -(now["force"] ** 2))
     assert not plan.ok

@@ -169,6 +169,7 @@ class Hypersensitive(Sled):
         return jk.Force((inputs["force"] - u["v"] ** 3) * motion.N.x, motion["sled"])
 
 
+@pytest.mark.slow
 def test_hypersensitive_problem():
     """J. T. Betts, Practical Methods for Optimal Control, example 10.7: 6.7241 over 10 000 s, which is at rest but for
     the first and last seconds."""
@@ -200,6 +201,7 @@ class Chute(jk.System):
         return jk.weight(motion, 9.81 * motion.N.y), jk.Torque(inputs["torque"] * motion.N.z, motion["bead"])
 
 
+@pytest.mark.slow
 def test_brachistochrone():
     """A cycloid of radius 1 m down to the parameter 2: its time is 2 sqrt(1 / 9.81) s. Its heading turns steadily."""
     rtol = 1e-5
@@ -232,14 +234,20 @@ def test_lane_change_of_notebook_9():
     assert refined.deviation(refined.replay()) < 1e-4
 
 
+WALKERS = [
+    (jk.catalog.CompassGait(), [-0.22, 0.32, 0.0], [1.1, 0.4], 0.73),
+    pytest.param(jk.catalog.SimplestWalker(), [0.2, 0.4, 0.0], [-0.626, -0.05], 1.24, marks=pytest.mark.long),
+]
+
+
 @pytest.mark.slow
-def test_gait_of_the_compass_walker():
+@pytest.mark.parametrize(("walker", "q", "u", "period"), WALKERS, ids=lambda x: type(x).__name__)
+def test_gaits_of_walkers(walker, q, u, period):
     """A phase that its own heel strike leads back to its start is the periodic orbit."""
     rtol = 1e-8
-    walker, first = jk.catalog.CompassGait(), jk.State([-0.22, 0.32, 0.0], [1.1, 0.4])
-    orbit = periodic(walker, first, section="heel_strike")
-    step = Problem(walker, (0.4, 1.2), controls=[], start={"foot": 0.0})
-    guess = jk.simulate(walker, first, jnp.linspace(0.0, 0.7, 50))
+    orbit = periodic(walker, jk.State(q, u), section="heel_strike", period=period)
+    step = Problem(walker, (0.5 * period, 1.5 * period), controls=[], start={"foot": 0.0})
+    guess = jk.simulate(walker, jk.State(q, u), jnp.linspace(0.0, 0.95 * period, 50))
     plan = solve(Phases([step], links=["heel_strike"]), [guess], intervals=20, method="lobatto", tolerance=1e-8)
     assert plan.ok, plan.reason
     assert plan.duration == pytest.approx(float(orbit.period), rel=rtol)

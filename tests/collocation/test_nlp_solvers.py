@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mechanisms import Sled
 
-from jaxkane._collocate.solvers import INTERRUPTED
+from jaxkane._collocate.solvers import INTERRUPTED, default_solver
 from jaxkane.collocation import Cyipopt, Ipopt, Problem, TrustConstr, solve
 
 
@@ -121,3 +121,9 @@ def test_progress_is_shown_on_one_line(capsys):
     assert shown.err.startswith("\riteration 0: cost ")
     assert shown.err.endswith("\n")
     assert shown.err.count("\n") == 1
+
+
+def test_default_without_ipopt_is_named(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.warns(UserWarning, match=r"pip install jaxkane\[collocation\]"):
+        assert isinstance(default_solver(), TrustConstr)

@@ -103,6 +103,49 @@ def test_two_phases_are_one_motion(plan, joined):
             call()
 
 
+class Barge(jk.System):
+    """A point of 2 kg with its own names."""
+
+    coordinates, speeds, inputs = ("place",), ("speed",), ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(2.0, 0.0, O.moving(q["place"] * N.x, u["speed"] * N.x), N, name="barge")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(inputs["push"] * motion.N.x, motion["barge"])
+
+
+def test_phases_of_different_systems():
+    """A sled of 1 kg becomes a barge of 2 kg at 0.5 m, and keeps its momentum. By 1 N the sled has 1 m/s there, after
+    1 s. The barge has 0.5 m/s, and -1 N stop it within 1 s and 0.25 m."""
+    fast = {"force": (0.0, 1.0)}
+    sled = Problem(Sled(), (0.2, 3.0), controls=fast, final_cost=lambda t, now: t, start=ENDS["start"])
+    barge = Problem(
+        Barge(), (0.2, 3.0), controls={"push": (-1.0, 0.0)}, final_cost=lambda t, now: t,
+        end={"place": 0.75, "speed": 0.0},
+    )  # fmt: skip
+
+    def link(last, first):
+        return {
+            "place": first["place"] - last["x"],
+            "momentum": 2.0 * first["speed"] - last["v"],
+            "at": last["x"] - 0.5,
+        }
+
+    plan = solve(Phases([sled, barge], [link]), intervals=4, tolerance=None)
+    assert plan.ok, plan.reason
+    assert [phase.duration for phase in plan.phases] == pytest.approx([1.0, 1.0], abs=1e-6)
+    assert plan.trajectory is None
+    assert plan.multipliers["phase 0: at"] != 0
+    for wrong in (lambda: plan["x"], lambda: plan.t, lambda: plan.state()):
+        with pytest.raises(ValueError, match="the phases have different states"):
+            wrong()
+    with pytest.raises(TypeError, match="must be a Trajectory"):
+        jk.animate(Barge(), plan)
+    assert jk.positions(Barge(), plan.phases[1])["barge"].shape == (9, 3)
+
+
 def test_plans_as_guesses(plan, joined):
     """A plan needs no iterations for its own problem, also if it has phases."""
     assert solve(plan.problem, plan, intervals=10).iterations <= 1

@@ -12,10 +12,13 @@ from jaxkane.catalog import CATALOG
 from jaxkane.collocation import Phases, Problem, check_derivatives
 
 WITHOUT_CONTACTS = [name for name, entry in CATALOG.items() if type(entry.example()).contacts is jk.System.contacts]
+# Dense derivatives of a whole program compile for 5 to 10 s.
+IN_CI = {"WhippleBicycle", "RotatingFrameAndBarChosenSpeeds", "SimplestWalker"}
+SYSTEMS = [pytest.param(name, marks=[] if name in IN_CI else pytest.mark.long) for name in WITHOUT_CONTACTS]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", WITHOUT_CONTACTS)
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_derivatives_of_the_catalogue(name):
     rtol = 1e-10
     entry = CATALOG[name]

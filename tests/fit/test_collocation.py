@@ -70,7 +70,7 @@ def test_equals_simulation_if_inputs_are_known():
 
 
 def test_equals_the_kalman_filter_if_an_input_is_unknown():
-    """A quarter of a standard error; standard errors within 15 %: one is of the observed, one of the expected curvature."""
+    """A quarter of a standard error; standard errors within 15 %: observed and expected curvature differ."""
     trial = record(2, density=0.3)
     found = by_collocation(trial, unknown_inputs={"push": 0.3})
     other = fit(GUESS, trial, NAMES, unknown=("x", "x_dot"), noise={"push": 0.3})

@@ -11,6 +11,7 @@ import dataclasses
 import importlib.util
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
@@ -113,6 +114,7 @@ class Monitor:
 
 
 INTERRUPTED = "interrupted"
+NOT_FINITE = "a function or a derivative is not finite"
 
 
 class Solver(Protocol):
@@ -154,7 +156,7 @@ _IPOPT_STATUS = {
     "Search_Direction_Becomes_Too_Small": (False, "the steps became too small"),
     "Restoration_Failed": (False, "no feasible point was found near the last iterate"),
     "Error_In_Step_Computation": (False, "no step could be computed"),
-    "Invalid_Number_Detected": (False, "a function or a derivative is not finite"),
+    "Invalid_Number_Detected": (False, NOT_FINITE),
     "Not_Enough_Degrees_Of_Freedom": (False, "there are more equations than variables"),
     "User_Requested_Stop": (False, INTERRUPTED),
 }
@@ -465,4 +467,9 @@ def default_solver() -> Solver:
         return Ipopt()
     if importlib.util.find_spec("cyipopt") is not None:
         return Cyipopt()
+    warnings.warn(
+        "IPOPT is not installed, so SciPy's trust-constr is used, which takes many more iterations. Run "
+        "`pip install jaxkane[collocation]`, or pass solver=jaxkane.collocation.TrustConstr().",
+        stacklevel=4,
+    )
     return TrustConstr()

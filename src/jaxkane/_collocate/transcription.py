@@ -276,6 +276,7 @@ class Transcription:
         if self._objectives is not None:
             self._objectives(builder, self.layouts)
         self.rows = builder.rows
+        self._named_blocks = [*((block, "equations of motion") for block in dynamics), *builder.user_blocks]
         self._check_functions(builder)
         g_scale = builder.scales(self.x, self.x_scale)
         self.program = NonlinearProgram(*builder.arguments(), self.x_bounds, builder.bounds, self.x_scale, g_scale)
@@ -304,6 +305,16 @@ class Transcription:
             duration = layout.problem.durations[0] if layout.duration is None else float(x[layout.duration])
             n_y = layout.variables.n_y
             found.append(Motion(layout.s, duration, values[:, :n_y], values[:, n_y:]))
+        return found
+
+    def not_finite(self, x: np.ndarray) -> list[str]:
+        """The functions whose values or derivatives are not finite at variables (n,)."""
+        found = []
+        for block, label in self._named_blocks:
+            if not np.all(np.isfinite(block.values(x))):
+                found.append(f"`{label}`")
+            elif not np.all(np.isfinite(block.jacobian(x))):
+                found.append(f"the derivative of `{label}`")
         return found
 
     def theta(self, x: np.ndarray) -> np.ndarray:

@@ -44,7 +44,7 @@ class Plan:
     - `reason`: the result in words.
     - `cost`: the cost. `duration`: [s].
     - `estimates`: the values of the free parameters by name. `system`: the system with these values.
-    - `trajectory`: the `Trajectory` at the nodes.
+    - `trajectory`: the `Trajectory` at the nodes; None for phases with different states.
     - `mesh` (N + 1,): the ends of the intervals [s].
     - `errors` (N,): the local error of each interval, relative to the size of each state; None if it was not computed.
     - `multipliers`: derivatives of the least cost by name; see `Multipliers`.
@@ -64,7 +64,7 @@ class Plan:
     duration: float
     estimates: dict[str, float]
     system: System
-    trajectory: Trajectory
+    trajectory: Trajectory | None
     mesh: np.ndarray
     errors: np.ndarray | None
     multipliers: Multipliers
@@ -80,32 +80,38 @@ class Plan:
     method: Lobatto = dataclasses.field(repr=False, kw_only=True)
     scales: np.ndarray = dataclasses.field(repr=False, kw_only=True)
 
+    @property
+    def _whole(self) -> Trajectory:
+        if self.trajectory is None:
+            raise ValueError("Plan: the phases have different states. Use plan.phases[0], plan.phases[1], ...")
+        return self.trajectory
+
     def __getitem__(self, name: str) -> Float[Array, " K"]:
-        return self.trajectory[name]
+        return self._whole[name]
 
     @property
     def t(self) -> Float[Array, " K"]:
         """Times (K,) of the nodes [s]."""
-        return self.trajectory.t
+        return self._whole.t
 
     @property
     def q(self) -> Float[Array, "K n_q"]:
         """Coordinates (K, n_q) at the nodes."""
-        return self.trajectory.q
+        return self._whole.q
 
     @property
     def u(self) -> Float[Array, "K n_u"]:
         """Independent speeds (K, n_u) at the nodes."""
-        return self.trajectory.u
+        return self._whole.u
 
     @property
     def x(self) -> Float[Array, "K n_x"]:
         """First-order states (K, n_x) at the nodes."""
-        return self.trajectory.x
+        return self._whole.x
 
     def state(self, i: int = -1) -> State:
         """The state at the i-th node."""
-        return self.trajectory.state(i)
+        return self._whole.state(i)
 
     @property
     def inputs(self) -> Any:
@@ -121,7 +127,9 @@ class Plan:
         return with_controls(self.problem.signals, polynomials)
 
     def at(self, ts: Any) -> dict[str, np.ndarray]:
-        """States and controls by name at other times, by the polynomials of the method.
+        """States and controls by name at other times, by the polynomials through the nodes of each interval.
+
+        Between the nodes, the states are less accurate than at the nodes: parabolas for "hermite-simpson".
 
         **Arguments:**
 
@@ -200,7 +208,7 @@ class Plan:
         if self.errors is not None:
             lines.append(f"largest local error {np.max(self.errors):.1e} of the size of a state")
         if self.problem.n_constraints:
-            h = np.asarray(_drift(self.system, self.trajectory.t, self.trajectory.q))
+            h = np.asarray(_drift(self.system, self.t, self.q))
             lines.append(f"configuration constraints: largest residual {np.max(np.abs(h)):.1e}")
         lines.append(self._words_of_replay())
         if self.starts:

@@ -42,7 +42,8 @@ class Problem:
         plan = jk.collocation.solve(problem)
 
     The time starts at 0. In costs and constraints, `now["roll"]` is any coordinate, speed, dependent speed, first-order
-    state, input or output, and `now.system` the system with the current parameters (see `Now`).
+    state, input or output, and `now.system` the system with the current parameters (see `Now`). Bounds and path
+    constraints hold at the nodes. Between the nodes, a control that jumps from one bound to the other may exceed them.
 
     **Arguments:**
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from .._collocate.lobatto import Lobatto, lobatto
 from .._collocate.program import NonlinearProgram
-from .._collocate.solvers import INTERRUPTED, Monitor, Solution, Solver, default_solver
+from .._collocate.solvers import INTERRUPTED, NOT_FINITE, Monitor, Solution, Solver, default_solver
 from .._collocate.transcription import Motion, Transcription, nodes_of, system_at
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
@@ -300,6 +300,8 @@ class _Search:
         if ok and is_coarse:
             worst = max(float(np.max(e)) for e in errors or ())
             ok, reason = False, f"solved, but the local error is {worst:.1e} instead of {self.tolerance:g}"
+        if reason == NOT_FINITE and (names := transcription.not_finite(x)):
+            reason = f"{', '.join(names)} is not finite at the last iterate"
         residual = dual_residual(program, solution)
         common = {
             "ok": ok,
@@ -468,9 +470,8 @@ def active_of(transcription: Transcription, solution: Solution, p: int) -> tuple
 def _joined(plans: Sequence[Plan]) -> Plan:
     """One plan for all phases, whose trajectory contains them one after another."""
     first = plans[0]
-    trajectory = first.trajectory
-    if all(plan.trajectory.names == trajectory.names for plan in plans):
-        trajectory = _concatenated([plan.trajectory for plan in plans])
+    parts = [plan.trajectory for plan in plans if plan.trajectory is not None]
+    trajectory = _concatenated(parts) if len({part.names for part in parts}) == 1 else None
     offsets = np.cumsum([0.0, *(plan.duration for plan in plans)])
     meshes = [plan.mesh + offset for plan, offset in zip(plans, offsets)]
     mesh = np.concatenate([meshes[0], *(mesh[1:] for mesh in meshes[1:])])
