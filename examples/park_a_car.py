@@ -11,7 +11,7 @@ bounded, and points along the outline of the car must stay outside the parked ca
     drive, servo         force of the motor, torque on the front wheels            N, N m
 
 Run:      python examples/park_a_car.py [--out FOLDER]
-Appears:  the report of the plan; park_a_car.png: the way of the car, its speed and steering.
+Appears:  the report of the plan; park_a_car.png: the path of the car, its speed and steering.
 Takes:    20 seconds.
 """
 
