@@ -253,3 +253,20 @@ def test_gaits_of_walkers(walker, q, u, period):
     assert plan.duration == pytest.approx(float(orbit.period), rel=rtol)
     np.testing.assert_allclose(plan.state(0).q, orbit.state.q, atol=1e-7)
     np.testing.assert_allclose(plan.state(0).u, orbit.state.u, atol=1e-6)
+
+
+@pytest.mark.parametrize("intervals", [7, 50])
+@pytest.mark.parametrize("method", ["hermite-simpson", "lobatto"])
+def test_a_switch_inside_an_interval_is_refined(method, intervals):
+    """2 s, 1e-6. With seven intervals that are not refined, the time is 7e-3 s too long, and 2e-3 s too short."""
+    fastest = Problem(
+        Sled(), (0.1, 10.0), controls={"force": (-1.0, 1.0)}, final_cost=elapsed,
+        start={"x": 0.0, "v": 0.0}, end={"x": 1.0, "v": 0.0},
+    )  # fmt: skip
+    plan = solve(fastest, intervals=intervals, method=method)
+    assert plan.ok
+    assert plan.duration == pytest.approx(2.0, abs=1e-6)
+
+
+def elapsed(t, now):
+    return t

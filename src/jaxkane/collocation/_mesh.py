@@ -173,6 +173,31 @@ def refined(mesh: np.ndarray, errors: np.ndarray, tolerance: float, order: int) 
     return np.array(new)
 
 
+def switch_errors(layout: Layout, motion: Motion, method: Lobatto) -> np.ndarray:
+    """The error (N,) of intervals in which a control jumps between its bounds.
+
+    Controls are continuous, so a jump takes one interval of length h. The time of the double integrator was too long by
+    a third of (h / duration)^2, although the simulation of this interval is exact. An interval counts if a control
+    changes by more than a third of the distance between its bounds. If this happens in more than a fifth of the
+    intervals, the control oscillates, and shorter intervals would not help.
+    """
+    places = np.linspace(0.0, 1.0, 9)
+    powers = np.vander(places, len(method.c), increasing=True)
+    C = coefficients_of(motion.W, method)  # (N, s, n_w)
+    errors = np.zeros(len(layout.mesh) - 1)
+    for i, name in enumerate(layout.variables.controls):
+        low, high = layout.problem.limits.get(name, (-math.inf, math.inf))
+        if not low < high or not math.isfinite(high - low):
+            continue
+        share = np.ptp(C[:, :, i] @ powers.T, axis=1) / (high - low)
+        if np.count_nonzero(share > _JUMP) <= 0.2 * len(errors):
+            errors = np.maximum(errors, np.where(share > _JUMP, (share * np.diff(layout.mesh)) ** 2, 0.0))
+    return errors
+
+
+_JUMP = 1 / 3
+
+
 def quadrature_errors(layout: Layout, x: np.ndarray, motion: Motion, method: Lobatto) -> np.ndarray:
     """The error (N,) of the integral of the cost over each interval, against a quadrature with twice as many points.
 

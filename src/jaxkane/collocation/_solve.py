@@ -19,7 +19,7 @@ from .._collocate.transcription import Motion, Transcription, nodes_of, system_a
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
 from ._guess import detours, guess_of
-from ._mesh import interpolated, local_errors, quadrature_errors, refined
+from ._mesh import interpolated, local_errors, quadrature_errors, refined, switch_errors
 from ._plan import Multipliers, Plan, trajectory_of
 from ._problem import Phases, Problem
 
@@ -289,7 +289,8 @@ class _Search:
         for p, (layout, motion) in enumerate(zip(transcription.layouts, transcription.motions(x), strict=True)):
             scales, system = transcription.x_scale[layout.node(0)], system_at(transcription, p, x)
             errors = local_errors(layout, system, motion, self.method, scales, self.tolerance or 1.0)
-            found.append(np.maximum(errors, quadrature_errors(layout, x, motion, self.method) / size))
+            errors = np.maximum(errors, quadrature_errors(layout, x, motion, self.method) / size)
+            found.append(np.maximum(errors, switch_errors(layout, motion, self.method)))
         return found
 
     def _refined(self, meshes: Sequence[np.ndarray], errors: Sequence[np.ndarray] | None) -> list[np.ndarray] | None:
