@@ -259,6 +259,7 @@ MIMIC = ONE.replace("</joint>", '<mimic joint="{}"/></joint>')
             'rpy="0 0 90" exceeds a full',
         ),
         (ONE.replace("</joint>", '<limit lower="-90" upper="90"/></joint>'), "limits -90 and 90 are in degrees"),
+        (ONE.replace("</joint>", '<dynamics damping="-1"/></joint>'), "joint 'j': the damping is -1.0; it must not"),
         (robot(link("a"), link("b")), "must have one root link; this one has a, b. Connect them"),
         (robot(link("a"), link("a")), "the links 'a' and 'a' are equal"),
         (robot(link("tool_tip"), link("tool.tip")), "would both be 'tool_tip'"),

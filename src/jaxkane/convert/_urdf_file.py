@@ -142,6 +142,9 @@ def _joint(joint: Element, label: str) -> FileJoint:
     if kind not in ("fixed", "floating") and not direction.any():
         raise ValueError(f"{label}: the axis is zero. Give it a direction, or make the joint fixed.")
     damping, friction = (0.0 if dynamics is None else _number(dynamics, x, label, 0.0) for x in ("damping", "friction"))
+    for what, value in (("damping", damping), ("friction", friction)):
+        if value < 0.0:
+            raise ValueError(f"{label}: the {what} is {value}; it must not be negative.")
     follows = None
     if mimic is not None:
         if not mimic.get("joint"):
