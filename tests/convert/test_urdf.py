@@ -253,7 +253,10 @@ MIMIC = ONE.replace("</joint>", '<mimic joint="{}"/></joint>')
         (ONE.replace('axis xyz="0 0 1"', 'axis xyz="0 0 0"'), "joint 'j': the axis is zero"),
         (ONE.replace('type="revolute"', 'type="hinge"'), "joint 'j': the type must be one of .*; got 'hinge'"),
         (ONE.replace('<parent link="base"/>', ""), r"joint 'j': <parent link=\"...\"/> is missing"),
-        (ONE.replace('<parent link="base"/>', '<parent link="foot"/>'), "connects 'foot', which is not a link"),
+        (
+            ONE.replace('<parent link="base"/>', '<parent link="foot"/>'),
+            "joint 'j': There is no 'foot' in the links; there are base, arm",
+        ),
         (
             ONE.replace('<origin xyz="0 0 0"/>\n     <axis', '<origin rpy="0 0 90"/><axis'),
             'rpy="0 0 90" exceeds a full',
@@ -266,7 +269,7 @@ MIMIC = ONE.replace("</joint>", '<mimic joint="{}"/></joint>')
         (LOOP, "one root link; this one has none. The joints form a loop"),
         (LOOP.replace("</robot>", '<link name="c"/></robot>'), "the joints j, k form a loop"),
         (robot(*TWO, joint("jb", "base", "a")), "the joints 'ja' and 'jb' both carry the link 'a'"),
-        (MIMIC.format("x"), "'j' mimics 'x', which is not"),
+        (MIMIC.format("x"), "'j' cannot mimic 'x': "),
         (MIMIC.format("j"), "the joints j mimic each other in a circle"),
     ],
 )
