@@ -191,8 +191,8 @@ class _UrdfReader:
             if followed not in self.simple:
                 names = not_there(followed, self.simple, "the revolute, continuous and prismatic joints").args[0]
                 raise ValueError(
-                    f"{self.file.name}: the joint {joint.name!r} cannot mimic {followed!r}: {names} Correct <mimic>, or "
-                    "remove it."
+                    f"{self.file.name}: the joint {joint.name!r} cannot mimic {followed!r}: {names} Correct <mimic>, "
+                    "or remove it."
                 )
             chain = [joint.name]
             while (last := self.simple.get(chain[-1])) is not None and last.mimic is not None:
