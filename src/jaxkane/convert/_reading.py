@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Collection, Sequence
 from pathlib import Path as FilePath
-from typing import Literal
+from typing import Any, Literal
 
 Path = str | os.PathLike[str]
 
@@ -84,6 +84,11 @@ def report_left_out(owner: str, left_out: Collection[str], strict: bool, stackle
 def without_dots(name: str) -> str:
     """A dot separates the parts of a parameter's name, so names of a file have an underscore instead."""
     return name.replace(".", "_")
+
+
+def names_without_dots(names: Any) -> Any:
+    """A list of names of a file, with underscores. A string is not a list, and is refused later."""
+    return names if names is None or isinstance(names, str) else [without_dots(name) for name in names]
 
 
 def check_distinct(owner: str, kinds: str, given: Sequence[str]) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._common.lookup import not_there
 from ..joints import Coupling, Joint, Link, Mechanism, ball, free, hinge, mechanism, planar, slide
 from ._inertias import Choice, FileBody, possible_inertias
 from ._reading import Path, Selection, report_left_out, selected, text_of
@@ -188,9 +189,10 @@ class _UrdfReader:
                 continue
             followed, factor, offset = joint.mimic
             if followed not in self.simple:
+                names = not_there(followed, self.simple, "the revolute, continuous and prismatic joints").args[0]
                 raise ValueError(
-                    f"{self.file.name}: the joint {joint.name!r} mimics {followed!r}, which is not a revolute, "
-                    "continuous or prismatic joint. Correct <mimic>, or remove it."
+                    f"{self.file.name}: the joint {joint.name!r} cannot mimic {followed!r}: {names} Correct <mimic>, "
+                    "or remove it."
                 )
             chain = [joint.name]
             while (last := self.simple.get(chain[-1])) is not None and last.mimic is not None:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .._common.lookup import not_there
 from ._reading import check_distinct, without_dots
 
 Element = ElementTree.Element
@@ -142,6 +143,9 @@ def _joint(joint: Element, label: str) -> FileJoint:
     if kind not in ("fixed", "floating") and not direction.any():
         raise ValueError(f"{label}: the axis is zero. Give it a direction, or make the joint fixed.")
     damping, friction = (0.0 if dynamics is None else _number(dynamics, x, label, 0.0) for x in ("damping", "friction"))
+    for what, value in (("damping", damping), ("friction", friction)):
+        if value < 0.0:
+            raise ValueError(f"{label}: the {what} is {value}; it must not be negative.")
     follows = None
     if mimic is not None:
         if not mimic.get("joint"):
@@ -244,7 +248,7 @@ def _root(name: str, links: list[str], joints: list[FileJoint]) -> str:
     for joint in joints:
         for link in (joint.parent, joint.child):
             if link not in links:
-                raise ValueError(f"{name}: the joint {joint.name!r} connects {link!r}, which is not a link.")
+                raise ValueError(f"{name}, joint {joint.name!r}: {not_there(link, links, 'the links').args[0]}")
         if joint.child in carrier:
             raise ValueError(
                 f"{name}: the joints {carrier[joint.child].name!r} and {joint.name!r} both carry the link "

@@ -91,11 +91,12 @@ def _independent_residuals(
     q = trial.start(pose)
     size, order = _pivots(trial.velocity_slopes(q))
     rows = [i for i, pivot in zip(order, size, strict=False) if pivot > max(1e-9 * size[0], 1e-13)]
-    good = [i for i, pivot in zip(order, size, strict=False) if i in rows and pivot > NEARLY_REDUNDANT * size[0]]
+    good = [i for i, pivot in zip(order, size, strict=False) if i in rows and trial.is_regular(i, pivot / size[0])]
     closed = trial.closed(q, sorted(good))
     if closed is not None:
         size, order = _pivots(trial.velocity_slopes(closed)[rows])
-        regular = [rows[i] for i, pivot in zip(order, size, strict=False) if pivot > NEARLY_REDUNDANT * size[0]]
+        pivots = zip(order, size, strict=False)
+        regular = [rows[i] for i, pivot in pivots if trial.is_regular(rows[i], pivot / size[0])]
         if len(regular) > len(good):  # q is close to a singular configuration
             good, closed = regular, trial.closed(q, sorted(regular))
     redundant = sorted(set(rows) - set(good))
@@ -280,6 +281,12 @@ class _Trial:
     def _of(self, q: np.ndarray, name: str | None) -> float:
         return float(q[self.coordinates.index(name)]) if name else 0.0
 
+    def is_regular(self, row: int, share: float) -> bool:
+        """Whether an independent residual is used. `share`: its part that does not depend on the others. The
+        coefficients of couplings are exact, so only residuals of loops may be redundant because of rounding."""
+        is_of_loop = row < sum(closure.size for closure in self.closures)
+        return share > NEARLY_REDUNDANT or not is_of_loop
+
     def velocity_slopes(self, q: np.ndarray) -> np.ndarray:
         """Derivatives of the velocity residuals with respect to the speeds (residuals, n)."""
         q = q * self.coordinate_units
@@ -382,7 +389,7 @@ class _Trial:
                 f"{self.structure.name}: these loops have residuals that nearly depend on the others and are omitted "
                 f"(their sizes at trial coordinates in brackets): {listed}.",
                 UserWarning,
-                stacklevel=2,
+                stacklevel=5,
             )
 
 
