@@ -12,6 +12,8 @@ from mechanisms import RodOnPin, Sled
 
 import jaxkane as jk
 from jaxkane.collocation import Phases, Problem, continuation, solve
+from jaxkane.collocation._guess import detours
+from jaxkane.collocation._solve import _guessed
 from jaxkane.fit.inverse.kinematics import kinematic_samples
 
 mpl.use("Agg")
@@ -155,6 +157,16 @@ def test_plans_as_guesses(plan, joined):
     ride = plan.replay()
     assert solve(plan.problem, [None, ride, {"force": 0.3}], intervals=10, tolerance=None).starts[1][1] == "solved"
     assert len(solve(plan.problem, starts=3, intervals=10, tolerance=None).starts) == 3
+
+
+def test_random_starts_change_every_kind_of_guess(plan):
+    """Also a plan, a simulation and a dict that names the coordinate; both ends keep their values."""
+    s = np.linspace(0.0, 1.0, 5)
+    _, detour = detours(plan.problem, 2)
+    for guess in (None, plan, plan.replay(), {"x": [0.0, 0.3, 1.0]}):
+        same, other = (_guessed(plan.problem, guess, s, d).Y[:, 0] for d in (None, detour))
+        np.testing.assert_allclose(other[[0, -1]], same[[0, -1]], atol=1e-12)
+        assert np.abs(other - same).max() > 0.1
 
 
 def test_continuation():

@@ -10,6 +10,7 @@ import pytest
 from mechanisms import OnACircle
 
 import jaxkane as jk
+from jaxkane._kane.consistent_state import euler_parameters
 from jaxkane.catalog import RigidBody
 
 PAGE = Path(__file__).parents[2] / "docs" / "constraints.md"
@@ -119,3 +120,23 @@ def test_parameters_move_what_is_found():
 
     np.testing.assert_allclose(jax.jit(jax.jacfwd(y))(1.0), [0.0, 1.0, 0.0], atol=1e-14)
     np.testing.assert_allclose(jax.jit(jax.jacrev(y))(1.0), [0.0, 1.0, 0.0], atol=1e-14)
+
+
+def test_euler_parameters_among_many_coordinates():
+    """120 quaternions between 120 other coordinates: with one random point, some of 600 windows matched by accident."""
+
+    class Many(jk.System):
+        coordinates = tuple(name for i in range(120) for name in (f"x{i}", *(f"e{i}_{k}" for k in range(4))))
+        speeds = ("u",)
+
+        def q_dot(self, t, q, u):
+            return [u[0]] * len(q)
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x, u[0] * N.x), name="P")])
+
+        def configuration_constraints(self, t, q):
+            return [sum(q[5 * i + 1 + k] ** 2 for k in range(4)) - 1.0 for i in range(120)]
+
+    assert euler_parameters(Many()) == [tuple(range(5 * i + 1, 5 * i + 5)) for i in range(120)]

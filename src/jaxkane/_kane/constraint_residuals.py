@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, PyTree
 from .._scalarjit.cache import Cache
 from .._scalarjit.compat import Tracer, concretely
 from .._scalarjit.components import Component, Numbers, add, as_vector, dot, matvec, mul, stack, total
+from .._scalarjit.jaxpr import LARGEST_SUM
 from .._scalarjit.nan import nan_where
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.motion import SomeComponents, residual_groups
@@ -119,8 +120,12 @@ def _slope_sizes(system: System, t: Component, q: Numbers, direction: Numbers) -
     def slope(system: System, t: Component, q: Numbers, direction: Numbers) -> Numbers:
         return jax.jvp(lambda q: configuration_residual(system, t, q), (q,), (direction,))[1]
 
-    largest = [functools.reduce(jnp.maximum, [abs(x) for x, other in zip(row, units) if other == u]) for u in units]
-    sizes = [jnp.maximum(x, 1.0) if unit == "rad" else x for x, unit in zip(largest, units, strict=True)]
+    # Once for each unit: a robot with 100 free bodies has 728 coordinates.
+    largest = {
+        unit: functools.reduce(jnp.maximum, [abs(x) for x, other in zip(row, units, strict=True) if other == unit])
+        for unit in dict.fromkeys(units)
+    }
+    sizes = [jnp.maximum(largest[unit], 1.0) if unit == "rad" else largest[unit] for unit in units]
     return term_sizes(slope, system, t, q, direction, sizes=(None, None, as_vector(sizes, q), None))
 
 
@@ -175,7 +180,9 @@ def configuration_is_met(system: System, t: Component, q: Numbers) -> Any:
     if not any(h.size for h in relative_residuals):
         return np.array(True)
     xp = np if is_concrete(relative_residuals) else jnp
-    return xp.all(xp.concatenate(relative_residuals) <= configuration_tolerance(q.dtype))
+    are_met = xp.concatenate(relative_residuals) <= configuration_tolerance(q.dtype)
+    parts = [xp.all(are_met[i : i + LARGEST_SUM]) for i in range(0, are_met.size, LARGEST_SUM)]
+    return functools.reduce(xp.logical_and, parts)  # a longer reduction cannot be part of one compiled function
 
 
 def check_state(system: System, t: Component, q: Numbers) -> None:

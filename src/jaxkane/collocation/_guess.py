@@ -19,7 +19,7 @@ from .._system.system import units_of
 from ._problem import Problem
 
 
-def guess_of(problem: Problem, guess: Any, s: np.ndarray, detour: np.ndarray | None = None) -> Motion:
+def guess_of(problem: Problem, guess: Any, s: np.ndarray) -> Motion:
     """The guess of a motion at nodes.
 
     **Arguments:**
@@ -28,7 +28,6 @@ def guess_of(problem: Problem, guess: Any, s: np.ndarray, detour: np.ndarray | N
     - `guess`: None, a `Trajectory`, or by name numbers, arrays (n,) of samples at even distances, or functions of time;
         with "duration" a number.
     - `s` (K,): the nodes, as fractions of the duration.
-    - `detour` (n_q, 3) or None: the amplitudes of sines that are added to the coordinates.
 
     **Raises:** `ValueError` for unknown names and for values outside the bounds of the problem.
     """
@@ -44,14 +43,19 @@ def guess_of(problem: Problem, guess: Any, s: np.ndarray, detour: np.ndarray | N
     refuse_unknown(given, [*names, *controls, "duration"], f"solve: `guess`: {problem.title} has no", "it has")
     duration = _duration(problem, given.get("duration"))
     Y, W = _automatic(problem, s, duration)
-    if detour is not None:
-        k = np.arange(1, detour.shape[1] + 1)
-        Y[:, : len(detour)] += np.sin(np.pi * np.outer(s, k)) @ detour.T
     for name, value in given.items():
         if name != "duration":
             target, i = (Y, names.index(name)) if name in names else (W, controls.index(name))
             target[:, i] = _values(problem, name, value, s, duration)
     return Motion(s, duration, *_clipped(problem, s, Y, W, given))
+
+
+def detoured(problem: Problem, motion: Motion, detour: np.ndarray) -> Motion:
+    """A motion with sines of the amplitudes (n_q, 3) added to its coordinates. Both ends stay where they are."""
+    k = np.arange(1, detour.shape[1] + 1)
+    Y = motion.Y.copy()
+    Y[:, : len(detour)] += np.sin(np.pi * np.outer(motion.s, k)) @ detour.T
+    return motion._replace(Y=_clipped(problem, motion.s, Y, motion.W, {})[0])
 
 
 def detours(problem: Problem, count: int, seed: int = 0) -> list[np.ndarray | None]:

@@ -34,27 +34,31 @@ from ._problem import Problem
 class Plan:
     """A planned motion: `plan["roll"]` is any coordinate, speed, state, input or output at the nodes.
 
-    A plan can be passed to `jaxkane.animate`, to the functions of `jaxkane.plot`, to `jaxkane.positions` and the like,
-    and as the `guess` of another problem.
+    A plan can be passed to `jaxkane.animate`, `jaxkane.positions`, the functions of `jaxkane.plot` and similar
+    functions. It can also be the `guess` for another problem.
 
     Attributes:
 
     - `problem`: the problem that was solved.
     - `ok`: whether the solver found a local minimum and the local errors are below the tolerance.
     - `reason`: the result in words.
-    - `cost`: the cost, of all phases together. `duration`: [s].
-    - `estimates`: the values of the free parameters by name. `system`: the system with these values.
+    - `cost`: the cost, of all phases together.
+    - `duration`: the duration [s].
+    - `estimates`: the values of the free parameters by name.
+    - `system`: the system with these values.
     - `trajectory`: the `Trajectory` at the nodes; None for phases with different states.
     - `mesh` (N + 1,): the ends of the intervals [s].
     - `errors` (N,): the local error of each interval, relative to the size of each state; None if it was not computed.
     - `multipliers`: derivatives of the least cost by name; see `Multipliers`.
-    - `costs`: the cost on each mesh. `iterations`: the iterations of the solver, on all meshes.
-    - `violation`, `dual_residual`: the largest scaled violation of constraints, and of the conditions of a minimum.
-    - `unmet`: the constraints that are violated by more than the tolerance, by name, with the scaled violation.
+    - `costs`: the cost on each mesh.
+    - `iterations`: the number of iterations of the solver, on all meshes together.
+    - `violation`: the largest scaled violation of a constraint.
+    - `dual_residual`: the largest scaled violation of the conditions of a minimum.
+    - `unmet`: the scaled violations of constraints that are violated by more than the tolerance, by name.
     - `active`: the names of bounds and inequality constraints that are active somewhere.
-    - `starts`: for several guesses, the cost and the result of each.
-    - `phases`: the plans of all phases; empty for a single problem. Names of `multipliers`, `unmet` and `active` then
-        start with the phase, as in "phase 0: roll".
+    - `starts`: if there were several guesses, the cost and the result of each.
+    - `phases`: the plans of all phases; empty for a single problem. With phases, the names in `multipliers`, `unmet`
+        and `active` start with the phase, as in "phase 0: roll".
     """
 
     problem: Problem
@@ -115,7 +119,7 @@ class Plan:
 
     @property
     def inputs(self) -> Any:
-        """The inputs as functions of (t, state), for `simulate`. Between the nodes, a control is a polynomial.
+        """The inputs as functions of (t, state), for `simulate`. Controls are polynomials between the nodes.
 
         jk.simulate(plan.system, plan.state(0), ts, plan.inputs)
         """
@@ -127,9 +131,10 @@ class Plan:
         return with_controls(self.problem.signals, polynomials)
 
     def at(self, ts: Any) -> dict[str, np.ndarray]:
-        """States and controls by name at other times, by the polynomials through the nodes of each interval.
+        """States and controls by name at other times. They are interpolated by one polynomial for each interval.
 
-        Between the nodes, the states are less accurate than at the nodes: parabolas for "hermite-simpson".
+        Between the nodes, the states are less accurate than at the nodes. For "hermite-simpson", the polynomials are
+        parabolas.
 
         **Arguments:**
 
@@ -146,8 +151,8 @@ class Plan:
     def replay(self, ts: Any = None, *, feedback: bool = False, rtol: float = 1e-8, atol: float = 1e-8) -> Trajectory:
         """Simulate the whole plan from its first state with its inputs.
 
-        An unstable motion leaves the plan, because rounding errors grow. With `feedback`, a linear-quadratic regulator
-        along the plan corrects the controls.
+        If the motion is unstable, rounding errors grow and the simulation diverges from the plan. With `feedback`, a
+        linear-quadratic regulator corrects the controls.
 
         **Arguments:**
 
@@ -179,7 +184,7 @@ class Plan:
     def deviation(self, ride: Trajectory) -> float:
         """The largest deviation of a simulation from the plan, relative to the size of each state.
 
-        They are compared at the ends of intervals. Inside an interval the polynomials are less accurate.
+        The states are compared at the ends of intervals, because the polynomials are less accurate inside an interval.
         """
         self._refuse_phases("deviation")
         Y = np.asarray(jnp.concatenate([ride.q, ride.u, ride.x], axis=1))
@@ -193,7 +198,7 @@ class Plan:
             raise ValueError(f"Plan.{what}: the plan has {len(self.phases)} phases. Use plan.phases[0].{what}, ...")
 
     def report(self) -> str:
-        """A report in words: the solution, its accuracy, active bounds, and its simulation."""
+        """A report in words: the solution, its accuracy, active bounds, and a simulation of the plan."""
         if self.phases:
             parts = [f"phase {i}\n{plan.report()}" for i, plan in enumerate(self.phases)]
             return "\n\n".join([repr(self), *parts])
@@ -241,11 +246,12 @@ class Plan:
 class Multipliers(Mapping[str, Any]):
     """Derivatives of the least cost, by the names of states, controls, conditions and path constraints.
 
-    - `multipliers["roll"]` (K,): by a shift of the bound of a state or control that is active at a node; 0 elsewhere.
-        At a fixed start, this is the derivative by the initial value.
-    - `multipliers["condition"]`: by a shift of the value of a condition, (K,) for a path constraint. If its name is
-        also that of a variable, "conditions: roll" or "path: roll".
-    - `costate["roll"]` (N,): by a sudden change of a state within an interval.
+    - `multipliers["roll"]` (K,): the derivative with respect to a shift of the bound of this state or control at each
+        node. It is 0 at nodes where no bound is active. If the start is fixed, the first number is the derivative with
+        respect to the initial value.
+    - `multipliers["condition"]`: the derivative with respect to a shift of the required value of this condition. For a
+        path constraint, it is an array (K,). If a variable has the same name, use "conditions: roll" or "path: roll".
+    - `costate["roll"]` (N,): the derivative with respect to a sudden change of this state within each interval.
     """
 
     def __init__(self, values: Mapping[str, Any], costate: Mapping[str, np.ndarray]):

@@ -30,7 +30,7 @@ Values = Mapping[str, Condition] | State
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """Find the controls, and if wanted the duration and parameters, for which a motion has the least cost.
+    """Find the controls of a motion of least cost, and optionally its duration and parameters of the system.
 
         problem = jk.collocation.Problem(
             bicycle, 3.0,
@@ -41,30 +41,31 @@ class Problem:
         )
         plan = jk.collocation.solve(problem)
 
-    The time starts at 0. In costs and constraints, `now["roll"]` is any coordinate, speed, dependent speed, first-order
-    state, input or output, and `now.system` the system with the current parameters (see `Now`). Bounds and path
-    constraints hold at the nodes. Between the nodes, a control that jumps from one bound to the other may exceed them.
+    The time starts at 0. In costs and constraints, `now["roll"]` is the value of any coordinate, speed, dependent
+    speed, first-order state, input or output. `now.system` is the system with the current parameters (see `Now`).
+    Bounds and path constraints hold at the nodes. If a control jumps from one bound to the other, it may exceed its
+    bounds between the nodes.
 
     **Arguments:**
 
     - `system`: a `System` without contacts.
     - `duration`: the duration [s], or (least, greatest) if it is free.
-    - `controls`: the free inputs: a dict from names to (lower, upper) or None, or a sequence of names. A bound may be
-        None.
-    - `cost`: a function (t, now) -> number, whose integral over time is minimized.
-    - `final_cost`: a function (t, now) -> number at the end, which is added. For the shortest time, pass
-        `lambda t, now: t`.
-    - `start`, `end`: by name a number or (lower, upper), or a `State`. Names that are left out are free. Names of
-        dependent speeds and outputs are possible. An `end` that is a `State` leaves the dependent coordinates free,
-        because the configuration constraints determine them.
-    - `conditions`: a function (first, last, duration) -> dict by name of numbers that must be zero, or of
+    - `controls`: the inputs to find: a dict by name of (lower, upper) or None, or a sequence of names. None means no
+        bound, also for `lower` or `upper` alone.
+    - `cost`: a function (t, now) -> number. The integral of this number over time is minimized.
+    - `final_cost`: a function (t, now) -> number. Its value at the end is added to the cost. For the shortest time,
+        pass `lambda t, now: t`.
+    - `start`, `end`: a `State`, or a dict by name. Each value is a number or (lower, upper). Names that are left out
+        are free. Dependent speeds and outputs are also allowed. If `end` is a `State`, the dependent coordinates remain
+        free, because the configuration constraints determine them.
+    - `conditions`: a function (first, last, duration) -> dict by name. Each value is a number that must be zero, or
         (number, lower, upper). An example is {"periodic": last["roll"] - first["roll"]}.
-    - `within`: by name (lower, upper), along the whole motion.
-    - `path`: a function (t, now) -> dict by name of numbers that must not be negative, or of (number, lower, upper),
-        along the whole motion.
+    - `within`: a dict by name of (lower, upper), for the whole motion.
+    - `path`: a function (t, now) -> dict by name, for the whole motion. Each value is a number that must not be
+        negative, or (number, lower, upper).
     - `free`: parameters of the system to optimize: names, `jk.fit.Free` or `jk.fit.Inertia`, as in `jk.fit.fit`.
-    - `inputs`: the other inputs, as in `simulate`: numbers, `Samples`, functions of (t, state). They must be
-        continuous.
+    - `inputs`: the inputs that are not controls, as in `simulate`: numbers, `Samples`, functions of (t, state). They
+        must be continuous.
 
     **Raises:** `ValueError` and `TypeError` that name the argument.
     """
@@ -188,7 +189,7 @@ class Problem:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Coordinates, independent speeds and first-order states: the variables of a node, before the controls."""
+        """Names of coordinates, independent speeds and first-order states, in the order of the variables of a node."""
         coordinates, speeds, _, states = names_of(self.system)
         return (*coordinates, *speeds, *states)
 
@@ -210,7 +211,7 @@ class Problem:
 
     @property
     def bounds_of_controls(self) -> dict[str, Bound]:
-        """Lower and upper bound of each control by name."""
+        """The lower and the upper bound of each control, by name."""
         given = self.controls
         if isinstance(given, Mapping):
             return {name: _pair(f"`controls` of {name!r}", b or (None, None)) for name, b in given.items()}
@@ -223,7 +224,7 @@ class Problem:
 
     @property
     def limits(self) -> dict[str, Bound]:
-        """Bounds along the motion by name, of controls and of `within`."""
+        """Bounds for the whole motion by name, from `controls` and `within`."""
         limits = self.bounds_of_controls
         for name, value in (self.within or {}).items():
             low, high = _pair(f"`within` of {name!r}", value)
@@ -318,19 +319,21 @@ class Phases:
         swing = jk.collocation.Problem(walker, (0.3, 1.5), controls=..., cost=...)
         gait = jk.collocation.Phases([swing], links=["heel_strike"])
 
-    With one link fewer than phases, the last phase ends freely. With as many links as phases, the last link leads from
-    the end of the last phase to the start of the first one, so the motion is periodic.
+    If there is one link fewer than phases, no link constrains the end of the last phase. If there are as many links as
+    phases, the motion is periodic: the last link connects the end of the last phase with the start of the first one.
 
-    In the functions of each phase, and in systems and inputs that depend on time, the time starts at 0 in each phase.
-    The times of `Plan.t` continue.
+    In each phase, the time starts at 0 in costs and constraints, and in systems and inputs that depend on time. In
+    `Plan.t`, the time continues from phase to phase.
 
     **Arguments:**
 
     - `phases`: the problems. Their systems need the same coordinates, speeds and states, unless the links are
-        functions. All have the same `free`.
-    - `links`: for each pair of phases: None for a continuous state; the name of an event of the first system, whose
-        function must be zero at the end, and whose jump (`then`) gives the next state; or a function (last, first) ->
-        dict by name of numbers that must be zero.
+        functions. All problems need the same `free`.
+    - `links`: one link for each pair of phases.
+        None: the state is continuous.
+        The name of an event of the first system: the event function must be zero at the end of the first phase, and
+        the jump (`then`) gives the first state of the next phase.
+        A function (last, first) -> dict by name of numbers that must be zero.
 
     **Raises:** `ValueError` and `TypeError` that name the phase or the link.
     """

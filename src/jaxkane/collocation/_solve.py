@@ -18,7 +18,7 @@ from .._collocate.solvers import INTERRUPTED, NOT_FINITE, Monitor, Solution, Sol
 from .._collocate.transcription import Motion, Transcription, nodes_of, system_at
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
-from ._guess import detours, guess_of
+from ._guess import detoured, detours, guess_of
 from ._mesh import interpolated, local_errors, quadrature_errors, refined, switch_errors
 from ._plan import Multipliers, Plan, trajectory_of
 from ._problem import Phases, Problem
@@ -43,32 +43,36 @@ def solve(
 ) -> Plan:
     """Find a motion of least cost by direct collocation.
 
-    The states are polynomials in each interval of a mesh, and satisfy the equations of motion at the collocation points
-    of a Lobatto IIIA method. The solver uses exact sparse first and second derivatives. Then each interval is simulated
-    from its own start. Intervals whose error is too large are divided, and the solution continues on the new mesh.
+    The states are polynomials in each interval of a mesh. They satisfy the equations of motion at the collocation
+    points of a Lobatto IIIA method. The solver uses exact sparse first and second derivatives.
+
+    After the solution, each interval is simulated from its own start to compute its local error. Intervals whose error
+    is too large are divided. Then the problem is solved on the new mesh, from the present solution.
 
     **Arguments:**
 
     - `problem`: a `Problem`, or `Phases`.
-    - `guess`: None for straight lines between the values at both ends; a `Plan`; a `Trajectory`; or by name numbers,
-        arrays (n,) of samples at even distances, or functions of time, with the key "duration". A sequence of these is
-        tried one by one, and the best solution is returned. For `Phases`, a sequence has one guess for each phase.
+    - `guess`: None for straight lines between the values at both ends; a `Plan`; a `Trajectory`; or a dict by name. A
+        value of the dict is a number, an array (n,) of equally spaced samples, or a function of time. The key
+        "duration" sets the duration. If `guess` is a sequence of these, all are tried and the best solution is
+        returned. For `Phases`, a sequence contains one guess for each phase.
     - `intervals`: the number of intervals of the first mesh.
     - `method`: "trapezoid" (order 2), "hermite-simpson" (order 4) or "lobatto" (order 6).
-    - `tolerance`: the largest local error of an interval, relative to the size of each state. None keeps the mesh.
+    - `tolerance`: the largest permitted local error of an interval, relative to the size of each state. None: the first
+        mesh is not refined.
     - `solver`: a `Solver`; by default `Ipopt` if CasADi is installed, else `Cyipopt`, else `TrustConstr`.
-    - `options`: options of the solver by its own names.
-    - `starts`: the number of guesses: random deviations from `guess` are added to the coordinates.
+    - `options`: options of the solver, by the names that the solver uses.
+    - `starts`: the number of searches. The first one starts from `guess`. For the others, random deviations are added
+        to the coordinates.
     - `seed`: the seed of these deviations.
-    - `max_iterations`: the largest number of iterations on a mesh.
+    - `max_iterations`: the largest number of iterations of the solver on each mesh.
     - `max_intervals`: the largest number of intervals of a phase.
     - `progress`: show the cost and the violation of each iteration.
 
-    **Returns:** a `Plan`. If no solution is found, `plan.ok` is False and `plan.reason` states why; the plan contains
-    the last or best iterate.
+    **Returns:** a `Plan`. If no solution is found, `plan.ok` is False and `plan.reason` states why. The plan then
+    contains the last or best iterate.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that make no sense, and if a function is not finite at the
-    guess.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments, and if a function is not finite at the guess.
     """
     phases = problem if isinstance(problem, Phases) else Phases([problem]) if isinstance(problem, Problem) else None
     if phases is None:
@@ -115,7 +119,7 @@ def continuation(
     - `guess`: the guess for the first problem.
     - `arguments`: arguments of `solve`.
 
-    **Returns:** the plans. The list ends with the first one that is not `ok`.
+    **Returns:** a list of plans. If a plan is not `ok`, it is the last one in the list.
     """
     plans: list[Plan] = []
     for value in values:
@@ -129,11 +133,15 @@ def continuation(
 def check_derivatives(
     problem: Problem | Phases, guess: Any = None, *, intervals: int = 2, method: str = "hermite-simpson", seed: int = 0
 ) -> dict[str, float]:
-    """Compare the sparse derivatives with dense ones by JAX, on a small mesh near the guess.
+    """Compare the sparse derivatives with dense derivatives computed by JAX, on a small mesh at a point near the guess.
 
-    **Arguments:** those of `solve`.
+    **Arguments:**
 
-    **Returns:** the largest deviation of "gradient", "jacobian" and "hessian", relative to the largest entry.
+    - `problem`, `guess`, `intervals`, `method`: as in `solve`.
+    - `seed`: the seed of the random point near the guess.
+
+    **Returns:** the largest deviations by name, for "gradient", "jacobian" and "hessian", each relative to the largest
+    entry.
     """
     phases = problem if isinstance(problem, Phases) else Phases([problem])
     found = lobatto(method)
@@ -380,8 +388,10 @@ def _guessed(problem: Problem, guess: Any, s: np.ndarray, detour: Any) -> Motion
     if _is_similar(problem, guess):
         found = interpolated(guess.motion, guess.mesh / guess.duration, guess.method, s)
         low, high = problem.durations
-        return found._replace(duration=min(max(guess.duration, low), high))
-    return guess_of(problem, getattr(guess, "trajectory", guess), s, detour)
+        found = found._replace(duration=min(max(guess.duration, low), high))
+    else:
+        found = guess_of(problem, getattr(guess, "trajectory", guess), s)
+    return found if detour is None else detoured(problem, found, detour)
 
 
 def _theta(problem: Problem, guess: Any) -> np.ndarray:
@@ -403,20 +413,20 @@ def _estimates(transcription: Transcription, x: np.ndarray) -> dict[str, float]:
 
 
 def lagrangian_gradient(program: NonlinearProgram, solution: Solution) -> np.ndarray:
-    """The derivatives (n,) of cost + multipliers . constraints by the scaled variables."""
+    """The derivatives (n,) of cost + multipliers . constraints with respect to the scaled variables."""
     rows, columns = program.jacobian_structure
     products = program.jacobian(solution.z) * solution.multipliers[rows]
     return program.gradient(solution.z) + np.bincount(columns, products, minlength=program.n)
 
 
 def dual_residual(program: NonlinearProgram, solution: Solution) -> float:
-    """The largest violation of the conditions of a minimum, of variables that are not fixed."""
+    """The largest violation of the conditions of a minimum, without variables that are fixed."""
     residual = lagrangian_gradient(program, solution) + solution.bound_multipliers
     return float(np.max(np.abs(residual[program.lower < program.upper]), initial=0.0))
 
 
 def multipliers_of(transcription: Transcription, solution: Solution, p: int) -> Multipliers:
-    """See `Multipliers`. The derivative of the cost by a bound is minus the multiplier of the bound."""
+    """See `Multipliers`. The derivative of the cost with respect to a bound is minus the multiplier of the bound."""
     program, layout = transcription.program, transcription.layouts[p]
     of_bounds = solution.bound_multipliers.copy()
     fixed = program.lower >= program.upper
@@ -457,7 +467,7 @@ def unmet_of(transcription: Transcription, solution: Solution, p: int, tolerance
 
 
 def active_of(transcription: Transcription, solution: Solution, p: int) -> tuple[str, ...]:
-    """The names of bounds and inequality constraints that are active somewhere, without values that are given."""
+    """The names of bounds and inequality constraints that are active somewhere. Fixed values are not included."""
     program, layout = transcription.program, transcription.layouts[p]
     found = []
 

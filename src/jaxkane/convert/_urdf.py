@@ -33,35 +33,40 @@ def from_urdf(
         dog = jk.convert.from_urdf("dog.urdf", floating=True)
 
     Revolute, continuous, prismatic, fixed, floating and planar joints are supported. A link without an `inertial` has
-    no mass, whatever its shapes. `mimic` becomes a coupling. `package://` paths and meshes are not read.
+    no mass, even if it has shapes. `mimic` becomes a coupling. `package://` paths and meshes are not read.
 
     **Arguments:**
 
-    - `model`: a path, or the text of a file, which begins with "<".
-    - `floating`: the root link moves freely, by a free joint named `root`. Default: it is fixed to the ground.
-    - `inertias`: for inertias that violate the triangle inequality by more than 5 %: "refuse" raises an exception with
-        a table of links, "nearest" uses the nearest possible inertias. An excess of up to 0.2 % is attributed to
-        rounding. An excess of up to 5 % causes a warning. Inertias that do not affect the motion are never refused.
-    - `merge_fixed`: links that are connected rigidly become one body, named after the first link with a mass. The
+    - `model`: a path, or the text of a file. A text must begin with "<".
+    - `floating`: True: a free joint named `root` connects the root link to the ground. False: the root link is fixed to
+        the ground.
+    - `inertias`: how to treat inertias that violate the triangle inequality by more than 5 %. "refuse" raises an
+        exception with a table of links. "nearest" uses the nearest possible inertias. For both, an excess of up to
+        0.2 % is attributed to rounding, and an excess of up to 5 % causes a warning. Inertias that do not affect the
+        motion are never refused.
+    - `merge_fixed`: True: links that are connected rigidly become one body, named after the first link with a mass. The
         other links remain as points. False: each link keeps its own parameters.
-    - `stops`: names of hinges and sliders whose limits become contacts without restitution, `NAME lower` and
-        `NAME upper`, with the parameters `lower.NAME`, `upper.NAME`. True: all that have a range. At most four contacts
-        are possible, so name the joints that reach their limits.
-    - `friction`: names of hinges and sliders whose friction becomes dry friction, the contact `NAME friction` with the
-        parameter `friction.NAME`. True: all that have friction.
-    - `gravity` (3,) [m/s^2]: in the inertial frame.
+    - `stops`: names of hinges and sliders whose limits become contacts without restitution. The contacts are named
+        `NAME lower` and `NAME upper`, and their parameters are `lower.NAME` and `upper.NAME`. True: all joints with a
+        range. A system can have at most four contacts, so name only the joints that reach their limits.
+    - `friction`: names of hinges and sliders whose friction becomes dry friction. The contact is named `NAME friction`,
+        and its parameter is `friction.NAME`. True: all joints with friction.
+    - `gravity` (3,): the acceleration of gravity in the inertial frame [m/s^2].
     - `strict`: raise an exception for elements that are not supported, instead of omitting them with a warning.
-    - `dependent`: hinges and sliders that follow others, as in `jaxkane.joints.mechanism`.
-    - `name`: of the class; the robot's name by default.
+    - `dependent`: names of hinges and sliders that are dependent, as in `jaxkane.joints.mechanism`.
+    - `name`: the name of the class. Default: the name of the robot.
 
     **Returns:** a `jaxkane.joints.Mechanism`. `left_out` lists omitted elements. A dot in a name becomes an underscore.
-    A floating joint on the ground becomes a free joint. On a moving link it becomes three sliders, `NAME_x`, `NAME_y`
-    and `NAME_z`, and a ball joint `NAME`. Joints that move no mass are fixed.
+    A floating joint on the ground becomes a free joint. A floating joint on a moving link becomes three sliders,
+    `NAME_x`, `NAME_y` and `NAME_z`, and a ball joint `NAME`. Joints that move no mass are fixed.
 
-    **Raises:** `ValueError` for a file that is not a URDF, contains macros of xacro, or is not one tree of links; for
-    numbers that are missing, not finite or in degrees; for impossible inertias; for a file in which nothing moves. Also
-    for `stops` and `friction` of joints without these, more than four contacts, and with `strict` for omitted elements.
-    `FileNotFoundError` for a missing file.
+    **Raises:**
+
+    - `ValueError` for a file that is not a URDF, contains macros of xacro, or is not one tree of links; for numbers
+        that are missing, not finite or in degrees; for impossible inertias; for a file in which nothing moves.
+    - `ValueError` for joints in `stops` without a range, for joints in `friction` without friction, for more than four
+        contacts, and with `strict` for omitted elements.
+    - `FileNotFoundError` for a missing file.
     """
     file = read_urdf(text_of(model))
     file = _without_massless_joints(file._replace(name=name or file.name))

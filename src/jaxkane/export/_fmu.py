@@ -43,36 +43,38 @@ def fmu(
     sources: bool = True,
     state: State | None = None,
 ) -> Path:
-    """Export a system as an FMU, for Simulink, OpenModelica, Dymola, FMPy and other programs with the interface FMI.
+    """Export a system as an FMU, for Simulink, OpenModelica, Dymola, FMPy and other programs that support FMI.
 
         jk.export.fmu(pendulum, "pendulum.fmu")
         # fmpy.simulate_fmu("pendulum.fmu", start_values={"angle": 1.0, "mass": 2.0})
 
     | in the system | in the FMU |
     |---|---|
-    | coordinates, independent speeds, first-order states | continuous states, which are outputs |
+    | coordinates, independent speeds, first-order states | continuous states; they are also outputs |
     | dependent speeds, outputs | outputs |
     | inputs | inputs |
     | parameters | tunable parameters with bounds; fixed parameters if configuration constraints depend on them |
     | events without `then`, det C_dep = 0 | end of the simulation |
     | events with `then` | jumps of the states |
 
-    All derivatives are exact (directional derivatives, also with respect to parameters). The state of the FMU can be
-    stored, restored and serialized. Co-simulation uses the classical Runge-Kutta method of order 4. It divides each
-    communication step evenly, and locates events. A parameter outside of its bounds is refused.
+    All directional derivatives are exact, also those with respect to parameters. The state of the FMU can be stored,
+    restored and serialized. Co-simulation uses the classical Runge-Kutta method of order 4. It divides each
+    communication step into equal steps, and locates events. The FMU refuses values of parameters outside of their
+    bounds.
 
-    At the end of the initialization, the FMU solves the configuration constraints for the dependent coordinates, or,
-    without dependent coordinates, for the nearest coordinates. Dependent speeds always follow from the constraints.
+    At the end of the initialization, the FMU solves the configuration constraints for the dependent coordinates. A
+    system without dependent coordinates starts at the nearest coordinates that satisfy the constraints. Dependent
+    speeds are always computed from the constraints.
 
     The equations are compiled with the C compiler of this computer: `$CC`, cc, gcc or clang. The FMU therefore runs on
-    computers of this kind. With `sources`, other programs can compile it for other computers.
+    computers of the same kind. With `sources`, other programs can compile the FMU for other computers.
 
     **Arguments:**
 
     - `system`: the system, with at most 12 independent speeds.
     - `path`: the file to write, "FOLDER/NAME.fmu". The folder is created. An existing file is replaced.
     - `fmi`: the version of the interface, "3.0" or "2.0".
-    - `kind`: "model exchange" (the importer integrates), "co-simulation" (the FMU integrates), or both.
+    - `kind`: "model exchange" (the importing program integrates), "co-simulation" (the FMU integrates), or both.
     - `step`: the longest step of the integration in co-simulation [s].
     - `sources`: whether the FMU contains its C source, one file without dependencies.
     - `state`: the start values. Default: `jaxkane.assemble(system, {}, {})`.
@@ -80,8 +82,8 @@ def fmu(
     **Returns:** the path.
 
     **Raises:** `ValueError` for contacts, for more than 12 speeds, for a batch of systems, for operations that are not
-    formulas of scalars, and for start values that violate the constraints. `RuntimeError` without a compiler if
-    `sources` is False; otherwise the FMU then contains only sources, and a warning states this.
+    formulas of scalars, and for start values that violate the constraints. `RuntimeError` if there is no compiler and
+    `sources` is False. If there is no compiler and `sources` is True, the FMU contains only the source, with a warning.
     """
     kinds = (kind,) if isinstance(kind, str) else tuple(kind)
     path = _checked(system, path, fmi, kinds, step)

@@ -34,22 +34,23 @@ from ._phases import TrialPhase, add_squares, checked_inputs, checked_within, gu
 
 @dataclasses.dataclass(frozen=True)
 class Collocation:
-    """Fit by direct collocation instead of simulation: all states at all samples are unknowns.
+    """Fit by direct collocation instead of simulation. The states at all samples are unknowns.
 
         jk.fit.fit(bicycle, trials, free, unknown=states, transcription=jk.fit.Collocation(
             unknown_inputs={"roll_torque": 4.0}, within={"roll": (-0.5, 0.5)}))
 
-    The equations of motion are constraints, so a motion may be unstable and long. An unknown input is a function of
-    time that is estimated too. Its prior is white noise of a given spectral density S, so that the cost contains the
-    integral of w^2 / S. The parameters are those of the largest marginal likelihood, in which the unknown inputs are
-    integrated out. Prefer the default, linked windows, if all inputs are recorded: it is faster.
+    The equations of motion are constraints, so a motion may be unstable and long. An unknown input w is also estimated,
+    as a function of time. Its prior is white noise of a given spectral density S, so the cost contains the integral of
+    w^2 / S. If there are unknown inputs, they are integrated out, and the parameters maximize the marginal likelihood.
+
+    Omit `transcription`, or use `window`, if all inputs are recorded: both are faster.
 
     **Arguments:**
 
     - `intervals_per_sample`: the number of intervals of the mesh between two samples.
-    - `unknown_inputs`: by name, the spectral density [unit^2 s] of inputs that were not recorded. An input that is also
-        recorded is the sum of its record and the unknown part.
-    - `within`: by name (lower, upper) of states and unknown inputs, at all nodes. Either bound may be None.
+    - `unknown_inputs`: a dict by name of the spectral densities [unit^2 s] of inputs that were not recorded. If an
+        input was recorded too, it is the sum of its record and the unknown part.
+    - `within`: a dict by name of (lower, upper), for states and unknown inputs at all nodes. None means no bound.
     - `method`: "trapezoid", "hermite-simpson" or "lobatto".
     - `solver`: a solver of `jaxkane.collocation`; by default the first one that is installed.
     - `max_iterations`: the largest number of iterations.
@@ -150,7 +151,7 @@ def solved(problem: Problem, how: Collocation, progress: bool) -> CollocationFit
 
 
 def with_fixed(program: NonlinearProgram, variables: np.ndarray, z: np.ndarray) -> NonlinearProgram:
-    """The same program in which some variables have the values z (n,), in scaled numbers."""
+    """The same program, but with some variables fixed at their values in z (n,), in scaled numbers."""
     changed = copy.copy(program)
     lower, upper = program.x_bounds.lower.copy(), program.x_bounds.upper.copy()
     lower[variables] = upper[variables] = z[variables] * program.x_scale[variables]
@@ -185,16 +186,21 @@ class CollocationFit:
 
     Attributes:
 
-    - `estimates`, `start`: estimates and initial guesses by name, gains and delays included.
-    - `standard_errors`: by name, from the inverse of the matrix of Karush, Kuhn and Tucker. `sigma` and the spectral
+    - `estimates`: estimates by name, including gains, offsets and delays of inputs.
+    - `start`: initial guesses by name.
+    - `standard_errors`: standard errors by name. They are computed from the inverse of the matrix of Karush, Kuhn and
+        Tucker, and with unknown inputs from the curvature of the marginal likelihood. `sigma` and the spectral
         densities are used as given.
     - `intervals(level)`: confidence intervals by name.
     - `covariance`, `correlation` (p, p): of the estimates, in the order of `names`.
     - `system`: the system with the estimates.
-    - `cost`: the sum of the squares of residuals, priors, and unknown inputs divided by their spectral densities.
-    - `residuals`, `fitted`: by trial and channel, (fitted - measured) / sigma and the fitted measurements (n_t,).
-    - `motions`: by trial and name, the estimated states and inputs at the samples (n_t,).
-    - `status`, `ok`, `message`: why the search ended.
+    - `cost`: the sum of three parts: the squared residuals, the squares of the priors, and the integrals of the squared
+        unknown inputs divided by their spectral densities.
+    - `residuals`: (fitted - measured) / sigma (n_t,), by trial and channel.
+    - `fitted`: the fitted measurements (n_t,), by trial and channel.
+    - `motions`: the estimated states and inputs at the samples (n_t,), by trial and name.
+    - `status`, `message`: why the search ended, as a word and as a sentence.
+    - `ok`: whether the search converged and the data determine all parameters.
     """
 
     problem: Problem
@@ -316,7 +322,7 @@ class CollocationFit:
         }
 
     def nuisance(self) -> dict[str, dict[str, float]]:
-        """By trial and name, the values of the unknowns of the trial."""
+        """The estimates that belong to one trial only, by trial and name."""
         model, n = self.problem.model.nuisance, self.parameters.size
         rows = {}
         for name, layout in zip(names_of(self.problem.trials), self.transcription.layouts, strict=True):
