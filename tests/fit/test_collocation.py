@@ -213,3 +213,14 @@ def test_options_that_collocation_does_not_have(option):
         fit(GUESS, record(1), NAMES, transcription=Collocation(), steps=3)
     with pytest.raises(ValueError, match="delay of sensor"):
         fit(GUESS, record(1), (*NAMES, Delay("x")), transcription=Collocation())
+
+
+def test_wrong_standard_deviations_are_noted():
+    """With a tenth of the true errors of the sensors, the mean square is not one."""
+    trial = record(2, density=0.3)
+    wrong = Trial(T, trial.measured, trial.inputs, sigma={"x": 2e-4, "x_dot": 1e-3})
+    found = by_collocation(wrong, unknown_inputs={"push": 0.3})
+    assert found.mean_square > 2.0
+    assert "spectral densities" in found.notes[0]
+    assert "mean square" in repr(found)
+    assert not by_collocation(trial, unknown_inputs={"push": 0.3}).notes

@@ -252,6 +252,23 @@ class CollocationFit:
         return self.transcription.program.objective(self.solution.z) * self.transcription.program.f_scale
 
     @property
+    def mean_square(self) -> float:
+        """The cost divided by the number of measurements; about one if `sigma` and the spectral densities are right."""
+        return self.cost / np.count_nonzero(np.asarray(self.problem.windows.weight) > 0)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Warnings as sentences."""
+        n = np.count_nonzero(np.asarray(self.problem.windows.weight) > 0)
+        if abs(self.cost - n) < 5.0 * np.sqrt(2.0 * n):
+            return ()
+        densities = " and the spectral densities of `unknown_inputs`" * bool(self.transcription_options.unknown_inputs)
+        return (
+            f"The mean square is {self.mean_square:.3g} instead of about 1, so the estimates and intervals cannot be "
+            f"trusted. Check `sigma`{densities}.",
+        )
+
+    @property
     def estimates(self) -> dict[str, float]:
         return self._by_name(self.parameters.values(jnp.asarray(self._theta)))
 
@@ -337,7 +354,7 @@ class CollocationFit:
             numbers = self.start[name], self.estimates[name], self.standard_errors[name]
             rows.append((name, unit, *(f"{x:.6g}" for x in numbers), f"{low:.6g} to {high:.6g}"))
         head = f"{self.problem.title}. By collocation: {self.message} Cost {self.cost:.6g}."
-        return f"{head}\n{text_table(rows, left=(0, 1))}"
+        return "\n".join([head, *self.notes, text_table(rows, left=(0, 1))])
 
 
 @jit
