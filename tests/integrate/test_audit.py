@@ -30,7 +30,8 @@ def test_energy_balance_of_ten_seconds(name):
     # Jumps accumulate. The accelerations of the wheel are discontinuous at the edge, so the energy has its own test.
     ends = {"BouncingBall": 3.0, "RockingBlock": 3.0, "SliderCrankWithClearance": 0.024, "Woodpecker": 0.7}
     end = ends.get(name, 10.0)
-    audit = jk.audit(*run(name, end, rtol=1e-10, atol=1e-10))
+    times = 2001 if name == "Woodpecker" else 1001  # the work between its many impacts is a sum over samples
+    audit = jk.audit(*run(name, end, times, rtol=1e-10, atol=1e-10))
     assert audit.energy_balance < RTOL
     assert audit.work_error < RTOL * audit.kinetic_energy.max()
     assert audit.ok
