@@ -103,7 +103,7 @@ SUBJECTS = {
         "result": ("Results, uncertainty, validation", "uncertainty"),
         "extend": ("Model extensions", "model_extensions"),
         "inverse": ("Inverse dynamics", "inverse_dynamics"),
-        "collocated": ("Fits by collocation", "optimal_control"),
+        "collocated": ("Fits by collocation", "process_noise"),
         "_bicycle": ("Bicycles", "bicycles_fit"),
     },
 }
@@ -142,13 +142,23 @@ def result_classes(module):
     """Classes that a module's functions return, but that it does not export."""
     package, exported = PACKAGE / module, public_names(module)
     tree = ast.parse((package / "__init__.py").read_text(encoding="utf-8"))
-    for file in dict.fromkeys(node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)):
-        body = ast.parse(package.joinpath(*file.split(".")).with_suffix(".py").read_text(encoding="utf-8")).body
-        functions = [node for node in body if isinstance(node, ast.FunctionDef) and node.name in exported]
-        returned = {ast.unparse(function.returns) for function in functions if function.returns}
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    for file, level in dict.fromkeys((node.module, node.level) for node in imports):
+        folder = package if level == 1 else package.parent  # `from .._collocate.functions import Now`
+        body = ast.parse(folder.joinpath(*file.split(".")).with_suffix(".py").read_text(encoding="utf-8")).body
+        classes = [node for node in body if isinstance(node, ast.ClassDef) and node.name in exported]
+        functions = [
+            node
+            for nodes in (body, *(each.body for each in classes))
+            for node in nodes
+            if isinstance(node, ast.FunctionDef) and node.name in exported
+        ]
+        returns = [ast.unparse(function.returns) for function in functions if function.returns]
+        returned = {name for text in returns for name in text.split(" | ")}
         for node in body:
             if isinstance(node, ast.ClassDef) and node.name in returned and node.name not in exported:
-                yield f"{full_name(module)}.{file}.{node.name}"
+                owner = full_name(module) if level == 1 else "jaxkane"
+                yield f"{owner}.{file}.{node.name}"
 
 
 def full_name(module):
