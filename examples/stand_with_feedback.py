@@ -1,9 +1,9 @@
-"""With which feedback does a person stand on a platform that shakes?
+"""Which feedback gains does a person use who stands on a shaking platform?
 
 A standing person is a double inverted pendulum with ankles and hips, which is unstable without feedback. Their torques
 are feedback of both angles and rates, with eight unknown gains. The platform moves with a known acceleration, and the
 two angles are measured with noise. The cost is the integral of the squared deviations from the measurements. There are
-no controls: the gains are the free parameters. The initial guess of the gains is far too weak to stand.
+no controls: the gains are the free parameters. With the initial guess of the gains, the person would fall.
 
 The model follows Park, Horak and Kuo (2004), *Postural feedback responses scale with biomechanical constraints in human
 standing*, Experimental Brain Research 154. The measurements are simulated, so the true gains are known. They

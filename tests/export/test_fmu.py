@@ -1,4 +1,4 @@
-"""Functional mock-up units, imported by FMPy: their variables, their motion, their events, and what is refused."""
+"""Functional mock-up units, imported by FMPy: variables, simulations, events, and errors for unsupported systems."""
 
 import shutil
 import subprocess

@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import importlib.util
 import signal
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -473,3 +474,19 @@ def default_solver() -> Solver:
         stacklevel=4,
     )
     return TrustConstr()
+
+
+def show_progress(iteration: int, cost: float, violation: float) -> None:
+    """One line that is overwritten in each iteration."""
+    text = f"\riteration {iteration}: cost {cost:.6g}, violation {violation:.1e}".ljust(72)
+    print(text, end="", file=sys.stderr, flush=True)
+
+
+def run(solver: Solver, program: NonlinearProgram, z: np.ndarray, *, progress: bool, **arguments: Any) -> Solution:
+    """Call a solver, with one line of progress if `progress` is True."""
+    monitor = Monitor(program, show_progress if progress else None)
+    try:
+        return solver(program, z, monitor, **arguments)
+    finally:
+        if progress:
+            print(file=sys.stderr)

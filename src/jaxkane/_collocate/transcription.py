@@ -98,7 +98,7 @@ class Motion(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A group of constraints: its kind, a name, and the places of its first and last row."""
+    """A group of constraints: its kind, its phase or link, its name, and the indices of its rows."""
 
     kind: str
     phase: int
@@ -253,17 +253,12 @@ class Transcription:
             self.x[layout.node(np.arange(layout.K))] = np.concatenate([motion.Y, motion.W], axis=1)
             if layout.duration is not None:
                 self.x[layout.duration] = motion.duration
-        self.x[self._shared_parameters] = theta
+        self.x[self.shared_parameters] = theta
         self._build()
 
     def _build(self) -> None:
         self.x_bounds = self._variable_bounds()
-        dynamics = [
-            EvaluatedBlock(
-                Block(Dynamics(x.variables), x.node_data(x.s[x.dynamics[0]]), x.dynamics[1], x.variables.n_y)
-            )
-            for x in self.layouts
-        ]
+        dynamics = [_dynamics(layout) for layout in self.layouts]
         self._check_finite_dynamics(dynamics)
         self.x_scale = self._scales(dynamics)
         builder = Builder(self.n, self.method)
@@ -293,9 +288,16 @@ class Transcription:
         return self.x / self.x_scale
 
     @property
-    def _shared_parameters(self) -> np.ndarray:
+    def shared_parameters(self) -> np.ndarray:
+        """The indices (p,) of the parameters of all phases."""
         layout = self.layouts[0]
         return layout.parameters[: len(layout.parameters) - layout.problem.n_local]
+
+    @property
+    def local_parameters(self) -> np.ndarray:
+        """The indices of the parameters that belong to one phase, of all phases."""
+        n = len(self.shared_parameters)
+        return np.concatenate([layout.parameters[n:] for layout in self.layouts])
 
     def motions(self, x: np.ndarray) -> list[Motion]:
         """The motions of all phases at variables (n,)."""
@@ -318,7 +320,7 @@ class Transcription:
         return found
 
     def theta(self, x: np.ndarray) -> np.ndarray:
-        return x[self._shared_parameters]
+        return x[self.shared_parameters]
 
     def _variable_bounds(self) -> Bounds:
         lower, upper = np.full(self.n, -math.inf), np.full(self.n, math.inf)
@@ -374,7 +376,7 @@ class Transcription:
             block = EvaluatedBlock(Block(Integrand(variables, problem.cost), data, layout.columns, 1))
             builder.cost(block, layout.quadrature(self.method))
         along = {k: v for k, v in problem.limits.items() if k not in (*problem.names, *variables.controls)}
-        path = self._constraints(layout, "path", problem.path, 0) if problem.path is not None else {}
+        path = self._constraints(layout, "path", problem.path) if problem.path is not None else {}
         if along or path:
             block = Block(Path(variables, tuple(along), problem.path), data, layout.columns, len(along) + len(path))
             builder.constraints("path", p, EvaluatedBlock(block), [*along.items(), *path.items()])
@@ -387,7 +389,7 @@ class Transcription:
             label: {k: bounds_of(k, v) for k, v in problem.ends[label].items() if k not in names}
             for label in ("start", "end")
         }
-        conditions = self._constraints(layout, "conditions", problem.conditions, 0)
+        conditions = self._constraints(layout, "conditions", problem.conditions)
         fixed = [c for c in problem.system.coordinates if not isinstance(problem.ends["start"].get(c, ()), tuple)]
         n_h = 0 if len(fixed) == len(problem.system.coordinates) else problem.n_constraints
         items = [(f"{name}", bounds) for name, bounds in conditions.items()]
@@ -441,7 +443,7 @@ class Transcription:
         jax.eval_shape(dataclasses.replace(link, how=recorded), node, jnp.asarray(self.x[columns[0]]))
         return found
 
-    def _constraints(self, layout: Layout, label: str, f: Any, k: int) -> dict[str, Bound]:
+    def _constraints(self, layout: Layout, label: str, f: Any) -> dict[str, Bound]:
         """The bounds of the constraints that a function of the user returns, by name."""
         if f is None:
             return {}
@@ -484,6 +486,13 @@ class Transcription:
         sizes = [abs(self.program.objective(place)) for place in (self.z, z)]
         finite = [size for size in sizes if math.isfinite(size) and size > 0]
         return max(finite, default=1.0)
+
+
+def _dynamics(layout: Layout) -> EvaluatedBlock:
+    """The equations of motion of a phase."""
+    nodes, columns, _ = layout.dynamics
+    variables = layout.variables
+    return EvaluatedBlock(Block(Dynamics(variables), layout.node_data(layout.s[nodes]), columns, variables.n_y))
 
 
 class Builder:

@@ -270,8 +270,13 @@ def projected(system: System, t: Component, q: Array, steps: int = 3) -> Float[A
     return q
 
 
+def n_configuration_constraints(system: System, t: Component, q: Any) -> int:
+    """The number of residuals of the configuration constraints. `q` may be a `jax.ShapeDtypeStruct`."""
+    return jax.eval_shape(lambda q: configuration_residual(system, t, q), q).shape[0]
+
+
 def has_configuration_constraints(system: System, t: Component, q: Array) -> bool:
-    return jax.eval_shape(lambda q: configuration_residual(system, t, q), q).shape[0] > 0
+    return n_configuration_constraints(system, t, q) > 0
 
 
 class DependentSpeeds(eqx.Module):

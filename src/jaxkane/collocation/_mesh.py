@@ -35,14 +35,18 @@ class ControlPolynomial(eqx.Module):
     coefficients: Float[Array, "N s"]
 
     def __call__(self, t: Component, state: Any = None) -> Array:
-        mesh = jnp.asarray(self.mesh)
-        at = jax.lax.stop_gradient(jnp.asarray(t, mesh.dtype))
-        i = jnp.clip(jnp.sum(mesh <= at, dtype=jnp.int32) - 1, 0, mesh.shape[0] - 2)
-        u = (t - mesh[i]) / (mesh[i + 1] - mesh[i])
+        i, u = place_in_mesh(jnp.asarray(self.mesh), t)
         value = jnp.zeros_like(u)
         for k in range(self.coefficients.shape[1] - 1, -1, -1):
             value = value * u + self.coefficients[i, k]
         return value
+
+
+def place_in_mesh(mesh: Array, t: Component) -> tuple[Array, Array]:
+    """The index of the interval that contains a time, and the fraction of the interval."""
+    at = jax.lax.stop_gradient(jnp.asarray(t, mesh.dtype))
+    i = jnp.clip(jnp.sum(mesh <= at, dtype=jnp.int32) - 1, 0, mesh.shape[0] - 2)
+    return i, (t - mesh[i]) / (mesh[i + 1] - mesh[i])
 
 
 def coefficients_of(values: np.ndarray, method: Lobatto) -> np.ndarray:

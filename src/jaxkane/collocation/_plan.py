@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from .._collocate.lobatto import Lobatto
 from .._collocate.program import padded
 from .._collocate.transcription import Motion
+from .._integrate.inputs import inputs_at
 from .._integrate.simulate import simulate
 from .._integrate.status import Status
 from .._integrate.trajectory import Trajectory
@@ -26,7 +27,7 @@ from .._scalarjit.cache_key import jit
 from .._scalarjit.compat import on_device
 from .._system.prints import wrapped
 from .._system.system import State, System, has_outputs, names_of, units_of, unpacked
-from ._mesh import ControlPolynomial, coefficients_of, interpolated, with_controls, without_events
+from ._mesh import ControlPolynomial, coefficients_of, interpolated, place_in_mesh, with_controls, without_events
 from ._problem import Problem
 
 
@@ -171,7 +172,7 @@ class Plan:
         )
 
     def _with_feedback(self) -> Any:
-        regulator = Regulator(
+        return Regulator(
             jnp.asarray(self.mesh),
             jnp.asarray(coefficients_of(self.motion.Y, self.method)),
             jnp.asarray(coefficients_of(self.motion.W, self.method)),
@@ -179,7 +180,6 @@ class Plan:
             self.problem.signals,
             tuple(self.problem.bounds_of_controls),
         )
-        return regulator
 
     def deviation(self, ride: Trajectory) -> float:
         """The largest deviation of a simulation from the plan, relative to the size of each state.
@@ -281,9 +281,7 @@ class Regulator(eqx.Module):
     controls: tuple[str, ...] = eqx.field(static=True)
 
     def __call__(self, t: Any, state: Any) -> dict[str, Any]:
-        at = jax.lax.stop_gradient(t)
-        i = jnp.clip(jnp.sum(self.mesh <= at, dtype=jnp.int32) - 1, 0, self.mesh.shape[0] - 2)
-        u = (t - self.mesh[i]) / (self.mesh[i + 1] - self.mesh[i])
+        i, u = place_in_mesh(self.mesh, t)
         powers = jnp.stack([u**k for k in range(self.Y.shape[1])])  # an array of integers would be promoted
         x = () if state.x is None else (jnp.asarray(state.x),)
         y = jnp.concatenate([jnp.asarray(state.q), jnp.asarray(state.u), *x])
@@ -329,10 +327,9 @@ def _linear(system: System, signals: Any, controls: tuple[str, ...], ts: Array, 
 
 
 def inputs_with(system: System, signals: Any, controls: Sequence[str], t: Array, y: Array, w: Array) -> dict[str, Any]:
-    from .._integrate.inputs import inputs_at
-
-    given = inputs_at(system, signals, t, unpacked(system, y)) | {name: w[i] for i, name in enumerate(controls)}
-    return given | {name: jnp.zeros_like(t) for name in system.inputs if name not in given}
+    """All inputs by name. Those that are neither signals nor controls are zero."""
+    others = inputs_at(system, signals, t, unpacked(system, y), all_of_them=True)
+    return others | {name: w[i] for i, name in enumerate(controls)}
 
 
 @jit
@@ -340,9 +337,9 @@ def _drift(system: System, t: Array, q: Array) -> Array:
     return jax.vmap(lambda t, q: configuration_residual(system, t, q))(t, q)
 
 
-def trajectory_of(system: System, problem: Problem, motion: Motion, origin: float = 0.0) -> Trajectory:
+def trajectory_of(system: System, problem: Problem, motion: Motion) -> Trajectory:
     """A motion as a `Trajectory` at its nodes."""
-    t = origin + motion.s * motion.duration
+    t = motion.s * motion.duration
     controls = tuple(problem.bounds_of_controls)
     along = _along(system, problem.signals, controls, *(padded(a) for a in (t, motion.Y, motion.W)))
     q, u, x, u_dep, inputs, outputs = jax.tree.map(lambda a: on_device(np.asarray(a)[: len(t)]), along)

@@ -1,4 +1,4 @@
-"""Optimal control problems: what is given, what is free, what is minimized."""
+"""Optimal control problems: a system, its controls, the cost and the constraints."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from .._collocate.functions import Bound, Condition, Now, Variables, bounds_of
 from .._collocate.transcription import variables_of
 from .._common.lookup import as_names, real_number, refuse_unknown
 from .._integrate.inputs import as_signals, is_samples
+from .._integrate.jumps import names_of_jumps
 from .._kane.arguments import check_is_system, is_concrete, refuse_multipliers
 from .._kane.checks import check_system
-from .._kane.constraint_residuals import check_state, configuration_residual
+from .._kane.constraint_residuals import check_state, configuration_residual, n_configuration_constraints
 from .._kane.contact import has_contacts
 from .._kane.right_hand_side import output_names
 from .._system.parameters import in_batches
@@ -279,7 +280,7 @@ class Problem:
     def n_constraints(self) -> int:
         """The number of residuals of the configuration constraints."""
         q = jax.ShapeDtypeStruct((len(self.system.coordinates),), jnp.float64)
-        return jax.eval_shape(lambda q: configuration_residual(self.system, jnp.zeros(()), q), q).shape[0]
+        return n_configuration_constraints(self.system, jnp.zeros(()), q)
 
     @property
     def signals(self) -> Any:
@@ -361,22 +362,16 @@ class Phases:
             if not callable(link) and one.names != other.names:
                 raise ValueError(f"Phases: link {i}: the states have other names. Pass a function (last, first).")
             if isinstance(link, str):
-                refuse_unknown([link], events_with_jumps(one.system), f"Phases: {one.title} has no jump", "it has")
+                refuse_unknown([link], names_of_jumps(one.system), f"Phases: {one.title} has no jump", "it has")
         names = [() if p.parameters is None else p.parameters.names for p in phases]
         if len(set(names)) > 1:
             raise ValueError("Phases: all phases need the same `free`, because they share their parameters.")
 
 
-def events_with_jumps(system: System) -> tuple[str, ...]:
-    from .._integrate.jumps import names_of_jumps
-
-    return names_of_jumps(system)
-
-
 def _pair(label: str, value: Any) -> Bound:
     """Lower and upper bound of what must not be a number, because a bound of one side could be meant."""
     if not isinstance(value, (tuple, list)):
-        raise ValueError(f"Problem: {label} must be (lower, upper), where None is no bound; got {value!r}.")
+        raise ValueError(f"Problem: {label} must be (lower, upper), with None for no bound; got {value!r}.")
     return bounds_of(label, value)
 
 

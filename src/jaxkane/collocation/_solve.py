@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import numbers
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from .._collocate.lobatto import Lobatto, lobatto
 from .._collocate.program import NonlinearProgram
-from .._collocate.solvers import INTERRUPTED, NOT_FINITE, Monitor, Solution, Solver, default_solver
+from .._collocate.solvers import INTERRUPTED, NOT_FINITE, Solution, Solver, default_solver, run
 from .._collocate.transcription import Motion, Transcription, nodes_of, system_at
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
@@ -279,15 +278,10 @@ class _Search:
 
     def _solved(self, transcription: Transcription, is_warm: bool) -> Solution:
         program = transcription.program
-        monitor = Monitor(program, _show if self.progress else None)
-        try:
-            return self.solver(
-                program, transcription.z, monitor, is_warm=is_warm, max_iterations=self.max_iterations,
-                options=self.options,
-            )  # fmt: skip
-        finally:
-            if self.progress:
-                print(file=sys.stderr)
+        return run(
+            self.solver, program, transcription.z, progress=self.progress, is_warm=is_warm,
+            max_iterations=self.max_iterations, options=self.options,
+        )  # fmt: skip
 
     def _errors(self, transcription: Transcription, x: np.ndarray) -> list[np.ndarray]:
         """The error of each interval: of states, relative to their sizes, and of the cost, relative to the whole."""
@@ -528,9 +522,3 @@ def _concatenated(parts: Sequence[Trajectory]) -> Trajectory:
         for name in ("inputs", "outputs")
     }
     return dataclasses.replace(last, t=jnp.concatenate(t), t_end=jnp.asarray(offset), **rows, **by_name)
-
-
-def _show(iteration: int, cost: float, violation: float) -> None:
-    """One line that is overwritten in each iteration."""
-    text = f"\riteration {iteration}: cost {cost:.6g}, violation {violation:.1e}".ljust(72)
-    print(text, end="", file=sys.stderr, flush=True)

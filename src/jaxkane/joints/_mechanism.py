@@ -63,7 +63,7 @@ class LoopStructure(NamedTuple):
     second: str
     rigid: bool
     independent: tuple[int, ...]  # indices of its independent residuals
-    dropped: tuple[int, ...] = ()  # those that nearly depend on these, and are omitted
+    dropped: tuple[int, ...] = ()  # residuals that nearly depend on the others, and are omitted
 
     @property
     def size(self) -> int:

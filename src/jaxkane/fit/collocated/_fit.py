@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,7 +15,7 @@ import scipy.stats
 
 from ..._collocate.lobatto import lobatto
 from ..._collocate.program import Bounds, NonlinearProgram
-from ..._collocate.solvers import INTERRUPTED, Monitor, Solution, Solver, default_solver
+from ..._collocate.solvers import INTERRUPTED, Solution, Solver, default_solver, run
 from ..._collocate.transcription import Transcription
 from ..._scalarjit.cache_key import jit
 from ..._system.system import System
@@ -132,12 +131,11 @@ def solved(problem: Problem, how: Collocation, progress: bool) -> CollocationFit
     theta = np.zeros(problem.parameters.size)
     transcription = Transcription(phases, (), meshes, method, motions, theta, objectives)
     program = transcription.program
-    monitor = Monitor(program, _show if progress else None)
     solver = default_solver() if how.solver is None else how.solver
-    shared, local = places_of(transcription)
+    shared, local = transcription.shared_parameters, transcription.local_parameters
     if densities:  # first the motion for the initial guess of the parameters
         program = with_fixed(program, shared, transcription.z)
-    solution = solver(program, transcription.z, monitor, max_iterations=how.max_iterations)
+    solution = run(solver, program, transcription.z, progress=progress, max_iterations=how.max_iterations)
     if densities and solution.ok:
         found = Marginal(transcription, shared, local).minimum(solution)
         point, covariance = found.point, found.covariance
@@ -159,25 +157,14 @@ def with_fixed(program: NonlinearProgram, variables: np.ndarray, z: np.ndarray) 
     return changed
 
 
-def places_of(transcription: Transcription) -> tuple[np.ndarray, np.ndarray]:
-    """The indices of the shared parameters, and of the unknowns of all trials."""
-    layouts = transcription.layouts
-    n = len(layouts[0].parameters) - layouts[0].problem.n_local
-    return layouts[0].parameters[:n], np.concatenate([layout.parameters[n:] for layout in layouts])
-
-
 def covariance_of(transcription: Transcription, solution: Solution) -> np.ndarray:
     """The covariance (p, p) of the scaled shared parameters; NaN if it does not exist."""
-    shared, local = places_of(transcription)
+    shared, local = transcription.shared_parameters, transcription.local_parameters
     try:
         kkt = Kkt(transcription.program, np.concatenate([shared, local]), solution.z, solution.multipliers)
     except np.linalg.LinAlgError:
         return np.full((len(shared),) * 2, np.nan)
     return kkt.covariance(shared)
-
-
-def _show(iteration: int, cost: float, violation: float) -> None:
-    print(f"\riteration {iteration}: cost {cost:.6g}".ljust(60), end="", file=sys.stderr, flush=True)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -254,12 +241,16 @@ class CollocationFit:
     @property
     def mean_square(self) -> float:
         """The cost divided by the number of measurements; about one if `sigma` and the spectral densities are right."""
-        return self.cost / np.count_nonzero(np.asarray(self.problem.windows.weight) > 0)
+        return self.cost / self._n_measured
+
+    @property
+    def _n_measured(self) -> int:
+        return int(np.count_nonzero(np.asarray(self.problem.windows.weight) > 0))
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Warnings as sentences."""
-        n = np.count_nonzero(np.asarray(self.problem.windows.weight) > 0)
+        n = self._n_measured
         if abs(self.cost - n) < 5.0 * np.sqrt(2.0 * n):
             return ()
         densities = " and the spectral densities of `unknown_inputs`" * bool(self.transcription_options.unknown_inputs)

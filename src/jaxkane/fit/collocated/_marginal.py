@@ -97,7 +97,7 @@ class Marginal:
         return slopes
 
     def _free(self, kkt: Kkt) -> np.ndarray:
-        """The places among the shared parameters of those that are not fixed."""
+        """The indices, among the shared parameters, of the parameters that are not fixed."""
         return np.flatnonzero(np.isin(self.shared, kkt.border))
 
     @property

@@ -19,7 +19,7 @@ from ..._collocate.program import Block, EvaluatedBlock
 from ..._collocate.transcription import Builder, Layout, Motion, nodes_of
 from ..._common.lookup import positive_number, refuse_unknown
 from ..._integrate.inputs import Samples, inputs_at
-from ..._kane.constraint_residuals import configuration_residual
+from ..._kane.constraint_residuals import n_configuration_constraints
 from ..._kane.right_hand_side import vector_field
 from ..._scalarjit.cache_key import jit
 from ..._system.system import System, unpacked
@@ -207,7 +207,7 @@ class TrialPhase:
     @property
     def n_constraints(self) -> int:
         q = jax.ShapeDtypeStruct((len(self.system.coordinates),), jnp.float64)
-        return jax.eval_shape(lambda q: configuration_residual(self.system, jnp.zeros(()), q), q).shape[0]
+        return n_configuration_constraints(self.system, jnp.zeros(()), q)
 
     def variables(self) -> TrialVariables:
         return TrialVariables(
