@@ -462,9 +462,7 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
     trajectory = as_trajectory(trajectory)
     reached = reached_times("audit", system, trajectory)
     if not np.all(np.diff(np.asarray(trajectory.t)) > 0):
-        raise ValueError(
-            "audit: the times must increase. For a plan with phases, pass one phase: plan.phases[0]."
-        )
+        raise ValueError("audit: the times must increase. For a plan with phases, pass one phase: plan.phases[0].")
     t, q, u, inputs = jax.tree.map(
         lambda x: np.asarray(x)[reached], (trajectory.t, trajectory.q, trajectory.u, trajectory.values)
     )
