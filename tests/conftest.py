@@ -13,6 +13,7 @@ How to run them:
     JAXKANE_VALIDATION=docs/validation.md pytest -m published    writes the table of published figures
 """
 
+import fnmatch
 import gc
 import os
 import pathlib
@@ -173,13 +174,23 @@ def _kernels_of(item):
     return item.callspec.params["kernels"] if "kernels" in item.fixturenames else None
 
 
+def _is_slow_case(item) -> bool:
+    """Whether `slow_cases` of the item's test makes this case slow. Patterns are those of `fnmatch`."""
+    marker = item.get_closest_marker("slow_cases")
+    if marker is None:
+        return False
+    case = item.callspec.id
+    if "all_but" in marker.kwargs:
+        return not any(fnmatch.fnmatchcase(case, pattern) for pattern in marker.kwargs["all_but"])
+    return any(fnmatch.fnmatchcase(case, pattern) for pattern in marker.args)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Tests of a file that are compiled in one way follow each other; those of `long_tests.txt` are marked."""
-    names = set((pathlib.Path(__file__).parent / "long_tests.txt").read_text(encoding="utf-8").splitlines())
+    """Mark `slow_cases` and `weekly` tests as slow. Tests of a file that are compiled in one way follow each other."""
     for item in items:
-        if item.nodeid in names:
-            item.add_marker(pytest.mark.long)
+        if item.get_closest_marker("weekly") or _is_slow_case(item):
+            item.add_marker(pytest.mark.slow)
     files = {}
     items.sort(key=lambda item: (files.setdefault(item.path, len(files)), Compilation.of(item)))
 

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import jaxkane as jk
 import jaxkane.catalog
 import jaxkane.export
@@ -61,6 +63,7 @@ def file_of(name):
 FILES = sorted(path for path in SOURCE.rglob("*.py") if path != SOURCE / "__init__.py")
 
 
+@pytest.mark.slow
 def test_imports_point_down():
     for path in FILES:
         room = room_of(path)
@@ -72,6 +75,7 @@ def test_imports_point_down():
                 assert fine, f"{path.relative_to(SOURCE)} imports {below}, which does not stand below it"
 
 
+@pytest.mark.slow
 def test_no_files_import_each_other_in_a_circle_not_by_types_either():
     graphlib.TopologicalSorter({path: set(imports_of(path, types=True)) - {path} for path in FILES}).prepare()
 
@@ -149,6 +153,7 @@ def test_every_public_function_says_what_it_does():
                 assert thing.__doc__, f"{module.__name__}.{name} has no docstring"
 
 
+@pytest.mark.slow
 def test_importing_changes_nothing_and_prints_nothing():
     code = (
         "import os, sys, jax; before = dict(os.environ), jax.config.values.copy(); import jaxkane; "

@@ -133,6 +133,7 @@ class Weight(jk.System):
         return jk.weight(motion, 9.81 * motion.N.x)
 
 
+@pytest.mark.slow
 def test_animations_and_exports_replace_old_files_as_a_whole(tmp_path, monkeypatch):
     ride = jk.simulate(Weight(), jk.State([0.0], [0.0]), np.linspace(0.0, 0.5, 6))
     animation = jk.animate(Weight(), ride)

@@ -50,6 +50,7 @@ def joint_torques(system, q, u, u_dot):
     return np.array(torques)
 
 
+@pytest.mark.slow
 def test_the_joints_of_a_free_chain_give_no_torque():
     rtol = 1e-12
     q, u = chain.states(CHAIN.n, 3)
@@ -155,6 +156,7 @@ def test_a_child_that_fails_says_why():
         list(child("no_such_module"))
 
 
+@pytest.mark.slow
 def test_the_floor_of_first_calls_solves_its_equation():
     rtol = 1e-7
     slopes = first_calls.floor("sensitivities", samples=3, parameters=4)()

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pytest
 
 import jaxkane as jk
 
@@ -23,6 +24,7 @@ def assert_power_is_the_rate_of_energy(system, state):
     assert abs(float(rate - power)) < rtol * scale
 
 
+@pytest.mark.slow
 def test_the_recipes_describe_mechanisms():
     names = {}
     for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL):

@@ -53,6 +53,7 @@ def halved(self, t, q, u):
     return jk.Motion([jk.Body(0.5 * self.mass, 0.0, motion["bob"].center, name="bob")], frames=motion.frames)
 
 
+@pytest.mark.slow
 def test_methods_set_on_a_class_read_by_name():
     """Moment about the pivot: m l^2 = 2 kg m^2; the torque is -0.5 N m."""
     kind = fresh()
@@ -145,6 +146,7 @@ def saveat_and_adjoint(part):
     return type("Keeping", (Pendulum,), {"motion": motion, "loads": loads, "q_dot": q_dot})
 
 
+@pytest.mark.slow_cases("loads", "rates")
 @pytest.mark.parametrize("part", ["motion", "center", "number", "loads", "rates"])
 def test_what_is_kept_from_an_earlier_call_is_refused(part):
     KEPT.clear()
@@ -177,6 +179,7 @@ def four_bar(across):
     return mechanism(links, sites=sites, loops=[Loop("end", "ground")])
 
 
+@pytest.mark.slow
 def test_a_loop_that_cannot_be_closed_any_more_is_refused():
     system = four_bar(jnp.zeros(()))
     broken = system.replace({"site.ground.y": 0.1})

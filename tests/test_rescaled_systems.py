@@ -149,6 +149,7 @@ SMALL = Units(1e-6, 1e-9, 1e-3)  # as a micromechanism
 LARGE = Units(1e6, 1e9, 1e5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["BarWithPiston", "SliderWithPinnedBar"])
 def test_systems_in_other_units(name):
     expected = results(name, Units())

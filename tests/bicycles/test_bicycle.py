@@ -50,6 +50,7 @@ def test_states_that_three_independent_programs_agree_on(i):
         np.testing.assert_allclose(x, y, rtol=0, atol=rtol * np.abs(y).max())
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 @pytest.mark.published
 def test_the_published_nonlinear_state_of_basu_mandal(published):
@@ -76,6 +77,7 @@ def moving_state():
     return state.q, state.u
 
 
+@pytest.mark.slow
 def test_J_dot_against_differences_and_the_books_wrong_sign():
     """Erratum 1: the book prints C1_dot - C2_dot J; with a plus it agrees with differences of J."""
     q, u = moving_state()
@@ -98,6 +100,7 @@ def test_J_dot_against_differences_and_the_books_wrong_sign():
     assert np.abs(as_printed - J_dot).max() > 0.1
 
 
+@pytest.mark.slow
 def test_partial_velocities_are_the_books():
     """[WA] of Example 7: the rear wheel's partial angular velocities, with the dependent speeds eliminated."""
     q, u = moving_state()
@@ -112,6 +115,7 @@ def test_partial_velocities_are_the_books():
     np.testing.assert_allclose(np.asarray(motion["B"].matrix(motion.N)) @ np.asarray(W[0]), printed, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_power_of_the_inputs_is_what_the_conventions_say():
     """The generalized active forces of (roll_rate, rear_wheel_rate, steer_rate) are the three torques themselves."""
     q, u = moving_state()
@@ -130,6 +134,7 @@ def test_steer_damping_takes_power():
     np.testing.assert_allclose(difference, [0.0, 0.0, -2.0 * float(u[2])], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_dependent_speeds_become_singular_where_the_design_says():
     """det C_dep changes sign at a steer of 91.77 degrees, upright; its condition number is about 120 at 90."""
     from jaxkane._kane.kanes_method import KaneEquations

@@ -61,6 +61,7 @@ def split(bicycle, mass, x, z, Ixx, Iyy, Izz):
     return bicycle.with_parts(mH=left, xH=center[0], zH=center[1], **dict(zip(("IHxx", "IHyy", "IHzz", "IHxz"), own)))
 
 
+@pytest.mark.slow
 def test_without_parts_it_costs_what_the_whipple_bicycle_costs():
     """5 % more operations at most, of the equations of motion."""
 
@@ -79,6 +80,7 @@ def test_without_parts_it_costs_what_the_whipple_bicycle_costs():
 # Steering
 
 
+@pytest.mark.slow
 def test_the_steer_feels_the_inertia_of_a_geared_rotor():
     """Upright, the frame yaws with the steer by c cos(lam) / w: the rotor turns with ratio + c cos(lam)^2 / w of it."""
     motor = SteeringMotor(rotor_inertia=1e-3, ratio=7.0)
@@ -264,6 +266,7 @@ def front_trail():
     return BENCHMARK.c * jnp.cos(BENCHMARK.lam)
 
 
+@pytest.mark.slow
 def test_a_path_is_met_on_an_arc():
     """2 aside / (g preview^2), 1e-12 for a small one; limited for a large one; also where it rides back."""
     motion = SimpleNamespace(rear=SimpleNamespace(speed=3.0))

@@ -48,6 +48,7 @@ def instants(tmp_path):
     return [(state, arguments(state)) for state in KNOWN["states"]]
 
 
+@pytest.mark.slow
 def test_accelerations_of_a_bicycle_that_slips(instants):
     """1e-11 of each; the front wheel's slip follows from the others. Forces and moments are those it was given."""
     for state, at in instants:
@@ -85,6 +86,7 @@ def test_relaxation_forwards_and_backwards(instants):
     assert directions == {True, False}
 
 
+@pytest.mark.slow
 def test_configuration_of_toroidal_tyres(tmp_path):
     """1e-14: the pitch that puts both tyres on the ground, and where the front one touches it."""
     crowns = KNOWN["toroidal"]["crowns"]

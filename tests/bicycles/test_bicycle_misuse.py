@@ -161,6 +161,7 @@ def test_a_member_of_a_batch_with_such_a_number_is_invalid():
     assert swept.counts == {"completed": 2, "invalid": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ask",
     [
@@ -208,6 +209,7 @@ def test_two_parts_of_one_kind_are_refused_by_their_places(parts, words):
         jk.accelerations(BENCHMARK.with_parts(**parts), 0.0, jnp.zeros(8), jnp.zeros(3))
 
 
+@pytest.mark.slow
 def test_what_is_left_without_a_rider_is_a_body():
     """Here the moments of inertia would be 0.54, 7.82 and 8.86 kg m^2."""
     with pytest.raises(ValueError, match=r"cannot include the rider's body\. Without it: .*triangle inequality"):
@@ -216,6 +218,7 @@ def test_what_is_left_without_a_rider_is_a_body():
     assert jnp.isfinite(jk.accelerations(rest, 0.0, jnp.zeros(9), jnp.zeros(4))).all()
 
 
+@pytest.mark.slow
 def test_a_parameter_of_a_part_has_one_name():
     """As Python writes it: in a fit, an export and a copy with other parameters."""
     name, bicycle = "extra[0].mass", BENCHMARK.with_parts(extra=[TRAILER])
@@ -279,6 +282,7 @@ class Counts(Filter):
         return (1.0, 2.0)
 
 
+@pytest.mark.slow_cases("part[456]-*")
 @pytest.mark.parametrize(
     ("part", "error", "words"),
     [
@@ -339,6 +343,7 @@ def test_units_of_files(suffix, tmp_path):
         Bicycle.from_file(damaged)
 
 
+@pytest.mark.slow_cases("parts1-*")
 @pytest.mark.parametrize(
     ("parts", "words"),
     [

@@ -116,6 +116,7 @@ def assembled(model):
     return bicycle.with_parts(**tyres)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "model", [pytest.param(name, marks=[pytest.mark.slow] if name == "arms" else []) for name in SYMBRIM["models"]]
 )
@@ -138,6 +139,7 @@ def test_a_rider_taken_out_of_the_frame_leaves_what_files_have_for_it():
         np.testing.assert_allclose(getattr(bicycle, name), LITERATURE["legs"][name], rtol=5e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_rider_who_does_not_move_is_part_of_the_frame():
     """1e-12: accelerations of a bicycle that counts him in B."""
     whole = Bicycle.from_parameters({n: x for n, x in LITERATURE["feedback"]["parameters"].items() if n != "v"})
@@ -267,6 +269,7 @@ def test_parameters_of_parts_are_refused_as_those_of_the_bicycle():
         with_parameters(arms, {"extra[0].fore_length": 0.01})
 
 
+@pytest.mark.slow
 def test_batches_of_riders_are_left_to_their_members():
     """A heavier and an impossible rider; arms that reach and that do not."""
     whole = Bicycle.benchmark()
@@ -302,6 +305,7 @@ def trailer(**more):
     return Trailer(**values | {"center": 0.1, "height": 0.15, "Ixx": 1.5, "Iyy": 2.0, "Izz": 2.5} | more)
 
 
+@pytest.mark.slow
 def test_a_trailer_follows_the_hitch():
     """1e-12: behind a bicycle that runs straight the angle falls as that of a tractrix, v / length * sin(angle)."""
     bicycle = Bicycle.benchmark().with_parts(extra=[trailer()])
@@ -385,6 +389,7 @@ def test_formulas_and_fits_know_the_parameters_of_a_rider(tmp_path):
     assert "rider_stiffness" in written.header.read_text()
 
 
+@pytest.mark.slow
 def test_a_bicycle_with_arms_is_one_program_of_scalars():
     """About 6500 operations, against 2000 of the bicycle alone: the loops are solved block by block."""
     bicycle = with_arms()

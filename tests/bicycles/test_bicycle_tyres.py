@@ -362,6 +362,7 @@ def test_tyres_feel_what_the_ground_carries_in_braking():
     np.testing.assert_allclose([still[name] for name in moved], 0.0, atol=1e-10)
 
 
+@pytest.mark.slow_cases(all_but=["law2"])
 @pytest.mark.parametrize("law", [LateralSlip(9000.0), MagicFormula(12.0), LongitudinalSlip(2e4)])
 def test_a_tyre_pulls_against_its_slip(law):
     """Less than the friction that it has, nothing without slip or load, with a slope everywhere, at rest too."""
@@ -418,6 +419,7 @@ def test_a_measured_tyre_has_the_forces_of_its_formula(pressure):
         np.testing.assert_allclose(even.moment(force, *turned), -even.moment(force, *at), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_measured_tyre_outside_its_formula():
     """Held past the largest slip angle, nothing where the wheel would lift, NaN with NaN slopes above its load."""
     law = schwalbe_energizer(400e3, offsets=True)

@@ -54,6 +54,7 @@ class Seat(Part):
         return ()
 
 
+@pytest.mark.slow
 def test_riding_straight_takes_a_drive_against_drag_and_a_seat_that_gives_way():
     """1e-7, the smoothing of the drag at rest: density / 2 area v^2 rR, and weight over stiffness."""
     bicycle = Bicycle.benchmark().with_parts(drive=Drag(area=0.6), extra=[Seat()])

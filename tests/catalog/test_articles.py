@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxkane as jk
 from jaxkane.catalog import BouncingBall, Rattleback, RimlessWheel
@@ -9,6 +10,7 @@ from jaxkane.catalog import BouncingBall, Rattleback, RimlessWheel
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 
+@pytest.mark.slow
 def test_bouncing_ball():
     """Closed form of a fall with drag from 1 m, in 30 digits."""
     times = [0.4590853109923369, 1.1280946846381106, 1.6405736265752897, 2.0400984767321484, 2.3546963595549943]
@@ -23,6 +25,7 @@ def test_bouncing_ball():
     assert int(ride.jumps.count) == 8
 
 
+@pytest.mark.slow
 def test_the_wheel_steps_by_the_impact_of_kanes_equations():
     """With an inertia: a massless wheel about its hub has a singular mass matrix while its foot is released."""
     wheel = RimlessWheel(inertia=0.3)
@@ -67,6 +70,7 @@ def normal(q):
     return np.array([-np.cos(roll) * np.sin(pitch), np.sin(roll), np.cos(roll) * np.cos(pitch)])
 
 
+@pytest.mark.slow
 def test_accelerations_of_the_rattleback():
     rng = np.random.default_rng(0)
     for _ in range(3):
@@ -78,6 +82,7 @@ def test_accelerations_of_the_rattleback():
         np.testing.assert_allclose((normal(q + step) - normal(q - step)) / 2e-6, n_dot, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_rattleback_reverses_its_spin():
     """From 0.5 degrees and 5 rad/s, as in the article. The energy of the motion without slip is constant."""
     start = jk.State(np.deg2rad([0.0, 0.5, 0.5, 0.0, 0.0]), [0.0, 0.0, -5.0])
@@ -106,6 +111,7 @@ def matrix(spin):
     return np.stack([rates(at + 1e-30j * e).imag / 1e-30 for e in np.eye(5)], axis=1)
 
 
+@pytest.mark.slow
 def test_steady_spin_is_more_unstable_in_one_direction():
     for spin, growth in ((-5.0, 2.12), (5.0, 0.20)):
         model = jk.stability.linearize(Rattleback(), jk.State(jnp.zeros(5), jnp.array([0.0, 0.0, spin])))

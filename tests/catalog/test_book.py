@@ -364,6 +364,7 @@ INPUT_LETTERS = {
 }
 
 
+@pytest.mark.slow_cases(all_but=["Exercise 5.5", "Example 3", "Exercise 5.3", "Exercise 5.2", "Exercise 5.8"])
 @pytest.mark.parametrize("place", LETTERS)
 def test_independent_figures(place):
     rtol = 1e-12

@@ -12,6 +12,18 @@ from jaxkane._scalarjit.program import Program
 from jaxkane.catalog import CATALOG
 
 
+@pytest.mark.slow_cases(
+    "WhippleBicycle",
+    "SpatialDoublePendulum",
+    "Aircraft",
+    "AircraftEulerParameters",
+    "SliderCrankWithClearance",
+    "Rattleback",
+    "DoublePendulum",
+    "CompassGait",
+    "RigidBody",
+    "ColumnFrameAndDisk",
+)
 @pytest.mark.parametrize("name", CATALOG)
 def test_the_programs_do_not_grow(name):
     entry = CATALOG[name]
@@ -39,6 +51,7 @@ OF_STATES = "equations_of_motion accelerations partial_velocities generalized_in
 OF_CONSTRAINTS = "dependent_speeds dependent_accelerations constraint_jacobian_rate constraint_forces"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error:.*its description uses")
 @pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=SLOW) for name in CATALOG])
 def test_every_public_function_is_one_program_of_scalars(name, monkeypatch):

@@ -56,6 +56,7 @@ FUNCTIONS = {f.__name__: f for f in (equations, forces, kinematics, modes)}
 QUICK = {("RodOnPin", f) for f in ("equations", "forces", "kinematics")} | {("BarWithPiston", "equations")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "f"),
     [

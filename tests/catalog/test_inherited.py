@@ -81,6 +81,7 @@ def test_every_entry_can_be_inherited_from(name):
     np.testing.assert_allclose(np.array(kept).reshape(-1, 3), active[0].reshape(-1, 3), rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_passenger_changes_nothing_else():
     """The same through the method, of an entry with dependent speeds, and one with auxiliary ones."""
     for name in ("WhippleBicycle", "BarWithPiston"):
@@ -126,6 +127,7 @@ def merged(loaded):
     return WhippleBicycle(**values)
 
 
+@pytest.mark.slow
 def test_a_basket_is_part_of_the_front_assembly():
     q, u = (jnp.array(x) for x in (CATALOG["WhippleBicycle"].q, CATALOG["WhippleBicycle"].u))
     loaded = Loaded.benchmark()
@@ -185,6 +187,7 @@ def not_leaning(leaning):
     return WhippleBicycle(**values | {"IBxx": values["IBxx"] + more, "IByy": values["IByy"] + more})
 
 
+@pytest.mark.slow
 def test_a_rider_who_does_not_lean_is_part_of_the_frame(leaning):
     """2 T of the four speeds at zero lean: its block of the bicycle's three is that of frame and torso in one; the
     torso alone has m h^2 about its hinge."""

@@ -101,6 +101,7 @@ def test_some_entries_have_constraints():
     assert "WhippleBicycle" in DEPENDENT
 
 
+@pytest.mark.slow_cases("WhippleBicycle", "AircraftEulerParameters")
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_rates_keep_the_configuration_constraints(name):
     example = _example(name)
@@ -109,6 +110,7 @@ def test_rates_keep_the_configuration_constraints(name):
     assert_close(h_dot, 0.0, 1e-13, scale=np.abs(example.q_dot).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DEPENDENT)
 def test_dependent_speeds_keep_the_velocity_constraints_and_change_as_their_accelerations_say(name):
     example = _example(name)
@@ -125,6 +127,7 @@ def test_mass_matrix_is_symmetric_and_positive_definite(example):
     assert np.linalg.eigvalsh(M).min() > 0
 
 
+@pytest.mark.slow
 def test_mass_matrix_is_that_of_the_kinetic_energy(example):
     # T is a quadratic form of the speeds, drift apart, and M its matrix: d2T/du2 = M
     M = jk.mass_matrix(*example.at)
@@ -132,6 +135,7 @@ def test_mass_matrix_is_that_of_the_kinetic_energy(example):
     assert_close(M, jax.hessian(lambda u: jk.kinetic_energy(system, t, q, u))(u), 1e-12)
 
 
+@pytest.mark.slow_cases(all_but=["SpinningTop"])
 def test_forces_balance_at_the_accelerations(example):
     Fr = jk.generalized_active_forces(*example.at, example.inputs)
     Fr_star = jk.generalized_inertia_forces(*example.at, example.inputs, u_dot=example.u_dot)
@@ -205,6 +209,7 @@ def test_mass_centres_move_as_their_velocities_say(example):
     assert_close(rates, velocities, 1e-12, scale=np.abs(velocities).max() + 1e-3)
 
 
+@pytest.mark.slow
 def test_derivatives_equal_central_differences(example):
     rtol = 1e-6
     x, unravel = ravel_pytree((example.system, example.q, example.u))

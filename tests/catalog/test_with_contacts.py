@@ -27,6 +27,7 @@ def test_a_block_rocks_as_in_housners_article():
     np.testing.assert_array_equal(ride.contacts["right"], np.where(ride["angle"] < 0, 2, 0))
 
 
+@pytest.mark.slow
 def test_the_block_on_a_belt():
     """Closed forms of the times at which the block sticks and slips, from rest at x = 0."""
     times = [0.205758423033744, 2.101402346772704, 4.2602012771151685, 5.7602012771151685, 7.919000207457633]
@@ -41,6 +42,7 @@ def test_the_block_on_a_belt():
     np.testing.assert_allclose(ride["belt.friction"][~sticks], 2.5 * np.sign(0.5 - ride["x_dot"][~sticks]), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_motor_drives_a_load_through_play():
     """With the torque A cos(w t) and e = 0. Momentum is conserved: the motor reaches the load with the speed
     A sin(w t) / w / J_m and continues with A sin(w t) / w / (J_m + J_l). It lifts off when the torque changes its sign.

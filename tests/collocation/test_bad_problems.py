@@ -208,6 +208,7 @@ def test_ends_that_say_the_same_twice_are_refused():
         Problem(rod, 1.0, controls=[], start={"y": 0.0, "x": 0.9})
 
 
+@pytest.mark.slow
 def test_a_problem_without_a_solution_names_its_constraints():
     plan = solved(controls={"force": (-1.0, 1.0)})
     assert not plan.ok
@@ -226,6 +227,7 @@ def test_a_derivative_that_is_not_finite_is_named():
     assert plan.reason == "the derivative of `cost` is not finite at the last iterate"
 
 
+@pytest.mark.slow
 def test_a_function_that_is_not_finite_on_a_finer_mesh_keeps_the_solution():
     """The speed at a new node is above the limit by the error of the interpolation."""
     plan = solved(path=lambda t, now: {"slow": jnp.sqrt(1.3 - now["v"]) - 0.01})
@@ -234,6 +236,7 @@ def test_a_function_that_is_not_finite_on_a_finer_mesh_keeps_the_solution():
     assert plan.cost == pytest.approx(13.065, abs=0.2)
 
 
+@pytest.mark.slow
 def test_a_cost_without_a_lower_bound():
     plan = solved(cost=lambda t, now: -(now["force"] ** 2))
     assert not plan.ok

@@ -52,6 +52,7 @@ def planned(units, is_fastest):
     return solve(Problem(plate, 2 * T, cost=effort, **arguments), intervals=10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("units", [OTHERS[0], pytest.param(OTHERS[1], marks=pytest.mark.slow)])
 def test_units_of_length_mass_and_time(units):
     rtol, (L, M, T) = 1e-9, units
@@ -66,6 +67,7 @@ def test_units_of_length_mass_and_time(units):
         np.testing.assert_array_equal(scaled["y"], 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("duration", [1e-9, pytest.param(1e-6, marks=pytest.mark.slow), 1e6])
 def test_durations(duration):
     """Without units of the system: a place of 1, a force of 1e18."""
@@ -106,6 +108,7 @@ def test_states_that_are_zero_do_not_refine_the_mesh():
 weight = 1.0
 
 
+@pytest.mark.slow
 def test_changed_values_of_functions_are_used():
     """A global, a closure and an attribute that change between two solves; the compiled programs are of the new
     values."""
@@ -136,6 +139,7 @@ def test_changed_values_of_functions_are_used():
     assert least(of_global, **end) == pytest.approx(3.0)
 
 
+@pytest.mark.slow
 def test_second_solve_compiles_nothing():
     """Also with another mass, and with another end, which has other sizes. With sizes of one power of ten each, the
     simulations of the intervals were compiled again for 2.5 s."""
@@ -153,6 +157,7 @@ def test_second_solve_compiles_nothing():
     assert not compiled
 
 
+@pytest.mark.slow
 def test_repeated_solves_do_not_grow_memory():
     problem = Problem(Sled(), 1.0, controls=["force"], cost=effort, **ENDS)
 
@@ -204,6 +209,7 @@ SIGNALS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param("samples", marks=pytest.mark.slow), pytest.param("function", marks=pytest.mark.slow), "all"]
 )
@@ -237,6 +243,7 @@ class Valve(Sled):
         return {"power": now["actual"] * u["v"], "energy": {"kinetic": 0.5 * u["v"] ** 2}}
 
 
+@pytest.mark.slow
 def test_first_order_states_and_outputs():
     """Outputs in the cost, along the motion, in a path constraint and at both ends."""
     problem = Problem(

@@ -37,6 +37,7 @@ def test_least_energy_from_rest_to_rest():
     np.testing.assert_allclose(plan.multipliers.costate["x"], -24.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_least_time_from_rest_to_rest():
     """Full force forwards, then backwards: 2 s."""
     atol = 1e-6
@@ -50,6 +51,7 @@ def test_least_time_from_rest_to_rest():
     assert float(plan.t[-1]) == plan.duration == plan.mesh[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", ["within", "path"])
 def test_least_time_with_a_speed_limit(limit):
     """0.5 s to the speed 0.5, as long to brake, and 0.75 / 0.5 s between. Controls are continuous, so that a switch
@@ -85,6 +87,7 @@ def regulated(**arguments):
     return solve(Problem(SPRUNG, 2.0, controls=["force"], cost=cost, start=start), **arguments)
 
 
+@pytest.mark.slow_cases(all_but=["lobatto-6"])
 @pytest.mark.parametrize(("method", "order"), [("trapezoid", 2), ("hermite-simpson", 4), ("lobatto", 6)])
 def test_order_of_convergence(method, order):
     """The end of a free oscillation against the matrix exponential, and the least cost of a linear-quadratic problem
@@ -104,6 +107,7 @@ def test_order_of_convergence(method, order):
         assert regulated(intervals=12, method=method, tolerance=None).cost == pytest.approx(3.1584649082719, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_linear_quadratic_problem_against_riccati():
     """Cost, control and multipliers. The tolerance 1e-6 bounds the error of each interval."""
     rtol = 3e-6
@@ -116,6 +120,7 @@ def test_linear_quadratic_problem_against_riccati():
     assert np.max(plan.errors) <= 1e-6
 
 
+@pytest.mark.slow
 def test_multipliers_are_derivatives_of_the_least_cost():
     """By finite differences: of a start, an end, a bound, a condition, a path constraint and the duration's bound."""
     rtol, step = 1e-4, 1e-3
@@ -144,6 +149,7 @@ def test_multipliers_are_derivatives_of_the_least_cost():
         assert slope == pytest.approx(difference, rel=rtol, abs=1e-5), name
 
 
+@pytest.mark.slow
 def test_free_parameter():
     """Energy 12 m^2 / m^4 of the scaled force, and the mass itself: m^3 = 24."""
     rtol = 1e-7
@@ -236,7 +242,7 @@ def test_lane_change_of_notebook_9():
 
 WALKERS = [
     (jk.catalog.CompassGait(), [-0.22, 0.32, 0.0], [1.1, 0.4], 0.73),
-    pytest.param(jk.catalog.SimplestWalker(), [0.2, 0.4, 0.0], [-0.626, -0.05], 1.24, marks=pytest.mark.long),
+    pytest.param(jk.catalog.SimplestWalker(), [0.2, 0.4, 0.0], [-0.626, -0.05], 1.24, marks=pytest.mark.weekly),
 ]
 
 
@@ -255,6 +261,7 @@ def test_gaits_of_walkers(walker, q, u, period):
     np.testing.assert_allclose(plan.state(0).u, orbit.state.u, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("intervals", [7, 50])
 @pytest.mark.parametrize("method", ["hermite-simpson", "lobatto"])
 def test_a_switch_inside_an_interval_is_refined(method, intervals):

@@ -26,6 +26,7 @@ FASTEST = Problem(
 )  # fmt: skip
 
 
+@pytest.mark.slow_cases(all_but=["Cyipopt"])
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
 def test_all_solvers_find_the_same_plan(solver):
     """2.05 s without the error of four intervals. A place that is farther by 1 m costs 1.25 s at the speed limit."""
@@ -98,6 +99,7 @@ class OnlyCoarse:
         return solution if self.calls == 1 else dataclasses.replace(solution, z=0 * z, ok=False, status=self.status)
 
 
+@pytest.mark.slow_cases("interrupted")
 @pytest.mark.parametrize("status", [INTERRUPTED, "the largest number of iterations was reached"])
 def test_failure_on_a_finer_mesh_keeps_the_solution(status):
     """The energy of a sled with a spring, whose mesh of one interval is too coarse."""

@@ -66,6 +66,7 @@ def test_plans_of_other_systems_are_refused(plan):
         jk.positions(SLED, plan, plan.q)
 
 
+@pytest.mark.slow
 def test_polynomials_between_the_nodes(plan):
     """`at`, `inputs` and the trajectory agree at the nodes; `replay` reproduces the plan there, and with the accuracy
     of a parabola elsewhere."""
@@ -118,6 +119,7 @@ class Barge(jk.System):
         return jk.Force(inputs["push"] * motion.N.x, motion["barge"])
 
 
+@pytest.mark.slow
 def test_phases_of_different_systems():
     """A sled of 1 kg becomes a barge of 2 kg at 0.5 m, and keeps its momentum. By 1 N the sled has 1 m/s there, after
     1 s. The barge has 0.5 m/s, and -1 N stop it within 1 s and 0.25 m."""
@@ -148,6 +150,7 @@ def test_phases_of_different_systems():
     assert jk.positions(Barge(), plan.phases[1])["barge"].shape == (9, 3)
 
 
+@pytest.mark.slow
 def test_plans_as_guesses(plan, joined):
     """A plan needs no iterations for its own problem, also if it has phases."""
     assert solve(plan.problem, plan, intervals=10).iterations <= 1
@@ -183,6 +186,7 @@ def test_continuation():
     assert [plan.ok for plan in limited] == [True, False]
 
 
+@pytest.mark.slow
 def test_names_that_variables_and_conditions_share():
     plan = solve(
         Problem(
@@ -211,6 +215,7 @@ def test_copies_of_plans(plan):
         assert other.multipliers["x"][-1] == plan.multipliers["x"][-1]
 
 
+@pytest.mark.slow
 def test_refinement_stays_within_its_limits():
     """A bang-bang control, and a spring so stiff that the first mesh is far too coarse."""
     fastest = Problem(

@@ -14,7 +14,7 @@ from jaxkane.collocation import Phases, Problem, check_derivatives
 WITHOUT_CONTACTS = [name for name, entry in CATALOG.items() if type(entry.example()).contacts is jk.System.contacts]
 # Dense derivatives of a whole program compile for 5 to 10 s.
 IN_CI = {"WhippleBicycle", "RotatingFrameAndBarChosenSpeeds", "SimplestWalker"}
-SYSTEMS = [pytest.param(name, marks=[] if name in IN_CI else pytest.mark.long) for name in WITHOUT_CONTACTS]
+SYSTEMS = [pytest.param(name, marks=[] if name in IN_CI else pytest.mark.weekly) for name in WITHOUT_CONTACTS]
 
 
 @pytest.mark.slow
@@ -107,6 +107,7 @@ def branches(x):
     ])  # fmt: skip
 
 
+@pytest.mark.slow
 def test_patterns_contain_all_entries_of_both_branches():
     """At 60 random places no derivative lies outside the pattern; and what both branches lack is not in it."""
     first, second = patterns(branches, [jax.ShapeDtypeStruct((5,), jnp.float64)], 0)

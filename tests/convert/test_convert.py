@@ -37,6 +37,7 @@ def mjcf(body, rest=""):
     return f"<mujoco><worldbody>{body}</worldbody>{rest}</mujoco>"
 
 
+@pytest.mark.slow
 @needs_mujoco
 def test_a_file_is_the_tree_that_stands_in_it():
     system = jk.convert.from_mjcf(FIGURES["model"], strict=True)  # nothing is left out
@@ -97,6 +98,7 @@ def test_a_loop_is_closed_rigidly():
     np.testing.assert_allclose([rates[f"j{i}_rate"] for i in (1, 2, 3)], expected, rtol=RTOL)
 
 
+@pytest.mark.slow_cases(all_but=["<weld site1=*", '<connect body1="a" anchor=*'])
 @needs_mujoco
 @pytest.mark.parametrize(
     "equality",
@@ -128,6 +130,7 @@ def test_a_loop_is_closed_where_the_file_places_its_bodies(equality):
     assert np.abs(system.configuration_constraints(0.0, q + 0.01)[0]) > 1e-4
 
 
+@pytest.mark.slow
 @needs_mujoco
 def test_joints_that_follow_others():
     degree = '<equality><joint joint1="k" joint2="j" polycoef="0 2 0.5 0 0"/></equality>'
@@ -174,6 +177,7 @@ LIMITED = BODY.format(' range="20 90"').replace(
 )
 
 
+@pytest.mark.slow
 @needs_mujoco
 def test_a_limit_of_a_joint_is_a_contact():
     """A pendulum falls from 1 rad to its limit at 20 degrees: J w^2 / 2 = m g l (cos(limit) - cos(1)).

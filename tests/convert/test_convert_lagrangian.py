@@ -98,6 +98,7 @@ def rates_of(lagrange, values, system, q, u):
     return every
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_a_lagrangian_alone_accelerates_as_in_sympy(name):
     lagrange, values, system = brought(name)
@@ -130,6 +131,7 @@ def test_its_energy_is_half_u_M_u_and_is_kept():
     np.testing.assert_allclose(total, total[0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_it_is_a_system_as_any_other():
     _, _, system = brought("double_pendulum")
     q, u = jnp.array([0.3, -0.5]), jnp.array([0.6, 0.2])
@@ -146,6 +148,7 @@ def test_it_is_a_system_as_any_other():
     assert batch.shape == (0, 2)
 
 
+@pytest.mark.slow
 def test_a_mass_matrix_that_is_not_positive_is_no_number():
     L = m * x.diff() ** 2 / 2 + k * x.diff() * a.diff() + m * a.diff() ** 2 / 2 - g * x
     system = jk.convert.from_sympy(me.LagrangesMethod(L, [x, a]), {"m": 1.0, "k": 2.0, "g": 9.81})

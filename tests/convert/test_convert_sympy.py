@@ -150,6 +150,7 @@ def brought(me, model, **more):
     return jk.convert.from_sympy(MODELS[model](me, sympy), FIGURES[model]["params"], **more)
 
 
+@pytest.mark.slow_cases(all_but=["one_dof_spring_mass_damper"])
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_accelerates_as_in_sympy(me, name):
     system = brought(me, name)
@@ -164,6 +165,7 @@ def test_a_model_accelerates_as_in_sympy(me, name):
         np.testing.assert_allclose([found[x] for x in speeds], expected, rtol=RTOL, atol=RTOL * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_a_model_is_a_system_as_any_other(me):
     system = brought(me, "n_link_pendulum_on_cart_n3", name="Cart")
     again = brought(me, "n_link_pendulum_on_cart_n3", name="Cart")
@@ -194,6 +196,7 @@ def double_pendulum(me, sm):
     return me.LagrangesMethod(lagrangian, [q1, q2], forcelist=[(R, F * N.y)], bodies=bobs, frame=N), O
 
 
+@pytest.mark.slow
 def test_a_lagrangian_with_bodies_accelerates_as_in_sympy(me):
     import sympy as sm
 
@@ -247,6 +250,7 @@ def pendulum_on_a_shaker(me, sm):
     return kane, z, O
 
 
+@pytest.mark.slow
 def test_a_prescribed_motion_is_an_expression_or_a_function(me):
     """(J + m l^2) u_dot = -m g l sin(q) + m l sin(q) z_dot_dot. The moments I are not read and need no value."""
     import sympy as sm
@@ -277,6 +281,7 @@ def test_a_prescribed_motion_is_an_expression_or_a_function(me):
         jk.convert.from_sympy(kane, {"l": 0.5, "g": 9.81}, prescribed={z: t})
 
 
+@pytest.mark.slow
 def test_a_lagrangian_with_a_prescribed_motion(me):
     import sympy as sm
 
@@ -324,6 +329,7 @@ def test_what_a_model_does_not_say_is_named(me):
         jk.convert.from_sympy(q.diff() - u, {})
 
 
+@pytest.mark.slow
 def test_functions_are_those_of_sympy_or_refused_by_name(me):
     import sympy as sm
 

@@ -39,6 +39,7 @@ def without_mujoco(monkeypatch, request):
         monkeypatch.setitem(sys.modules, "mujoco", None)
 
 
+@pytest.mark.slow
 def test_a_urdf_moves_as_in_mujoco(tmp_path, monkeypatch):
     mujoco = pytest.importorskip("mujoco")
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
@@ -121,6 +122,7 @@ def test_planar_and_floating_joints():
     assert jk.convert.from_urdf(on_ground).speeds[:2] == ("wing_vx", "wing_vy")
 
 
+@pytest.mark.slow
 def test_mimics_of_mimics_and_joints_that_move_no_mass():
     mimic = '<mimic joint="{}" multiplier="{}" offset="{}"/>'
     text = robot(

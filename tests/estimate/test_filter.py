@@ -75,6 +75,7 @@ def test_of_a_linear_motion_it_is_kalmans(method):
         np.testing.assert_allclose(belief.deviation(), np.sqrt(P.diagonal()), atol=tolerance)
 
 
+@pytest.mark.slow
 @ONE_QUICKLY
 def test_states_before_are_smoothed_and_late_measurements_find_theirs(method):
     """Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems, 1965."""
@@ -171,6 +172,7 @@ def by_hand(method, m, P, torque, y, h, density, sigma, drift):
     return m + K @ (y - expected), P - K @ (own + np.diag(sigma**2)) @ K.T
 
 
+@pytest.mark.slow
 @METHODS
 def test_of_a_pendulum_it_is_the_filter_by_hand(method):
     tolerance = 1e-10
@@ -208,6 +210,7 @@ def last_of(filter, belief, n=12):
 MORE = {"lag": 2, "noise": {"torque": 1e-24, "rate": 0.01}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [MORE, pytest.param({"lag": 20}, marks=pytest.mark.slow)])
 def test_the_present_does_not_depend_on_states_that_are_kept_nor_on_noise_that_is_negligible(options):
     tolerance = 1e-10
@@ -216,6 +219,7 @@ def test_the_present_does_not_depend_on_states_that_are_kept_nor_on_noise_that_i
     np.testing.assert_allclose(other.covariance(), first.covariance(), atol=tolerance)
 
 
+@pytest.mark.slow
 def test_a_known_coordinate_and_units_change_no_unscented_estimate():
     """A covariance without full rank has no triangle of its own; its symmetric root does not depend on rounding."""
     filter, belief = of_pendulum(lag=1, drift={"pull": 0.0, "damping": 0.0})
@@ -235,6 +239,7 @@ def bent(v, w):
     return jnp.stack([v[0] * v[1] + v[2] ** 2, jnp.sin(v[0]) + w[0] * v[1] + 2.0 * w[1], v[0] ** 3 - v[2]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rank", [3, 2])
 def test_moments_of_a_function_have_exact_derivatives(rank):
     """Of the mean, the covariance, and the covariance with what follows from the same x."""
@@ -253,6 +258,7 @@ def test_moments_of_a_function_have_exact_derivatives(rank):
         np.testing.assert_allclose(slope[..., 0], (high - low) / (2 * d), rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.slow_cases("3")
 @pytest.mark.parametrize("rank", [3, 2])
 def test_moments_of_a_function_are_those_of_points(rank):
     rng, amplitude = np.random.default_rng(2), jnp.array([0.3, 0.2])
@@ -291,6 +297,7 @@ def test_derivatives_of_smoothed_and_late_states_are_exact(method):
     np.testing.assert_allclose(slope, numbers, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.slow
 @ONE_QUICKLY
 def test_a_closed_loop_is_filtered_as_well_in_any_unit(method):
     """The slider's place in metres, in units of 3.3 cm, and in metres where the crank is 30 m long."""
@@ -324,6 +331,7 @@ def test_a_closed_loop_is_filtered_as_well_in_any_unit(method):
         np.testing.assert_allclose(other[1], deviation, rtol=0.25)
 
 
+@pytest.mark.slow
 def test_deviations_at_the_start_meet_the_constraints():
     """Of a point on a circle: y follows from x; if both are given, both are known independently of each other."""
     x, y, a, b = 0.6, 0.8, 0.1, 0.05
@@ -335,6 +343,7 @@ def test_deviations_at_the_start_meet_the_constraints():
     np.testing.assert_allclose(both.deviation(), [y * along, x * along, 0.0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_it_runs_in_loops_batches_and_derivatives():
     filter = Filter(Pendulum(), {"rate": 0.05}, noise={"torque": 0.01}, drift={"pull": 0.0})
     belief = begin(filter, jk.State(jnp.array([0.8]), jnp.array([-0.3])), {"angle": 0.1, "pull": 1.0})
@@ -357,6 +366,7 @@ def test_it_runs_in_loops_batches_and_derivatives():
     np.testing.assert_allclose(slopes, numbers, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_nothing_happens_in_no_time_and_without_measurements():
     filter = Filter(Pendulum(), {"rate": 0.05}, noise={"rate": 0.01}, lag=1)
     belief = begin(filter, jk.State(jnp.array([0.8]), jnp.array([-0.3])), {"angle": 0.1})

@@ -114,6 +114,7 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("Aircraft", "Spa
 pytestmark = pytest.mark.filterwarnings("ignore:.*its description uses")
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("name", [*SYSTEMS, *SLOW])
 def test_c_gives_the_numbers_and_derivatives_of_the_library(name, tmp_path):
@@ -134,6 +135,7 @@ def test_c_gives_the_numbers_and_derivatives_of_the_library(name, tmp_path):
         assert_close(found, expected, of_derivatives if function in JACOBIANS else rtol, function)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_the_test_program_passes_and_finds_what_is_wrong(dtype, tmp_path):
@@ -169,6 +171,7 @@ class Balanced(jk.System):
         return jk.Force((3.0 * self.left - self.right) * motion.N.x, motion.bodies[0])
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_the_test_program_compares_with_the_size_of_all_entries(tmp_path):
     """Rounding of 1e-17 beside an entry that is equal, and of a vector whose terms all cancel."""
@@ -238,6 +241,7 @@ def test_names_of_other_languages():
     assert found == ["theta", "phi", "phi_", "a_b", "a_b_", "int_", "int_2", "n2x", "Delta", "e", "n", "u8f66"]
 
 
+@pytest.mark.slow_cases(all_but=["Bob"])
 @pytest.mark.parametrize("name", [*SYSTEMS, *SLOW])
 def test_numpy_source_gives_the_numbers_of_the_library(name):
     rtol = 1e-13
@@ -271,6 +275,7 @@ def test_names_with_dots_and_spaces_of_mechanisms_of_joints():
     np.testing.assert_allclose(module["rates"](0.0, [0.4], [0.5], parameters=heavy)[1], [expected], rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_numpy_source_in_float32_stays_there_and_is_written(tmp_path):
     rtol = 1e-5
     system, t, q, u, w = case("Odd")
@@ -284,6 +289,7 @@ def test_numpy_source_in_float32_stays_there_and_is_written(tmp_path):
     assert_close(found, [*expected["rates"], *expected["state_jacobian"]], rtol)
 
 
+@pytest.mark.slow
 def test_derivatives_where_branches_meet():
     """Beside and on the edges of `where`, sqrt, sign, max and min: sides that are not taken have no derivative."""
     rtol = 1e-12
@@ -372,6 +378,7 @@ def in_numpy(f, x, folder):
 LANGUAGES = [pytest.param(in_c, marks=needs_compiler), in_numpy]
 
 
+@pytest.mark.slow_cases("in_c")
 @pytest.mark.parametrize("language", LANGUAGES)
 def test_every_operation_in_source(language, tmp_path):
     rtol, atol = 2e-13, 1e-14
@@ -511,6 +518,7 @@ def test_casadi_gives_the_numbers_and_derivatives_of_the_library(name):
         assert_close([found], expected["state_jacobian"], of_derivatives)
 
 
+@pytest.mark.slow
 def test_every_operation_in_casadi():
     """But for float32, which is refused: see below."""
     rtol = 2e-13
@@ -554,6 +562,7 @@ np.savez(sys.argv[3], gradient=gradient, **found)
 """
 
 
+@pytest.mark.slow
 def test_stablehlo_is_loaded_without_jaxkane_for_any_batch_and_gives_the_same_bits(on_cpu, tmp_path):
     rtol = 1e-13
     pytest.importorskip("flatbuffers")
@@ -621,6 +630,7 @@ class Tower(jk.System):
         return [jk.Force(-x * motion.N.x, body) for x, body in zip(q, motion.bodies, strict=True)]
 
 
+@pytest.mark.slow
 def test_many_speeds_are_exported_but_for_what_lapack_does(on_cpu):
     tower, q, u = Tower(), np.linspace(0.1, 0.2, 13), np.linspace(-1.0, 1.0, 13)
     with pytest.raises(ValueError, match=r"Tower: 'rates' .* with 13 speeds .* by LAPACK.*functions=\('equations',\)"):

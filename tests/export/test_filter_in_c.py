@@ -150,6 +150,7 @@ def assert_same_steps(filter, belief, in_c, rtol, n=5, dt=0.02):
         np.testing.assert_allclose(nis, innovation.nis, rtol=100 * rtol, atol=100 * rtol)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.slow)])
 def test_c_makes_the_steps_of_the_library(method, tmp_path):
@@ -158,6 +159,7 @@ def test_c_makes_the_steps_of_the_library(method, tmp_path):
     assert_same_steps(filter, belief, compiled(filter, belief, tmp_path), 1e-12)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(
     "of", [of_circle, *(pytest.param(of, marks=pytest.mark.slow) for of in (of_crank, of_bicycle))]
@@ -184,6 +186,7 @@ def test_single_precision_old_states_and_impossible_times(tmp_path):
     assert np.isnan(mean[:3]).all()
 
 
+@pytest.mark.slow
 @needs_compiler
 @METHODS
 def test_the_program_beside_the_header_compares(method, tmp_path):

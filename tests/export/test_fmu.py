@@ -174,6 +174,7 @@ class Unit:
         return np.array(self.unit.getDirectionalDerivative(*arguments))
 
 
+@pytest.mark.slow_cases(all_but=["Bob-2.0", "Driven-3.0"])
 @needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 @pytest.mark.parametrize(
@@ -192,6 +193,7 @@ def test_fmpy_finds_no_problem(name, fmi, fmu_of):
     assert np.all(np.isfinite([*last]))
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(
     ("fmi", "kind"), [("2.0", "co-simulation"), ("3.0", "co-simulation"), ("3.0", "model exchange")]
@@ -207,6 +209,7 @@ def test_an_fmu_of_one_kind(fmi, kind, tmp_path):
     assert fmpy.simulate_fmu(path, stop_time=0.1)["h"][-1] == pytest.approx(1.0 - 9.81 * 0.1**2 / 2, abs=1e-5)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_the_source_compiles_without_warnings(fmu_of, tmp_path):
     for name, system in {"Driven": Driven(), "Bob": Bob(), "Ball": Ball()}.items():
@@ -405,6 +408,7 @@ def test_a_ball_does_not_fall_through_the_floor(kind, restitution, fmu_of):
         )  # fmt: skip
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_dependent_speeds_that_become_singular_end_the_simulation(fmi, fmu_of):
@@ -425,6 +429,7 @@ def test_dependent_speeds_that_become_singular_end_the_simulation(fmi, fmu_of):
         assert unit.get("x", "y") == pytest.approx((np.sin(t), np.cos(t)), abs=1e-9)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_start_values_satisfy_the_constraints(fmi, fmu_of):

@@ -15,6 +15,7 @@ from jaxkane.fit.inverse.kinematics import KinematicSamples, kinematic_samples
 from jaxkane.joints import Actuator, Link, Loop, Site, hinge, mechanism
 
 
+@pytest.mark.slow
 def test_double_pendulum_as_in_textbooks():
     """Khalil and Dombre: ZZ1 + L^2 M2, MX1 + L M2, MY1, ZZ2, MX2, MY2; with a free swing only their ratios."""
     found = base_parameters(Swing())
@@ -46,6 +47,7 @@ def arm(n, gravity=(0.0, -9.81, 0.0)):
     return mechanism(links, gravity=gravity)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "numbers"), [pytest.param(1, 2, marks=pytest.mark.slow), (2, 5), pytest.param(3, 8, marks=pytest.mark.slow)]
 )
@@ -69,6 +71,7 @@ def test_a_vertical_axis_tells_one_number_and_a_horizontal_one_three():
         assert found.count == len(expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("second", [1e6, 1e-6])
 def test_base_parameters_in_other_units_of_time(second):
     """A second is a million units of time, or the millionth part of one."""

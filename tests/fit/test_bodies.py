@@ -22,6 +22,7 @@ def is_possible(values):
     return m > 0 and moments[0] > 0 and moments[2] < moments[0] + moments[1]
 
 
+@pytest.mark.slow_cases(all_but=["moves3-wheel3"])
 @pytest.mark.parametrize(
     ("moves", "wheel"),
     [
@@ -44,6 +45,7 @@ def test_every_number_is_a_possible_body_and_back(moves, wheel):
         np.testing.assert_allclose(back(jnp.asarray(x)), x, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
 def test_values_of_numbers_and_of_bodies_are_one_program(jacobian):
     """Where they are not, a warning ends the test."""

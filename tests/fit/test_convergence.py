@@ -52,6 +52,7 @@ def test_a_limited_step_is_that_of_bounded_least_squares():
     np.testing.assert_allclose(least, 2 * limited.cost, rtol=1e-9)
 
 
+@pytest.mark.slow_cases("Levenberg-Marquardt")
 @pytest.mark.parametrize("optimizer", [LeastSquares(), GradientDescent()], ids=lambda m: m.name)
 def test_a_fit_ends_where_a_step_gains_nothing_in_units_of_the_variance(optimizer):
     problem = Problem.of(Track(), TRIAL, FREE, **POSED)
@@ -75,6 +76,7 @@ def test_nanometres_with_a_sigma_of_one_are_fitted_like_metres():
     assert nanometres.errors["gain"] == pytest.approx(metres.errors["gain"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_parameter_rests_at_its_bound():
     from test_parameters import Limited
 
@@ -119,6 +121,7 @@ def vibration():
     return t, exact, exact + noise
 
 
+@pytest.mark.slow
 def test_micrometres_are_integrated_like_metres(vibration):
     t, _, x = vibration
     guess = Cart(mass=1.0, stiffness=390.0, damping=2.5)
@@ -138,6 +141,7 @@ def test_micrometres_are_integrated_like_metres(vibration):
             assert one.estimates[name] == pytest.approx(found[0].estimates[name], abs=0.3 * one.errors[name])
 
 
+@pytest.mark.slow
 def test_loose_tolerances_are_reported(vibration):
     t, _, x = vibration
     trial = Trial(t, {"x": x}, sigma=1.0, initial={"x": 1e-6, "x_dot": 0.0})

@@ -221,6 +221,7 @@ SLOWLY = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("T", "p", "spread"), [(6, 2, 0.5), *SLOWLY])
 def test_few_trials_scatter_more_than_a_sandwich_sees(T, p, spread):
     """Trials of unlike inputs, correlated residuals: intervals, and the test of several parameters that are zero."""
@@ -334,6 +335,7 @@ def test_the_bootstrap_of_many_trials_scatters_as_the_jackknife():
     assert "Bootstrap of 60 trials" in repr(draws)
 
 
+@pytest.mark.slow
 def test_intervals_by_scatter_are_those_of_a_mean():
     """With one parameter and trials alike, each trial has an estimate of its own, and that of all is their mean."""
     rng, T = np.random.default_rng(6), 5
@@ -349,6 +351,7 @@ def test_intervals_by_scatter_are_those_of_a_mean():
     assert (low, high) == pytest.approx((own.mean() - half, own.mean() + half), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_what_the_data_do_not_determine_has_no_narrow_interval():
     """Without a push its gain has no influence: infinite, or as wide as its prior says."""
     rng = np.random.default_rng(7)
@@ -382,6 +385,7 @@ def kicked():
     return minimize(problem, LeastSquares(damping=1e-9))
 
 
+@pytest.mark.slow
 def test_what_one_trial_determines_has_no_interval_by_trial(kicked):
     """Left out, its estimate would stay where it is, and look exact."""
     found, folds = kicked, cross_validate(kicked)
@@ -427,6 +431,7 @@ def test_a_fold_that_has_not_converged_is_named(kicked, monkeypatch):
     assert all(np.isnan(pair).all() for pair in folds.intervals().values())
 
 
+@pytest.mark.slow
 def test_few_trials_are_clustered_by_their_parts():
     """Errors of neighbours by 0.4: formal errors are too small, and parts of the trial are clusters."""
     rng = np.random.default_rng(9)
@@ -489,6 +494,7 @@ def test_leverage_is_that_of_the_cluster_that_matters_most():
     assert with_prior.leverage == pytest.approx([0.5])
 
 
+@pytest.mark.slow
 def test_four_trials_are_clusters():
     rng = np.random.default_rng(12)
     options = {"unknown": ("x_dot",), "simulation": Simulation(step=0.1)}

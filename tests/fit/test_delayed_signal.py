@@ -14,6 +14,7 @@ delayed_signal, low_passed = jax.jit(sensor_dynamics.delayed_signal), jax.jit(se
 T = jnp.linspace(0.0, 1.0, 41)
 
 
+@pytest.mark.slow_cases("False")
 @pytest.mark.parametrize("irregular", [False, True])
 def test_what_a_sensor_said_before(irregular):
     t = T + (0.004 * jnp.sin(40.0 * T) if irregular else 0.0)
@@ -75,6 +76,7 @@ def tracks(order):
     return trials
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_low_pass_is_selected_and_found(order):
     before = fit(Track(gain=1.0), tracks(order), "gain", simulation=Simulation(step=0.025))
@@ -88,6 +90,7 @@ def test_a_low_pass_is_selected_and_found(order):
     assert search.fit.variance < 1.3
 
 
+@pytest.mark.slow_cases(all_but=["Delay-2.5-1000.0"])
 @pytest.mark.parametrize("unit", [2e-6, 1e3])  # [s] between samples: 500 kHz, and three times an hour
 @pytest.mark.parametrize(("kind", "true"), [(LowPass, 4.0), (Delay, 2.5)])
 def test_times_in_any_unit(unit, kind, true):

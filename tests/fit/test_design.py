@@ -56,6 +56,7 @@ def test_the_printed_correlation_is_the_largest_off_the_diagonal():
         assert str(plan).endswith(f"largest correlation: {printed}")
 
 
+@pytest.mark.slow
 def test_a_plan_is_about_parameters_and_not_about_offsets_of_each_trial():
     free = ("gain", Offset("x", each="trial", prior=(0.0, 0.1)), "drift")
     plan = design(Track(), t[:11], push, C, free, sigma=SIGMA, initial={"x": 0.1}, steps=1)

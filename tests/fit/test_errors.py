@@ -143,6 +143,7 @@ def test_innovations_are_those_of_the_dense_covariance(phi):
     assert not np.any(np.asarray([u, log_variance])[:, ~seen])
 
 
+@pytest.mark.slow
 def test_two_channels_against_a_direct_likelihood(of_two_channels):
     found, theta = of_two_channels, numbers_of(of_two_channels)
     assert found.ok
@@ -158,6 +159,7 @@ def test_two_channels_against_a_direct_likelihood(of_two_channels):
     assert theta == pytest.approx(best, rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_autoregression_against_statsmodels(of_second_order):
     api, arima = pytest.importorskip("statsmodels.api"), pytest.importorskip("statsmodels.tsa.arima.model")
     found, numbers, total = of_second_order, of_second_order.measurement_errors["x"], 0.0
@@ -180,6 +182,7 @@ def test_autoregression_against_statsmodels(of_second_order):
     assert found.identifiability.degrees_of_freedom == pytest.approx(n - 5)
 
 
+@pytest.mark.slow
 def test_huber_against_statsmodels(of_huber):
     api = pytest.importorskip("statsmodels.api")
     found, trials = of_huber, of_huber.problem.trials
@@ -205,6 +208,7 @@ def test_huber_against_statsmodels(of_huber):
     assert loss == pytest.approx(of_all, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_scoring_is_that_of_the_likelihood(of_two_channels, of_huber):
     for found in (of_two_channels, of_huber):
         density, point = found.problem.log_density(), found.problem.at({"gain": 1.25})
@@ -216,6 +220,7 @@ def test_the_gradient_of_scoring_is_that_of_the_likelihood(of_two_channels, of_h
             assert float(slope[i]) == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_scales_of_all_channels_are_estimated(of_two_channels):
     """A `sigma` that is wrong by another factor in each channel changes nothing."""
     found = of_two_channels
@@ -229,6 +234,7 @@ def test_scales_of_all_channels_are_estimated(of_two_channels):
     assert scales == pytest.approx([0.01 * 0.5, 200.0], rel=0.5)
 
 
+@pytest.mark.slow
 def test_without_a_model_scales_alone(of_second_order):
     problem = of_second_order.problem
     found = fit(Track(), problem.trials, FREE, errors={}, **STEP)
@@ -250,6 +256,7 @@ def test_without_a_model_scales_alone(of_second_order):
     assert plain.measurement_errors == {}
 
 
+@pytest.mark.slow
 def test_tests_and_notes_are_of_innovations(of_second_order):
     found = of_second_order
     plain = fit(Track(), found.problem.trials, FREE, **STEP)
@@ -268,6 +275,7 @@ def test_tests_and_notes_are_of_innovations(of_second_order):
     assert "phi_2" in report(found)
 
 
+@pytest.mark.slow
 def test_evidence_is_the_density_of_the_measurements():
     """Linear in the start, with a Gaussian prior: the dense marginal density, given the estimated numbers."""
     rng = np.random.default_rng(5)
@@ -308,6 +316,7 @@ def test_save_load_and_resume(of_two_channels, tmp_path):
     assert first.estimates == pytest.approx(resumed.estimates, rel=1e-7) == found.estimates
 
 
+@pytest.mark.slow
 def test_a_fit_goes_on_from_its_numbers(of_two_channels):
     found = of_two_channels
     again = minimize(found.problem, LeastSquares(), start=found.point)
@@ -318,6 +327,7 @@ def test_a_fit_goes_on_from_its_numbers(of_two_channels):
     assert (low, high) == pytest.approx(found.intervals()["gain"], rel=0.03)
 
 
+@pytest.mark.slow
 def test_held_out_trials_by_the_likelihood_of_the_training(of_two_channels):
     found = of_two_channels
     one = found.problem.trials[0]
@@ -332,6 +342,7 @@ def test_held_out_trials_by_the_likelihood_of_the_training(of_two_channels):
     assert math.isnan(left_out.score)
 
 
+@pytest.mark.slow
 def test_an_estimated_scale_is_not_called_wrong():
     """With nearly as many unknown starts as residuals the ratio of residuals to degrees of freedom is far from one."""
     noise = np.random.default_rng(8).normal(size=(3, t.size))
@@ -411,6 +422,7 @@ def test_numbers_of_models_are_checked(make):
         make()
 
 
+@pytest.mark.slow
 def test_numbers_of_known_residuals():
     """Of one channel each: given degrees of freedom, normal residuals, a random walk, and a channel without samples."""
     rng = np.random.default_rng(9)

@@ -55,6 +55,7 @@ OPTIMIZERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_a_descent_goes_on_with_its_own_optimizer_only(name, problem, tmp_path):
     path = kept(problem, tmp_path / "fit.npz", GradientDescent(OPTIMIZERS[name]()))
@@ -69,6 +70,7 @@ def test_a_descent_goes_on_with_its_own_optimizer_only(name, problem, tmp_path):
     assert resumed.history == pytest.approx(whole.history, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_says_in_what_another_fit_differs(problem, tmp_path):
     path = kept(problem, tmp_path / "fit.npz")
     others = {

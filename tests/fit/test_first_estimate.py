@@ -98,6 +98,7 @@ def test_a_first_guess_may_start_with_a_centre_at_the_joint():
     assert guess.ok
 
 
+@pytest.mark.slow
 def test_what_a_first_guess_refuses():
     _, at = swings()
     for free, said in (

@@ -123,10 +123,12 @@ def check(result):
     assert "mass" in result.table(TRUTH)
 
 
+@pytest.mark.slow
 def test_least_squares(problem):
     check(minimize(problem, LeastSquares()))
 
 
+@pytest.mark.slow
 def test_gradient_descent(problem):
     result = minimize(problem, GradientDescent())
     check(result)
@@ -134,6 +136,7 @@ def test_gradient_descent(problem):
     assert result.history[-1] < 0.2 * result.history[0]
 
 
+@pytest.mark.slow
 def test_any_optax_optimizer(problem):
     check(minimize(problem, GradientDescent(optax.adam(optax.cosine_decay_schedule(0.2, 100)), rtol=0.03)))
 

@@ -68,6 +68,7 @@ def test_few_samples_a_period_have_no_bias(trial, by_exact_motion):
     assert np.all(np.abs((np.array(list(found.estimates.values())) - best) / errors) < step_tolerance(found.problem))
 
 
+@pytest.mark.slow
 @pytest.mark.many_steps
 def test_steps_too_coarse_are_told_or_halved(trial):
     # Slow where it starts: the steps that are chosen there are too coarse where it ends.
@@ -88,6 +89,7 @@ def test_steps_too_coarse_are_told_or_halved(trial):
     assert len(finer.history) > len(direct.history)
 
 
+@pytest.mark.slow
 def test_steps_are_halved_where_that_changes_anything(trial):
     at_rest = Trial(
         t, {"x": np.zeros(t.size)}, {"push": np.zeros(t.size)}, sigma=SIGMA, initial={"x": 0.0, "x_dot": 0.0}
@@ -104,6 +106,7 @@ def test_a_step_longer_than_a_window_is_one_that_halving_shortens(trial):
     assert not errors[1] < step_tolerance(posed[1])  # NaN where such a step goes nowhere
 
 
+@pytest.mark.slow
 def test_what_says_how_to_integrate(trial):
     assert Problem.of(GUESS, trial, NAMES, simulation=Simulation(atol=1e-9)).model.settings.step is None
     assert Problem.of(GUESS, trial, NAMES, simulation=Simulation(step=1e-3)).model.settings.max_steps is None
@@ -117,6 +120,7 @@ def test_what_says_how_to_integrate(trial):
             Simulation(**options)
 
 
+@pytest.mark.slow
 @pytest.mark.many_steps
 def test_more_fixed_steps_than_any_default_allows(trial):
     # 10 s by steps of 1 ms are more than 4096.
@@ -150,6 +154,7 @@ def beyond():
     return Problem.of(guess, pushed, Free("stiffness", bounds=(None, None)), simulation=Simulation(step=0.05))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
     [GradientDescent(), *(pytest.param(m, marks=pytest.mark.slow) for m in (LeastSquares(),))],
@@ -188,6 +193,7 @@ def stiff():
     return guess, trials, by_error
 
 
+@pytest.mark.slow
 @pytest.mark.many_steps
 @pytest.mark.parametrize(
     "how", [None, Simulation(step=0.05 / 16, solver=diffrax.Kvaerno5())], ids=["halved", "implicit"]
@@ -204,6 +210,7 @@ def test_stiff_motions_are_fitted(stiff, how):
     assert by_error.estimates["stiffness"] == pytest.approx(6.0, abs=3.5 * error)
 
 
+@pytest.mark.slow
 @pytest.mark.many_steps
 def test_what_falls_from_the_guess_is_fitted_with_the_steps_of_others(stiff):
     """One start is far off, so that the step finds no end there whatever it is; it is as short as those of others."""

@@ -101,6 +101,7 @@ def found(rubbing):
     return forward_selection(rubbing, FIVE, depth=1, refits=1)
 
 
+@pytest.mark.slow
 def test_dry_friction_is_found_among_five(rubbing, found):
     assert found.selected == ("dry",)
     assert found.best is found.rounds[0][0]
@@ -154,6 +155,7 @@ def beams():
     return [forward_selection(without, ("both", "dry", "spring"), depth=2, beam=n) for n in (1, 2)]
 
 
+@pytest.mark.slow
 def test_a_beam_finds_what_an_impostor_hides(beams):
     greedy, beam = beams
     assert greedy.selected[0] == "both"
@@ -273,6 +275,7 @@ def test_one_trial_alone(rubbing):
         forward_selection(alone, "dry", folds=2)
 
 
+@pytest.mark.slow_cases("asked0-*")
 @pytest.mark.parametrize(
     ("asked", "options", "message"),
     [
@@ -313,6 +316,7 @@ def test_what_is_asked_of_a_fit_at_a_minimum(rubbing):
         forward_selection(dataclasses.replace(rubbing, status="steps"), "dry")
 
 
+@pytest.mark.slow
 def test_fits_beside_each_other(rubbing, found):
     held = record(9, system=Pendulum(dry=0.4))
     table = compare({"viscous": rubbing, "with friction": found.fit}, held, plausible={"damping": 0.5})
@@ -344,6 +348,7 @@ def test_fits_beside_each_other(rubbing, found):
         compare([rubbing.problem])
 
 
+@pytest.mark.slow
 def test_a_fit_of_one_candidate_runs_the_program_of_all(rubbing, monkeypatch):
     """Nothing is compiled for it, and it has the derivatives of a program of its own."""
     asked = checked_terms(rubbing, ["dry", Gain("torque"), "spring"])
@@ -369,6 +374,7 @@ def test_a_fit_of_one_candidate_runs_the_program_of_all(rubbing, monkeypatch):
     assert len(programs() - compiled) == 1
 
 
+@pytest.mark.slow
 def test_a_page_of_the_report(found, tmp_path):
     page = save_report(found.fit, tmp_path / "fit.html", forward_selection=found).read_text(encoding="utf-8")
     assert "Model extensions" in page
@@ -468,6 +474,7 @@ def row_of(found, name):
     return next(row for round in found.rounds for row in round if row.name == name)
 
 
+@pytest.mark.slow
 def test_units_do_not_matter():
     """Masses of 1e-12 and 1e12 kg: a candidate that starts at zero has a scale of its own."""
     rows = []
@@ -484,6 +491,7 @@ def test_units_do_not_matter():
             assert one[1:] == pytest.approx(same[1:], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_refits_that_were_asked_for_are_made():
     """However little a score test says of a candidate: the linearization may hardly see a damper."""
     found = forward_selection(
@@ -495,6 +503,7 @@ def test_refits_that_were_asked_for_are_made():
     assert all(row.reason == "no more than chance" for row in found.rounds[0] if row.p >= 1e-9 / 4)
 
 
+@pytest.mark.slow
 def test_a_term_is_replaced():
     """The fit has viscous friction, the cart has drag: nothing else is left of it once drag is there."""
     before = loaded(carts(lambda x, v: 0.3 * v * abs(v)), ("stiffness", "damping"), damping=0.2)
@@ -515,6 +524,7 @@ def test_a_term_is_replaced():
         forward_selection(without, "drag", remove="dampign")
 
 
+@pytest.mark.slow
 def test_a_pair_of_which_neither_is_accepted_alone():
     """Two forces that are nearly alike, with opposite signs: only their difference acts."""
     trials = carts(lambda x, v: v - 1.6 * np.sin(3.0 * v) / 3.0, sigma=0.02, size=lambda i: 0.25)
@@ -529,6 +539,7 @@ def test_a_pair_of_which_neither_is_accepted_alone():
         forward_selection(loaded(trials[:1]), "damping", exchange=True)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_negative_is_tested_on_one_side():
     before = loaded(carts(lambda x, v: 0.006 * v, sigma=0.02))
     both = row_of(forward_selection(before, "damping", refits=0), "damping")
@@ -556,6 +567,7 @@ def test_trials_of_another_kind_are_held_out():
         cross_validate(loaded(trials[::2]), folds="amplitude")
 
 
+@pytest.mark.slow
 def test_estimates_that_were_free_before_are_judged_too():
     """A negative damping makes up for an offset: it is named, and it is no reason against what is found."""
     trials = carts(lambda x, v: -0.1 * v + 0.3)
@@ -573,6 +585,7 @@ def test_estimates_that_were_free_before_are_judged_too():
     assert energy_sources(loaded(carts(lambda x, v: 0.1 * v), ("stiffness", "damping"))) == {}
 
 
+@pytest.mark.slow
 def test_a_parameter_rests_at_its_bound():
     """Predictions do not move it beyond the bound. The fit of a candidate may take it off the bound."""
     trials = carts(lambda x, v: 0.1 * v - 0.2 * np.sin(3.0 * v), n=4, sigma=0.02, size=lambda i: 0.25)
@@ -586,6 +599,7 @@ def test_a_parameter_rests_at_its_bound():
     assert other.values["damping"] == pytest.approx(0.1, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_thrust_is_no_negative_damping():
     """It adds energy as long as the cart moves forward, but not if the same motion is run backwards."""
     forward = Trial(T, {"x": 0.4 * T**2}, {"push": 0.0 * T}, sigma=0.1)
@@ -604,6 +618,7 @@ def slow(rng, *shape):
     return rng.normal(size=shape) + 0.4 * e
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [white, slow])
 @pytest.mark.parametrize("T", [3, 6, 12])
 def test_false_positives(T, noise):

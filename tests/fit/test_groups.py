@@ -67,6 +67,7 @@ def mixed():
     return trials, fit(Track(), trials, (Free("gain", each="rider", prior="normal"), "drift"), **EXACT)
 
 
+@pytest.mark.slow
 def test_a_distribution_over_groups_is_that_of_the_restricted_likelihood(mixed):
     trials, found = mixed
     best = optimize.minimize_scalar(
@@ -80,6 +81,7 @@ def test_a_distribution_over_groups_is_that_of_the_restricted_likelihood(mixed):
     assert found.ok, found.message
 
 
+@pytest.mark.slow
 def test_few_groups_give_few_degrees_of_freedom(mixed):
     """Satterthwaite's, by differences of the dense likelihood in the logarithms a of ratio and variance."""
     trials, found = mixed
@@ -124,6 +126,7 @@ def test_a_distribution_over_groups_is_that_of_statsmodels(mixed):
     assert [found.estimates[f"gain [{r}]"] for r in RIDERS] == pytest.approx(effects, rel=TIGHT)
 
 
+@pytest.mark.slow
 def test_groups_without_a_distribution_are_fits_of_each_group_alone():
     trials = recorded(1)
     found = fit(Track(), trials, Free("gain", each="rider"), **EXACT)
@@ -167,6 +170,7 @@ def test_groups_that_do_not_differ():
     assert any("the standard deviation of 5 groups is uncertain" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_a_log_normal_distribution_is_that_of_the_linearized_model():
     trials = recorded(5, deviation=0.2)
     free = (Free("gain", bounds=(0.0, None), each="rider", prior="lognormal"), "drift")
@@ -181,6 +185,7 @@ def test_a_log_normal_distribution_is_that_of_the_linearized_model():
     assert found.estimates["median of gain"] == pytest.approx(np.exp(b[0]), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_one_offset_of_two_channels():
     rng = np.random.default_rng(3)
     trials = []
@@ -207,6 +212,7 @@ def test_a_trial_has_its_own_factor_beside_the_common_one():
     )
 
 
+@pytest.mark.slow
 def test_offsets_of_windows_are_those_of_trials_that_are_one_window_long():
     tolerance = 1e-6  # the end of the iterations differs by 1e-8 between processors
     rng, trials = np.random.default_rng(5), []
@@ -256,6 +262,7 @@ def test_bad_groups_are_named(item, message):
         Problem.of(Track(), recorded()[:2], Free("gain", each="rider", prior="normal"), simulation=EXACT["simulation"])
 
 
+@pytest.mark.slow
 def test_a_log_normal_prior():
     trials = recorded(4)[:1]
     free = (Free("gain", bounds=(0.0, None), prior=("lognormal", 1.0, 0.05)),)

@@ -171,6 +171,7 @@ def formal(A, y, priors=N + 1):
     return N_inverse @ (variance * of_data + A.T @ A - of_data) @ N_inverse, variance, freedom
 
 
+@pytest.mark.slow_cases("noise")
 def test_estimates_and_formal_errors(case):
     records, found, A, y, best = case
     np.testing.assert_allclose(list(found.estimates.values()), best[:2], rtol=TIGHT)
@@ -231,6 +232,7 @@ def test_errors_by_window():
         bootstrap(chained)
 
 
+@pytest.mark.slow
 def test_intervals_and_profiles_have_the_same_freedom(case):
     records, found, *_, best = case
     C, freedom = errors_by_trial(records)
@@ -253,6 +255,7 @@ def test_what_a_plan_will_determine_follows_from_sigma():
     assert not identifiability(Problem.of(Track(), loud, ("gain", "drift", OWN), **OPTIONS)).ok
 
 
+@pytest.mark.slow
 def test_trials_left_out(case):
     records, found, *_, best = case
     left_out = cross_validate(found)
@@ -270,6 +273,7 @@ def test_trials_left_out(case):
     assert left_out.n.tolist() == [np.isfinite(y).sum() for y in records]
 
 
+@pytest.mark.slow_cases("noise")
 def test_the_held_out_cost_is_that_of_fits_of_the_others(case):
     rtol = 1e-5  # of starts and offsets that are searched for
     free = ("gain", "drift", Offset("x_dot", each="trial", prior=(0.0, 0.5)))  # which starts cannot stand for
@@ -356,6 +360,7 @@ def test_the_evidence_knows_priors_and_no_scales(evidence):
     assert cut - whole == pytest.approx(np.log(2.0), abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_wider_prior_pays_for_itself(evidence):
     drift = Free("drift", prior=(0.0, 2.0))
     wide = [evidence(Free("gain", prior=(1.2, width)), drift).log_evidence for width in (10.0, 1000.0)]
@@ -370,6 +375,7 @@ def test_a_wider_prior_pays_for_itself(evidence):
         none.sample(-1)
 
 
+@pytest.mark.slow
 def test_what_has_no_influence_takes_no_error_from_the_others():
     """Without a push its gain is free: infinite errors of both kinds, and those of the drift as without it."""
     trials = [Trial(t, x.measured, {"push": 0.0 * t}, sigma=SIGMA[0]) for x in trials_of(recorded(5, wander=0.2))]
@@ -384,6 +390,7 @@ def test_what_has_no_influence_takes_no_error_from_the_others():
     assert both.intervals()["gain"] == (-np.inf, np.inf)
 
 
+@pytest.mark.slow
 def test_the_verdict_does_not_know_units():
     # A push in mN with a gain in 1/g is the same experiment: so is what the data tell.
     def told(unit, noise):
@@ -402,6 +409,7 @@ def test_the_verdict_does_not_know_units():
         assert other.standard_errors["gain"] == pytest.approx(1e3 * one.standard_errors["gain"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_verdict_does_not_know_the_start():
     """A small initial guess is a small scale; the estimate is known to a hundredth of itself all the same."""
     trials = trials_of(recorded(3))
@@ -442,6 +450,7 @@ def test_outputs_are_channels_of_their_own():
     assert found.estimates["gain"] == pytest.approx(column @ x / (column @ column), rel=TIGHT)
 
 
+@pytest.mark.slow
 def test_errors_by_part():
     """Two trials of three parts: each part is left out in turn. Starts and offsets are estimated again too."""
     records = recorded(2, wander=0.2)[:2]
@@ -462,6 +471,7 @@ def test_errors_by_part():
     np.testing.assert_allclose(found.clustered_covariance, C[:2, :2], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_held_out_cost_beside_a_bound():
     """A parameter at its bound is fixed: as in a fit that does not free it."""
     records, bounded = trials_of(recorded(3)), Free("gain", start=0.5, bounds=(0.0, 1.0))  # it is 1.2
@@ -473,6 +483,7 @@ def test_the_held_out_cost_beside_a_bound():
     assert at_bound.message.startswith("converged: gain rests at its bound")
 
 
+@pytest.mark.slow
 def test_the_priors_of_a_subset_are_its_own():
     """Of three parameters, the last alone with its prior: as one that was never posed with the others."""
     records = trials_of(recorded(3))

@@ -160,6 +160,7 @@ def test_the_information_is_fishers_on_average(case):
     assert np.all(error < 0.1 * np.sqrt(np.outer(exact.diagonal(), exact.diagonal())))
 
 
+@pytest.mark.slow
 def test_the_fit_is_the_maximum(case, found):
     _, y, _ = case
     assert found.status == "converged"
@@ -194,6 +195,7 @@ def test_gradient_descent_ends_there_too(case, found):
     np.testing.assert_allclose(slope, -problem.linearize(problem.start).blocks.gradient[2], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_fit_is_saved(case, found, tmp_path):
     again = load(found.save(tmp_path / "fit.npz"), case[2])
     assert again.estimates == found.estimates
@@ -267,6 +269,7 @@ def test_without_noise_it_is_least_squares(case):
     assert quiet.cost == pytest.approx(plain.cost + logs + n * np.log(2 * np.pi), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_noise():
     _, y = drawn(1)
     trial = trial_of(y)
@@ -551,6 +554,7 @@ class Fenced(Cart):
         return {"fence": jk.falling(q["x"] + 0.2)}
 
 
+@pytest.mark.slow
 def test_a_motion_that_an_event_ends_is_told():
     """Also where a measurement, and no step, takes the mean over it."""
     _, y = drawn(1)
@@ -575,6 +579,7 @@ def test_an_implicit_solver_and_xla_give_the_same_filter(by_xla):
     assert costs["Bosh3"] == pytest.approx(exact, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_step_longer_than_between_samples_is_told():
     t = np.arange(0.0, 6.0, 0.5)
     _, y = drawn(1, t)
@@ -584,6 +589,7 @@ def test_a_step_longer_than_between_samples_is_told():
     assert any("too coarse" in note for note in told.notes)
 
 
+@pytest.mark.slow
 def test_a_measured_start_is_known_as_well_as_its_sample():
     """As a start of which nothing is known before, but that its sample is no measurement any more."""
     _, y = drawn(1)

@@ -49,6 +49,7 @@ class Part(Optimizer):
         return Iterate(point, at.cost, at, now.state + 1)
 
 
+@pytest.mark.slow
 def test_an_optimizer_is_one_class(tmp_path):
     problem = Problem.of(Track(), TRIAL, ["gain", "drift"], **POSED)
     least = minimize(problem, LeastSquares(rtol=1e-13)).cost
@@ -118,6 +119,7 @@ class Dial(jk.System):
         return {"needle": jnp.sin(3.0 * q["angle"])}
 
 
+@pytest.mark.slow
 def test_a_trial_in_which_a_step_leads_too_far_holds_up_no_other():
     near, far = (Trial(TRIAL.t, {"needle": np.sin(3 * a + 0 * TRIAL.t)}, sigma=0.1) for a in (0.2, 0.25))
     problem = Problem.of(Dial(), [near, far], "inertia", unknown=("angle",), simulation=POSED["simulation"])

@@ -47,6 +47,7 @@ def solved(trial, rows=(), values=()):
     return np.linalg.lstsq(np.vstack([A, *rows]), np.append(trial.measured["x"] / 0.05, values), rcond=None)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", [("gain", "drift"), (Free("gain", bounds=(0.0, None)), Free("drift", scale=0.1))])
 def test_an_exact_sum(trial, free):
     found = fit(Track(), trial, free, constraints=[Linear({"gain": 1.0, "drift": 2.0}, equals=1.9)], **EXACT)
@@ -65,6 +66,7 @@ def test_an_exact_sum(trial, free):
     assert found.problem.size == (T.size, 1)
 
 
+@pytest.mark.slow
 def test_a_measured_sum_and_a_joint_prior_are_rows_of_least_squares(trial):
     found = fit(Track(), trial, ("gain", "drift"), constraints=[Linear({"gain": 1, "drift": 2}, 1.5, 0.01)], **EXACT)
     best = solved(trial, [[[100.0, 200.0]]], [150.0])
@@ -84,6 +86,7 @@ def test_a_measured_sum_and_a_joint_prior_are_rows_of_least_squares(trial):
     assert "No evidence" in laplace(joint).message
 
 
+@pytest.mark.slow
 def test_rows_of_constraints_are_part_of_every_cost(trial):
     """Of the likelihood of a filter, and of the density for samplers with its gradient."""
     known = [Linear({"gain": 1.0, "drift": 2.0}, 1.5, 0.1)]
@@ -100,6 +103,7 @@ def test_rows_of_constraints_are_part_of_every_cost(trial):
     np.testing.assert_allclose(slope.parameters, -more.linearize(point).blocks.gradient[2], rtol=1e-9)
 
 
+@pytest.mark.slow_cases("at_most-1.7")
 @pytest.mark.parametrize(("side", "bound"), [("at_most", 1.7), ("at_least", 2.3), ("at_most", 2.5), ("at_least", 1.5)])
 def test_an_inequality(trial, side, bound, tmp_path):
     at = Track(gain=1.0, drift=0.2) if side == "at_most" else Track(gain=1.8, drift=0.5)
@@ -133,6 +137,7 @@ def test_a_prior_of_a_dependent_parameter_counts(trial):
     assert values["drift"] == pytest.approx(own @ rest / (own @ own), rel=TIGHT)
 
 
+@pytest.mark.slow
 def test_what_depends_keeps_its_own_bounds(trial):
     """The gain would be negative: the sum alone would allow it."""
     sums = [Linear({"gain": 1.0, "drift": 1.0}, equals=0.3)]

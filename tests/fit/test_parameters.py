@@ -42,6 +42,7 @@ class Springs(eqx.Module):
 SYSTEM = Springs(others=jnp.array([1.0, 2.0, 3.0]), matrix=jnp.zeros((2, 2)))
 
 
+@pytest.mark.slow
 def test_all_entries_of_a_vector_follow():
     free = Free("stiffness", tied={"others": 0.5, "matrix": -2.0})
     parameters = parameters_of(SYSTEM, free)
@@ -140,6 +141,7 @@ def test_what_is_plausible_does_not_follow_from_where_a_search_starts():
     )
 
 
+@pytest.mark.slow
 def test_friction_that_starts_at_its_bound_is_found():
     rtol = 1e-4
     free, bounded = (fit(Track(), TRIAL, ["gain", drift], optimizer=LeastSquares(rtol=1e-12), **POSED)
@@ -225,6 +227,7 @@ class Limited(Track):
     gain: jk.Scalar = jk.parameter(0.5, within=(0.0, 0.7))  # [1/kg]
 
 
+@pytest.mark.slow
 def test_a_fit_whose_data_want_more_ends_at_what_was_declared():
     T = np.linspace(0.0, 1.0, 11)
     of_drift, of_gain = T**2 / 2, T**3 / 6  # x, of a drift and of a push that grows by one a second
@@ -244,6 +247,7 @@ def asked(parameters, x):
     return y, parameters.slopes(x), parameters.inverse(y), parameters.prior_residuals(x), parameters.all(x)
 
 
+@pytest.mark.slow
 def test_numbers_are_mapped_as_under_a_trace():
     """And while something else is traced: values, slopes, their inverse, and what priors say; of a subset, too."""
     whole = parameters_of(Track(), ("gain", Free("drift", start=0.2, bounds=(0.0, 1.0), prior=(0.3, 0.1))))

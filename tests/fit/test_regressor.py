@@ -24,6 +24,7 @@ from jaxkane.catalog import CATALOG
 from jaxkane.fit import base_parameters, regressor
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["DoublePendulum", "SliderWithPinnedBar", pytest.param("ColumnFrameAndDisk", marks=pytest.mark.slow)]
 )
@@ -41,6 +42,7 @@ def test_matrix_times_parameters_is_what_kanes_equations_hold(name):
     np.testing.assert_allclose(found.matrix @ found.values - found.forces, -(F + F_star), atol=tolerance)
 
 
+@pytest.mark.slow_cases("XLA")
 def test_the_matrix_does_not_depend_on_what_is_to_be_found(kernels):
     """Y of a guess, times the parameters of the truth, is what acts on the truth as it moves."""
     tolerance = 1e-12
@@ -71,6 +73,7 @@ def test_weights_that_are_written_by_hand_are_found_or_refused():
     regressor(SwingElsewhere(), *i, bodies="link1")  # then the other's weight is known, as it is
 
 
+@pytest.mark.slow
 def test_dependent_speeds():
     """Of a knife edge: Izz, the first moment along the edge, and the mass; none of what is across."""
     tolerance = 1e-11
@@ -103,6 +106,7 @@ def test_batches_derivatives_and_traces():
     assert np.isfinite(length(0.2))
 
 
+@pytest.mark.slow
 def test_what_is_not_linear_is_refused():
     _truth, at = swings()
     i = (0.0, at.q[3], at.u[3], at.u_dot[3])
@@ -137,6 +141,7 @@ def test_what_is_not_linear_is_refused():
         regressor(Swing, *i)
 
 
+@pytest.mark.slow
 def test_known_bodies_stay_on_the_right_side():
     tolerance = 1e-12
     truth, at = swings()

@@ -17,6 +17,7 @@ def fit():
     return minimize(Problem.of(Track(), [TRIAL, SHORT], ["gain", "drift"], **POSED), LeastSquares())
 
 
+@pytest.mark.slow
 def test_a_data_frame_of_the_estimates(fit):
     frame = fit.to_pandas(level=0.9)
     assert [*frame.columns] == ["unit", "start", "estimate", "error", "lower", "upper"]
@@ -56,6 +57,7 @@ def test_json_has_the_report_and_no_nan(fit):
     np.testing.assert_allclose(told["correlation"], fit.correlation)
 
 
+@pytest.mark.slow
 def test_json_of_what_the_data_do_not_determine(fit):
     still = Trial(t, {"x": SEEN}, sigma=0.1)
     told = json.loads(minimize(Problem.of(Track(), still, ["gain", "drift"], **POSED), LeastSquares()).to_json())

@@ -56,6 +56,7 @@ def test_a_fit_comes_back_as_it_was(result, path):
     assert minimize(again.problem, LeastSquares(), start=again.point).cost == pytest.approx(result.cost, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_to_look_at_a_fit_simulates_nothing(path, monkeypatch):
     from jaxkane.fit.problem import problem
 
@@ -119,6 +120,7 @@ def test_a_fit_of_another_problem_is_refused(path):
             load(path, other)
 
 
+@pytest.mark.slow
 def test_a_fixed_parameter_that_differs_is_named():
     there, here = (
         described(pose(Track(gain=gain), free=["drift"], simulation=Simulation(step=0.1))) for gain in (1.0, 2.5)

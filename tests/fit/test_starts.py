@@ -58,6 +58,7 @@ def posed(system, free, *trials, **options):
     return Problem.of(system, trials, free, simulation=Simulation(step=0.5), **options)
 
 
+@pytest.mark.slow
 def test_a_start_that_is_measured_later_is_no_start():
     wire = Wire(follows=("y",))
     gap = {"x": [np.nan, 0.3, 0.4]}
@@ -87,6 +88,7 @@ def bead(initial, **measured):
     return Trial(t, {"x_dot": np.zeros(3), **measured}, sigma=0.1, initial=initial, name=f"bead {sorted(initial)}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("follows", [(), ("y",)])
 def test_what_a_trial_says_is_held(follows):
     system = Wire(follows=follows)
@@ -98,11 +100,13 @@ def test_what_a_trial_says_is_held(follows):
     np.testing.assert_allclose(starts(unknown), [[0.0, 1.0]], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_contradicts_itself_is_moved_to_the_nearest():
     both = {"x": 0.3, "y": 0.5}
     np.testing.assert_allclose(starts(posed(Wire(), "mass", bead(both))), [[0.4, 0.6]], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_trial_that_does_not_say_what_others_do_is_named():
     reason = r"bead \['x'\]: there are no data for y, whose initial value .* Add it to `initial`"
     with pytest.raises(ValueError, match=reason):
@@ -111,6 +115,7 @@ def test_a_trial_that_does_not_say_what_others_do_is_named():
     np.testing.assert_allclose(starts(of_each), [[0.3, 0.7], [0.0, 1.0]], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("follows", [(), ("e4",)])
 def test_euler_parameters_that_nobody_names_are_no_rotation(follows):
     turned = Trial(t, {"w1": np.zeros(3)}, sigma=0.1)
@@ -142,6 +147,7 @@ class Sliding(Spun):
         return [jk.rotations.euler_parameter_norm(q["e1":"e4"])]
 
 
+@pytest.mark.slow_cases(all_but=["dependent"])
 @pytest.mark.parametrize("system", [Spun(), Spun(follows=("e4",)), Sliding()], ids=["all", "dependent", "sliding"])
 def test_four_measured_euler_parameters_are_brought_to_unit_norm(system):
     raw = np.array([0.1, -0.5, 0.7, 1e-3])
@@ -171,6 +177,7 @@ def turning(sigma=0.01):
 SLOW = pytest.mark.slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("system", "window"),
     [
@@ -224,6 +231,7 @@ def test_the_recorded_tosses_begin_where_they_were_measured():
 TURNS = {"omega": ("w1", "w2", "w3"), "v": ("vx", "vy", "vz")}
 
 
+@pytest.mark.slow
 def test_a_speed_that_nobody_states_is_named():
     def notes_of(*trials, **options):
         problem = posed(Wire(follows=("y",)), "mass", *trials, **options)

@@ -170,6 +170,7 @@ def test_other_data_and_guesses_compile_nothing(result, runs, problem):
     assert programs() <= before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [LeastSquares(damping=0.0), GradientDescent()], ids=lambda m: m.name)
 def test_other_methods_find_the_same(problem, result, method):
     found = minimize(problem, method)
@@ -253,6 +254,7 @@ def late_push(delay):
     return Trial(t, {"x": ride["x"]}, {"push": push}, sigma=1e-3), np.asarray(ride.inputs["push"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", [[Delay("push")], ["mass", Delay("push", each="trial")]])
 @pytest.mark.parametrize("delay", [1.3, -0.7])
 def test_windows_receive_what_acted_long_before(free, delay):
@@ -272,6 +274,7 @@ def _windows(problem):
     return [jax.tree.map(lambda x, i=i: x[i], problem.windows) for i in range(len(problem.slices))]
 
 
+@pytest.mark.slow
 def test_windows_keep_what_the_bounds_of_a_delay_ask_for():
     trial, acted = late_push(0.4)
     sizes = []
@@ -385,6 +388,7 @@ def late_records(delay, n=3):
     return trials
 
 
+@pytest.mark.slow
 def test_what_acted_before_a_record_is_left_out_or_named():
     """The input is delayed by 0.8 s; its first sample is a wrong guess of what it was before."""
     trials, options = late_records(0.8), {"unknown": ("x", "x_dot")}
@@ -404,6 +408,7 @@ def test_what_acted_before_a_record_is_left_out_or_named():
         Problem.of(TRUTH, trials, guess(bounds=(0.0, 5.9)), **options)
 
 
+@pytest.mark.slow
 def test_an_input_has_the_value_that_is_given_before_its_first_sample():
     t = np.arange(0.0, 3.0, 0.1)
     trial = Trial(t, {"x": np.cos(t)}, {"push": 1.0 + t}, sigma=0.1)

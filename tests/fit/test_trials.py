@@ -156,6 +156,7 @@ def test_offsets_of_trials_alone_are_not_fitted():
         Problem.of(pendulum, trial(), Offset("theta1", each="trial"))
 
 
+@pytest.mark.slow
 def test_parameters_by_name_path_and_leaf():
     free = ("mass", lambda s: s.length, Free("gravity", bounds=(9.0, 10.0), start=9.5))
     parameters = Problem.of(pendulum, trial(), free).parameters
@@ -190,6 +191,7 @@ def test_a_window_shorter_than_the_samples_is_refused(window):
     assert len(Problem.of(pendulum, trial(), "mass", unknown="theta1", window=window, defect_std={}).slices) == 10
 
 
+@pytest.mark.slow
 def test_windows_cover_every_sample_once():
     problem = Problem.of(pendulum, [trial(), trial(t=2 * t)], "mass", window=0.4)
     assert problem.slices == ((0, 0, 4), (0, 4, 7), (1, 0, 2), (1, 2, 2), (1, 4, 2), (1, 6, 2), (1, 8, 3))
@@ -226,6 +228,7 @@ def bicycle_ride(**more):
     return Trial(t, {"roll": good}, sigma=0.1, initial={"speed": 5.0}, **more)
 
 
+@pytest.mark.slow_cases(all_but=["NoiseScale"])
 @pytest.mark.parametrize("kind", ENTRIES)
 def test_what_is_no_number_is_refused_where_something_is_freed(kind):
     for bad in NO_NUMBERS:

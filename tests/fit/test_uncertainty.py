@@ -79,6 +79,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(problem):
     assert np.all((hits >= 24) & (hits <= 38)), hits
 
 
+@pytest.mark.slow
 def test_intervals_beside_a_bound_hold_the_truth():
     """They are those of a fit without the bound, and end there."""
     rng, hits, beside = np.random.default_rng(5), 0, 0
@@ -99,6 +100,7 @@ def test_intervals_beside_a_bound_hold_the_truth():
     assert beside > 5
 
 
+@pytest.mark.slow
 def test_white_residuals_are_called_white(result):
     tests = [t["x"] for t in result.tests.values()]
     assert sum(t.is_white for t in tests) >= 5
@@ -120,6 +122,7 @@ def test_correlated_residuals_are_called_so():
     assert residual_test(t, t, np.full(300, np.nan)).n == 0
 
 
+@pytest.mark.slow
 def test_clustered_errors_see_what_differs_from_trial_to_trial(problem, result):
     # Every trial has its own stiffness: that is no noise of samples, and the formal error does not know it.
     rng = np.random.default_rng(5)
@@ -150,6 +153,7 @@ def test_residuals_are_not_written_to(result):
             next(iter(series.values()))["x"][:] = 0.0
 
 
+@pytest.mark.slow
 def test_trials_left_out(result):
     left_out = cross_validate(result, folds=3)
     assert np.all(np.isfinite(left_out.held_out))
@@ -200,6 +204,7 @@ def test_the_density_is_that_of_the_residuals(problem, result):
     assert extra == pytest.approx(float(problem.parameters.log_determinant(away.parameters)), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_laplace_has_the_errors_of_given_sigma(problem, result):
     gaussian = result.laplace()
     draws = gaussian.sample(4000)
@@ -263,6 +268,7 @@ def test_priors_are_weighed_and_told(problem, result):
 # Suspicious data, each reported by name.
 
 
+@pytest.mark.slow
 def test_a_wrong_sign_of_an_input(trials, monkeypatch):
     wrong = [Trial(t.t, t.measured, {"push": -t.inputs["push"]}, sigma=0.01, name=t.name) for t in trials]
     # With the mass free, an infinite one takes the wrong push out of the model.
@@ -399,6 +405,7 @@ def test_a_narrow_report_shows_all_columns_of_the_estimates(result, tmp_path):
         assert page.value(f"Math.max(...{cells})") <= 390
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fitted", [False, True])
 def test_undetermined_is_half_of_the_scale(fitted):
     """A parameter is determined if its standard deviation is less than half of the larger of scale and estimate. Here
@@ -442,6 +449,7 @@ def test_an_input_that_is_zero_in_many_trials_is_planned(trials):
     assert told(0) == told(3) == []
 
 
+@pytest.mark.slow
 def test_the_printed_interval_is_named(result):
     head, row = (line.split() for line in str(result).splitlines()[1:3])
     low, high = result.intervals()["mass"]

@@ -51,6 +51,7 @@ def falling():
     return fit(Falling(), NEAR, FREE, simulation=STEP, optimizer=LeastSquares())
 
 
+@pytest.mark.slow
 def test_trials_that_cannot_be_simulated_are_told_and_the_rest_is_kept(falling, tmp_path):
     held = validate(falling, [FAR[0], *NEAR, FAR[1]])
     alone = validate(falling, NEAR)
@@ -71,6 +72,7 @@ def test_trials_that_cannot_be_simulated_are_told_and_the_rest_is_kept(falling, 
     assert "not simulated" in text
 
 
+@pytest.mark.slow
 def test_trials_go_one_by_one_through_one_program():
     """Of one, two and three windows, with priors: as all of them together; and nothing is compiled for more trials."""
     long = np.linspace(0.0, 3.0, 31)
@@ -99,6 +101,7 @@ def test_trials_go_one_by_one_through_one_program():
     assert more.cost > held.cost + min(costs_by_trial(found.problem, found.point)[:2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -146,6 +149,7 @@ def test_windows_that_do_not_count_are_linked_to_none():
     np.testing.assert_array_equal(problem.only([1]).windows.linked, [0, 0, 0, 1, 1, 0])
 
 
+@pytest.mark.slow
 def test_a_trial_that_cannot_be_simulated_does_not_end_a_fit(falling, tmp_path):
     found = fit(Falling(), [FAR[0], *NEAR, FAR[1]], FREE, simulation=STEP, optimizer=LeastSquares())
     assert found.trial_names == ("near a", "near b", "near c")
@@ -167,6 +171,7 @@ def test_a_trial_that_cannot_be_simulated_does_not_end_a_fit(falling, tmp_path):
         fit(Falling(), FAR, FREE, simulation=STEP)
 
 
+@pytest.mark.slow
 def test_shorter_horizons_leave_no_trial_out_with_a_checkpoint_either(falling, tmp_path):
     """By them the fit comes to parameters that simulate all, from a guess that simulates none."""
     guess = Falling(drift=30.0)
@@ -189,6 +194,7 @@ def test_a_trial_that_the_others_cannot_simulate_costs_infinity(falling):
     assert left_out.conclusion == "b cannot be simulated with the parameters of the others."
 
 
+@pytest.mark.slow
 def test_the_score_is_relative_to_the_data_and_not_to_the_first_guess():
     rtol = 1e-6
     trials = [Trial(T, {"x": y}, {"push": PUSH}, sigma=0.1) for y in (TRIAL.measured["x"], 0.7 * T**2, 0.5 * T**2)]
@@ -202,6 +208,7 @@ def test_the_score_is_relative_to_the_data_and_not_to_the_first_guess():
     assert f"{100 * near.score:.1f} % of the measurements' variance" in str(near)
 
 
+@pytest.mark.slow
 def test_off_the_cpu_windows_are_one_batch(monkeypatch):
     """Without states of its own the system has trajectories with arrays of size zero, which a batch must permit."""
     rtol = 1e-12
@@ -216,6 +223,7 @@ def test_off_the_cpu_windows_are_one_batch(monkeypatch):
         np.testing.assert_allclose(there.q[i], motion.q, rtol=rtol)
 
 
+@pytest.mark.slow
 def test_reported_starts_are_those_of_the_motion():
     """With a gain and an offset of what is known of the starts."""
     trial = TRIAL.with_initial_state({"x": 0.5, "x_dot": 0.2})
@@ -227,6 +235,7 @@ def test_reported_starts_are_those_of_the_motion():
     assert abs(float(start[0]) - 0.5) > 0.1
 
 
+@pytest.mark.slow
 def test_a_noisy_start_that_is_held_is_told():
     """The first sample is off by three of its deviations, and the whole motion with it."""
     y = 0.5 * T**2 + np.append(0.3, np.zeros(10))
@@ -248,6 +257,7 @@ def test_a_fit_that_has_not_converged_says_so_in_its_notes():
     assert ended.notes[0].startswith("The fit has not converged (stopped after the last step")
 
 
+@pytest.mark.slow
 def test_given_values_are_validated():
     """Of a system as of a fit with the same values: nothing but the starts is estimated."""
     posed = {"unknown": ("x", "x_dot"), "simulation": STEP}
@@ -264,6 +274,7 @@ def test_given_values_are_validated():
         validate(found.problem, NEAR)
 
 
+@pytest.mark.slow
 def test_held_out_trials_cost_few_simulations(monkeypatch):
     """Trials are simulated together, as many windows at once as the fit has."""
     found = fit(Track(), NEAR, FREE, unknown=("x", "x_dot"), simulation=STEP, optimizer=LeastSquares())

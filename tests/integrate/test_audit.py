@@ -84,6 +84,7 @@ def test_conditioning_of_the_bicycle():
     assert jk.plot.audit(audit).shape == (2, 2)
 
 
+@pytest.mark.slow
 def test_a_run_that_ended_early_is_audited_up_to_there():
     ts = jnp.linspace(0.0, 2.0, 11)
     audit = jk.audit(Bead(), jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), ts))
@@ -139,6 +140,7 @@ def test_jumps_between_the_times_are_not_blamed_on_the_motion():
     assert "save more times" in str(audit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [21, 2])
 def test_a_jump_that_nobody_announces_is_not_blamed_on_the_motion(times):
     """A function may jump where it likes: two orders of quadrature agree about that, half of the times does not."""
@@ -182,6 +184,7 @@ class Oscillator(jk.System):
         return jk.Force((-400.0 * q["x"] - 0.4 * u["v"]) * motion.N.x, motion.bodies[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [2, 5, 33])
 def test_work_between_few_samples_is_not_known(times):
     """With 33 samples in 10 s, a sample a period, all rules of quadrature agree to 4e-8 and are wrong."""
@@ -193,6 +196,7 @@ def test_work_between_few_samples_is_not_known(times):
     assert 2 * audit.work_error > np.abs(audit.energy_error).max() > 1.0
 
 
+@pytest.mark.slow
 def test_a_coarse_run_with_a_damper_is_found_out():
     ride = jk.simulate(Oscillator(), jk.State([0.1], [0.0]), np.linspace(0.0, 1.0, 97), rtol=1e-2, atol=1e-2)
     audit = jk.audit(Oscillator(), ride)
@@ -221,6 +225,7 @@ class Rod(jk.System):
         return jk.weight(motion, self.gravity * motion.N.x)
 
 
+@pytest.mark.slow
 def test_a_change_of_units_changes_no_verdict():
     """Lengths of 1e-6 to 1e6 m and times of 1e-12 s; a loop that is open by one per cent is found in all units."""
     tables = []
@@ -269,6 +274,7 @@ def test_metres_beside_radians_are_no_bad_condition():
     assert audit.ok
 
 
+@pytest.mark.slow
 def test_reflected_inertias_have_no_momentum():
     """A free chain with geared motors conserves the angular momentum of its links."""
     bar = {"mass": 2.0, "center": (0.0, 0.0, -0.2), "inertia": (0.03, 0.03, 0.002)}

@@ -112,6 +112,7 @@ class Rod(jk.System):
         return (jk.Torque(0.2 * motion.N.z, rod),)
 
 
+@pytest.mark.slow
 def test_a_load_on_a_frame_that_loads_made_is_felt_and_its_work_is_counted():
     """0.2 N m on a rod of 0.1 kg m^2 about its end, 1 kg at 0.5 m: 0.2 / 0.35 rad/s^2."""
     start, ts = jk.State(jnp.zeros(1), jnp.array([2.0])), jnp.linspace(0.0, 0.1, 6)

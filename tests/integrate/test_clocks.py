@@ -61,6 +61,7 @@ def place_of_the_last(t0, dtype, hold, options):
     return jax.jit(jax.value_and_grad(place))(jnp.array([0.0, 1.0], dtype))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"step": 0.05}], ids=["adaptive", "fixed"])
 @pytest.mark.parametrize("hold", [True, False])
 def test_derivatives_do_not_depend_on_the_start(options, hold):
@@ -71,6 +72,7 @@ def test_derivatives_do_not_depend_on_the_start(options, hold):
         np.testing.assert_allclose(slope1, slope, rtol=rtol, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("step", [None, 0.01])
 def test_uneven_samples_under_a_hold(dtype, step):
@@ -87,6 +89,7 @@ def test_uneven_samples_under_a_hold(dtype, step):
         np.testing.assert_allclose([ride["x"][-1], ride["v"][-1]], [x, v], rtol=50 * jnp.finfo(dtype).eps, atol=atol)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_a_hold_that_jumps_at_the_last_time(dtype):
     """As when the requested times are those of the samples: 125 steps instead of a few."""
@@ -144,6 +147,7 @@ def test_a_short_flight_in_a_long_simulation(t0, flight):
     assert height == pytest.approx(-0.5 * flight, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_third_derivatives_of_the_end_are_nan():
     """A fall from h takes sqrt(2 h); its third derivative at h = 0.5 is 3, and two are exact."""
 
@@ -167,6 +171,7 @@ class Clocked(Particle):
         return {"tick": jk.falling(jnp.cos(np.pi / 2 * (q["x"] + 0.0)))}
 
 
+@pytest.mark.slow
 def test_the_first_of_several_fast_crossings_ends_the_simulation():
     ride = jk.simulate(Clocked(), jk.State([0.0], [1.0]), [0.0, 100.0])
     assert float(ride.t_end) == pytest.approx(1.0, abs=1e-9)
@@ -200,6 +205,7 @@ class Switched(Particle):
         return jk.Force(push * motion.N.x, motion["mass"])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Switched")
 @pytest.mark.parametrize(
     ("sampled", "options"), [(False, {}), (False, {"step": 0.05}), (True, {})], ids=["given", "fixed", "samples"]

@@ -48,6 +48,7 @@ BOUNCES = [0.4590853109923369, 1.1280946846381106, 1.6405736265752897, 2.0400984
 BOUNCES += [2.603903008180971, 2.802033708031122, 2.9599159114088045]
 
 
+@pytest.mark.slow
 def test_a_bouncing_ball_with_drag():
     atol, slope_rtol = 1e-10, 1e-6  # the second derivative of |v| v is discontinuous at the top
     slopes, ride = drop(DROP, jnp.linspace(0.0, 3.0, 21))
@@ -128,6 +129,7 @@ def jumps_of(ride):
     return np.asarray(ride.jumps.t)[: int(ride.jumps.count)]
 
 
+@pytest.mark.slow
 def test_a_ball_with_spin_drag_and_friction():
     # Extrapolation in 40 digits; derivatives by differences of the fourth order.
     atol, slope_rtol = 1e-10, 1e-8
@@ -171,6 +173,7 @@ BY_MU_V_W = {
 }
 
 
+@pytest.mark.slow_cases("sphere")
 @pytest.mark.parametrize("kind", BACKSPIN)
 def test_a_ball_with_backspin_slides_and_then_rolls(kind):
     atol, slope_atol = 1e-10, 1e-8
@@ -449,6 +452,7 @@ def random_values(rng, kind):
     return values | rod | {"h": 0.05 + 0.5 * np.cos(angle) + drop}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ball", "rod"])
 def test_random_simulations_satisfy_the_contact_laws(kind):
     """They land, bounce until they rest, slide, stick, reverse, and lift off, while the force changes at 1 s."""
@@ -557,6 +561,7 @@ belt = simulate_with_slopes(lambda p: Belt(jnp.ones(()), *p[:4]), lambda p: jk.S
 BELT = jnp.array([4.0, 0.5, 2.5, 4.0, 0.0, 0.0])  # stiffness, speed, kinetic, static, x, x_dot
 
 
+@pytest.mark.slow
 def test_a_block_on_a_belt_sticks_and_slips():
     atol, slope_atol = 1e-10, 1e-8
     slopes, ride = belt(BELT, jnp.linspace(0, 20, 21))
@@ -575,6 +580,7 @@ def test_a_block_on_a_belt_sticks_and_slips():
     np.testing.assert_array_equal(slopes["end"][1, 4:], 0.0)
 
 
+@pytest.mark.slow
 def test_static_friction_that_equals_the_kinetic_one():
     """The oscillator of Siconos: it rests after eight turns."""
     atol, slope_atol = 1e-10, 1e-8

@@ -197,6 +197,7 @@ def test_misuse_is_explained(case):
         simulate_with(contacts)
 
 
+@pytest.mark.slow
 def test_an_event_and_a_contact_need_different_names():
     class Both(BouncingBall):
         def events(self, t, q, u):

@@ -30,6 +30,7 @@ def tilted(angle, width=0.4, height=1.2, **speeds):
     return jk.State({"x": -height / 2 * np.sin(angle) + side * np.cos(angle) - side, "y": y, "angle": angle}, speeds)
 
 
+@pytest.mark.slow
 def test_a_rocking_block_changes_its_corner():
     # Quadrature; the energy ratio of an impact is r^2 with r = 1 - 3/2 sin^2(alpha).
     atol = 1e-10
@@ -90,6 +91,7 @@ def test_a_block_slides_on_both_corners():
     np.testing.assert_allclose(ride["left.normal"] + ride["right.normal"], 9.81, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_random_blocks_satisfy_the_contact_laws():
     rng = np.random.default_rng(1)
     for _ in range(40):

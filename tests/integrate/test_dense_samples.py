@@ -24,6 +24,7 @@ def ride(ts, values, **options):
     return jk.simulate(Cart(), jk.State([0.0], [0.0]), np.linspace(0.0, 1.0, 3), push, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 def test_a_second_of_dense_samples(n):
     """The samples of a smooth signal; and the same with a peak of one sample: a push of `height` dt [N s]."""
@@ -38,6 +39,7 @@ def test_a_second_of_dense_samples(n):
     np.testing.assert_allclose(peak["place"], place(smooth.t) + gained, atol=atol)
 
 
+@pytest.mark.slow
 def test_steps_end_beside_a_peak_wherever_it_stands():
     rtol, n = 1e-8, 10_000
     ts = np.linspace(0.0, 1.0, n)
@@ -69,6 +71,7 @@ def test_steps_pass_over_no_signal_that_is_not_smooth(signal):
         assert needed.mean() > 0.9
 
 
+@pytest.mark.slow
 def test_all_samples_end_steps_where_a_derivative_by_them_is_asked_for():
     ts = jnp.linspace(0.0, 1.0, 3000)
     signal = lambda x: (ts + x[0], (1 + x[1]) * jnp.sin(ts)[None], 1e-6 + x[2])  # noqa: E731
@@ -98,6 +101,7 @@ def test_steps_end_where_a_derivative_by_samples_is_asked_for():
     assert steps > n // 3 - 2
 
 
+@pytest.mark.slow
 def test_each_jump_of_a_zero_order_hold_ends_a_step():
     n, state = 10_000, jk.State(jnp.zeros(1), jnp.zeros(1))
     ts = jnp.linspace(0.0, 1.0, n)
@@ -111,6 +115,7 @@ def test_each_jump_of_a_zero_order_hold_ends_a_step():
     assert np.isfinite(linear.times).sum() < 20
 
 
+@pytest.mark.slow
 def test_a_few_entries_of_long_samples_are_those_that_numpy_finds():
     # From 32768 samples on a CPU, bisection and reading go entry by entry.
     rng = np.random.default_rng(0)

@@ -59,6 +59,7 @@ def exact(h, v, g):
     return jnp.stack([(v + root) / g, 0.0 * h, -root])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"step": 0.07}], ids=["adaptive", "fixed"])
 def test_a_dropped_particle(options):
     atol = 1e-9
@@ -73,6 +74,7 @@ def test_a_dropped_particle(options):
     assert np.isnan(ride["drive"][~reached]).all()
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_the_end():
     """By the velocity at the start, against the formula."""
     h, g = jnp.array(1.0), jnp.array(9.81)
@@ -104,6 +106,7 @@ class Pendulum(jk.System):
         return {"vertical": {0: q["angle"], 1: jk.rising(q["angle"]), -1: jk.falling(q["angle"]), 2: low}[self.way]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("way", "quarters"), [(-1, 1), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((0, 1), (1, 3)))]
 )
@@ -140,6 +143,7 @@ def test_second_derivatives_along_several_directions():
     np.testing.assert_allclose(over_reverse, second, rtol=rtol, atol=rtol)
 
 
+@pytest.mark.slow
 def test_a_start_on_zero():
     """Thrown up from the ground it comes back; resting on it, or thrown down, it has passed it at once."""
     ride = dropped(0.0, 3.0)
@@ -270,6 +274,7 @@ def test_other_ends_have_no_derivative():
     assert dropped(100.0, 0.1, Particle(ends="none"), max_steps=3).reason == "max steps"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ends", "height", "options"), [("root", 0.21, {"step": 0.07}), ("lost", 0.2, {})], ids=["fixed", "adaptive"]
 )
@@ -307,6 +312,7 @@ def test_the_end_by_an_implicit_solver():
     np.testing.assert_allclose(ride.t_end, np.arccos(0.3), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -369,6 +375,7 @@ def test_an_event_that_reads_no_speed_costs_no_accelerations():
     assert events_of(Particle(ends="roof"), TS[0], start).read_rates
 
 
+@pytest.mark.slow
 def test_the_first_crossing_of_cubics():
     """Against the roots of random cubics, among them those that start on zero, and those that come back at once."""
     rng = np.random.default_rng(0)
@@ -390,6 +397,7 @@ def test_the_first_crossing_of_cubics():
         assert (x == 0) == (first == 0)  # a motion ends where it starts only if it starts on its event
 
 
+@pytest.mark.slow
 def test_only_what_is_zero_at_the_start_passes_it_there():
     """Values and slopes of any size make double roots, beside which rounding errors send Newton's method anywhere."""
     rng = np.random.default_rng(0)
@@ -557,6 +565,7 @@ def test_samples_that_are_none():
             jk.simulate(Particle(), jk.State(jnp.ones(1), jnp.ones(1)), TS, {"drive": value})
 
 
+@pytest.mark.slow
 def test_times_that_tracing_hides_are_invalid():
     start = jk.State(jnp.ones(1), jnp.ones(1))
     hidden = jax.jit(lambda ts: jk.simulate(Particle(), start, ts))
@@ -608,6 +617,7 @@ def test_members_of_a_batch_end_at_their_own_times(mode, h, v, g):
     assert np.isnan(found[2, 1:6, 0, 2]).all(), "what is missing has no derivative"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("adjoint", "derivative"), [("forward", jax.jacfwd), ("reverse", jax.jacrev)])
 def test_an_event_after_a_jump_that_is_differentiated(adjoint, derivative):
     """A force of 1 N from 0.5 s + delay on. The step that begins there is rejected and repeated."""

@@ -51,6 +51,7 @@ def first_trajectory(system):
     return jk.simulate(system, state, TS)
 
 
+@pytest.mark.slow
 def test_a_description_is_read_three_times_at_most():
     """Once for its check and once for all that the method asks; and the check of its constraints."""
     count = itertools.count()  # whose next number Python finds without changing what the class reads
@@ -82,6 +83,7 @@ def test_assembling_compiles_nothing():
     np.testing.assert_allclose(state.q, [0.3, -np.sqrt(0.4**2 - 0.3**2)], rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_first_trajectory_compiles_one_program_and_few_of_the_solver():
     """diffrax compares its own result codes before it is compiled."""
 
@@ -94,6 +96,7 @@ def test_a_first_trajectory_compiles_one_program_and_few_of_the_solver():
     assert 1 <= len(compiled) <= 4
 
 
+@pytest.mark.slow
 def test_a_motion_that_nobody_differentiates_has_the_same_numbers():
     ride, other = first_trajectory(Bead()), jax.jit(lambda x: first_trajectory(Bead(radius=x)))(0.5)
     for x, y in zip(jax.tree.leaves(ride), jax.tree.leaves(other), strict=True):
@@ -126,6 +129,7 @@ def equations(jaxpr):
     return len(jaxpr.eqns) + sum(equations(x) for x in inner if hasattr(x, "eqns"))
 
 
+@pytest.mark.slow
 def test_the_program_of_a_motion_without_events_is_small():
     """Measured, with ten per cent to spare for other releases of diffrax, whose loop most of it is."""
     system = jk.catalog.DoublePendulum(mass=1.0, length=1.0)
@@ -146,6 +150,7 @@ def _two(scale, x):
     return {"product": [scale * product, 3.0], "sum": (a + b * t, jnp.where(a > b, a, b) / 2.0), "zero": 0.0 * t}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not native.is_on(), reason="the stages are a loop without native kernels")
 def test_samples_are_looked_up_once_in_a_step():
     push = {"shoulder_torque": jk.Samples(TS, jnp.cos(TS))}

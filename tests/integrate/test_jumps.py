@@ -69,6 +69,7 @@ def closed_form(p, t):
         v, start = e * end * jnp.sqrt(1 - jnp.exp(-2 * c * top)), start + rise + down
 
 
+@pytest.mark.slow
 def test_a_bouncing_ball_with_drag():
     atol = 1e-10
     ride = drop(P)
@@ -87,6 +88,7 @@ def test_a_bouncing_ball_with_drag():
         ride.jumps.name(3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
 def test_derivatives_through_jumps(adjoint):
     """Of the state at the end and of the time of the last bounce, against the closed form.
@@ -130,6 +132,7 @@ def test_second_derivatives_through_a_jump():
     assert np.isnan(jax.jit(third)(1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [{"step": 0.01}, {"solver": diffrax.Heun(), "rtol": 1e-7, "atol": 1e-7}],
@@ -149,6 +152,7 @@ def test_an_implicit_solver():
     np.testing.assert_allclose([ride.end.q[0], ride.end.u[0]], closed_form(P, 2.0), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_each_member_of_a_batch_jumps_at_its_own_times():
     """A member equals its own simulation, beside one without jumps and one with as many as are allowed."""
     heights = jnp.array([0.01, 1.0, 30.0])
@@ -179,6 +183,7 @@ def test_any_clock_and_any_scale_of_time(t0, scale):
     np.testing.assert_allclose((np.asarray(ride.jumps.t[:3]) - t0) / scale, TIMES, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_float32():
     p = P.astype(jnp.float32)
     system = jax.tree.map(lambda x: x.astype(jnp.float32), Ball(p[3], p[2], p[1]))
@@ -213,6 +218,7 @@ def kick(t, q, u, x):
     return {"kick": jk.rising(q["x"] - 1.0, when=0.5 - x["mode"], then={"v": 2.0 * u["v"], "mode": 1.0})}
 
 
+@pytest.mark.slow
 def test_a_sample_at_the_time_of_a_jump_has_the_value_after_it():
     ride = moving(kick)
     np.testing.assert_allclose(ride["v"], np.where(np.asarray(TS) < 1.0 - 1e-9, 1.0, 2.0))
@@ -223,6 +229,7 @@ def test_a_sample_at_the_time_of_a_jump_has_the_value_after_it():
     np.testing.assert_allclose(at_end["x"], TS, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_sample_at_a_jump():
     """It does not exist if the time of the jump depends on the parameter. At a jump with a fixed time it does."""
 
@@ -239,6 +246,7 @@ def test_the_derivative_of_a_sample_at_a_jump():
     np.testing.assert_allclose(by_time, np.where(TS <= 1.0, TS, 2 * TS - 1), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_derivative_of_an_end_at_a_jump():
     """It does not exist either if the time of the jump depends on the parameter."""
 
@@ -253,6 +261,7 @@ def test_the_derivative_of_an_end_at_a_jump():
     np.testing.assert_allclose(jax.jacfwd(lambda v: end(v, True))(1.0), [2.0, -3.0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_simultaneous_events_follow_each_other_in_alphabetical_order():
     """Each reads the state that the previous one left, and counts only if it still leaves in its direction."""
 
@@ -270,6 +279,7 @@ def test_simultaneous_events_follow_each_other_in_alphabetical_order():
     np.testing.assert_allclose(ride["x"][-1], 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_two_events_almost_at_once():
     for gap in (1e-13, 1e-9):
 
@@ -285,6 +295,7 @@ def test_two_events_almost_at_once():
         assert ride.jumps.name(0) == "soon" or gap < 1e-12
 
 
+@pytest.mark.slow
 def test_a_condition():
     """Crossings while `when` is not positive have no effect, and do not hide later ones."""
 
@@ -302,6 +313,7 @@ def test_a_condition():
     np.testing.assert_allclose(ends.t_end, crossings[1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_stages_read_the_state_that_the_previous_one_left():
     def swap(t, q, u, x):
         return {"mode": u["v"], "v": 0.5 * u["v"]}
@@ -311,6 +323,7 @@ def test_stages_read_the_state_that_the_previous_one_left():
     assert float(ride["v"][-1]) == -1.5
 
 
+@pytest.mark.slow
 def test_a_start_on_zero_jumps_at_once_if_it_leaves_in_its_direction():
     def events(t, q, u, x):
         return {"wall": jk.falling(q["x"], then={"v": -u["v"]})}
@@ -321,6 +334,7 @@ def test_a_start_on_zero_jumps_at_once_if_it_leaves_in_its_direction():
     np.testing.assert_allclose(back["x"], TS, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_both_zeros_of_a_gap_in_one_step():
     """A ball that leaves the floor with 1e-7 m/s lands after 2e-8 s."""
     ride = jk.simulate(Ball(0.5, 0.0), jk.State(jnp.zeros(1), jnp.array([1e-7])), TS, max_jumps=3)
@@ -339,6 +353,7 @@ def test_a_jump_that_repeats_itself_has_a_status():
     np.testing.assert_allclose(rests.t_end, TIMES[0], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_jumps_that_accumulate_have_a_status():
     ride = drop(P.at[3].set(0.3), max_jumps=20)
     assert ride.reason == "max jumps"
@@ -346,6 +361,7 @@ def test_jumps_that_accumulate_have_a_status():
     assert "max_jumps" in repr(ride)
 
 
+@pytest.mark.slow
 def test_a_jump_at_a_discontinuity_of_an_input():
     """The push changes its sign where the ball lands."""
     samples = jk.Samples(jnp.array([0.0, TIMES[0]]), jnp.array([0.0, 2.0]), zero_order_hold=True)
@@ -358,6 +374,7 @@ def test_a_jump_at_a_discontinuity_of_an_input():
     np.testing.assert_allclose(ride.jumps.t[:2], [TIMES[0], TIMES[0] + rise + down], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_rimless_wheel_converges_to_its_gait():
     """Rate after a step: cot(2 a) sqrt(4 (g / l) sin(a) sin(gamma)); each step multiplies deviations by cos(2 a)^2."""
     rtol, a = 1e-10, 0.4
@@ -390,6 +407,7 @@ def test_a_compass_gait():
     assert ride.jumps.energy[0] > 0
 
 
+@pytest.mark.slow
 def test_the_energy_balance_over_jumps():
     """The audit counts what the impacts lose, and no work where a jump moves a mass centre."""
     p = P.at[2].set(0.0)
@@ -413,6 +431,7 @@ def test_where_jumps_cannot_be_represented(tmp_path):
         jk.export.c(Ball(), tmp_path / "ball.c", ["rates"])
 
 
+@pytest.mark.slow
 def test_a_sweep_over_parameters_with_different_numbers_of_jumps():
     heights = jnp.array([[0.5], [1.0], [9.0]])
     batch = jk.sweep.sweep(Ball(drag=0.0), jk.State(heights, jnp.zeros((3, 1))), jnp.linspace(0.0, 1.0, 5), chunk=2)
@@ -422,6 +441,7 @@ def test_a_sweep_over_parameters_with_different_numbers_of_jumps():
     np.testing.assert_allclose(batch.jumps.t[0, 1], first[0] * 2.6, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_what_jumps_cannot_do():
     def then(new):
         return lambda t, q, u, x: {"kick": jk.rising(q["x"] - 1.0, then=new)}
@@ -446,6 +466,7 @@ def test_what_jumps_cannot_do():
         np.testing.assert_allclose(ride.t_end, 1.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_jump_that_violates_a_configuration_constraint_ends_the_simulation():
     class Kicked(jk.catalog.WhippleBicycle):
         def events(self, t, q, u):
@@ -456,6 +477,7 @@ def test_a_jump_that_violates_a_configuration_constraint_ends_the_simulation():
     assert jk.simulate(bicycle, start, jnp.linspace(0.0, 1.0, 3)).reason == "impossible jump"
 
 
+@pytest.mark.slow
 def test_the_last_sample_shortly_after_a_jump():
     for late in (0.0, 1e-15, 1e-13, 1e-12, 1e-10):
         ride = drop(P, jnp.array([0.0, TIMES[0] + late]))
@@ -465,6 +487,7 @@ def test_the_last_sample_shortly_after_a_jump():
         assert float(ride["bounces"][-1]) == 1.0
 
 
+@pytest.mark.slow
 def test_an_event_that_its_jump_does_not_change_occurs_once_at_each_crossing():
     """A switch at a time, and a counter of crossings."""
 
@@ -486,6 +509,7 @@ class OverMovingFloor(Ball):
         return {"floor": jk.falling(q["h"] - floor, then=new)}
 
 
+@pytest.mark.slow
 def test_a_moving_floor_is_not_passed():
     """Small dips through zero within long steps: the motion itself is a parabola, which does not limit them."""
     ts = jnp.linspace(0.0, 5.0, 1001)

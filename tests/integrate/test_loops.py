@@ -35,6 +35,7 @@ def assert_same(fast, other):
         np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_both_loops_take_the_same_steps(name, monkeypatch):
     entry = jk.catalog.CATALOG[name]
@@ -45,6 +46,7 @@ def test_both_loops_take_the_same_steps(name, monkeypatch):
 SAMPLED = {"push": jk.Samples(np.linspace(0.0, 1.0, 5), np.array([1.0, -2.0, 0.5, 3.0, 1.0]), zero_order_hold=True)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("system", "inputs", "options"),
     [
@@ -100,6 +102,7 @@ def test_what_diffrax_supports(options):
     np.testing.assert_allclose(swing(**options), swing(), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_controller_still_ends_steps_at_events():
     control = diffrax.PIDController(rtol=1e-7, atol=1e-7, pcoeff=0.2, icoeff=0.5)
     ride = jk.simulate(Thrown(), jk.State([0.0], [1.5]), [0.0, 10.0], controller=control)
@@ -107,6 +110,7 @@ def test_a_controller_still_ends_steps_at_events():
     assert float(ride.t_end) == pytest.approx(3.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_term_for_diffrax():
     system, state = jk.catalog.DoublePendulum(), jk.State(jnp.array([1.0, -0.5]), jnp.zeros(2))
     term, args = jk.ode_term(system, {"elbow_torque": lambda t, s: 0.3 * jnp.sin(t)})

@@ -61,6 +61,7 @@ def swing(gravity, ts, **options):
     return jk.simulate(system, state, ts, rtol=1e-12, atol=1e-12, max_steps=100_000, **options)
 
 
+@pytest.mark.slow
 def test_links_pass_the_place_where_dependent_speeds_are_singular():
     ts = jnp.linspace(0.0, 2.0, 21)
     assert jk.simulate(Links(), jk.assemble(Links(), START, None), ts).reason == "singular speeds"
@@ -121,6 +122,7 @@ class Parallelogram(jk.System):
         return jk.weight(motion, -9.81 * motion.N.y)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("excess", [0.0, 1e-8])
 def test_a_third_rocker_is_redundant(excess):
     system = jk.with_multipliers(Parallelogram(excess))

@@ -56,6 +56,7 @@ def ride():
     return jk.simulate(Disc(), START, TS, step=0.1)
 
 
+@pytest.mark.slow
 def test_by_name_along_a_trajectory(ride):
     n, r = int(np.isfinite(ride["x"]).sum()), 0.5
     assert 1 < n < 5  # it ended early
@@ -83,6 +84,7 @@ def test_a_trajectory_of_no_times_is_refused(ride):
             f(Disc(), none)
 
 
+@pytest.mark.slow
 def test_at_one_time_and_in_a_batch(ride):
     where = jk.positions(Disc(), 0.0, {"x": 1.0}, {})["rim"]
     np.testing.assert_allclose(where, [1.5, 0.0, 0.0], atol=1e-15)
@@ -113,6 +115,7 @@ def test_derivatives_along_a_trajectory_that_ended():
         np.testing.assert_allclose(found, numeric, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_forces_of_constraint_along_a_trajectory_that_ended():
     """The reverse derivative of what was reached sees nothing of what was not."""
     system = DoublePendulum()
@@ -128,6 +131,7 @@ def test_forces_of_constraint_along_a_trajectory_that_ended():
     assert np.isfinite(slope(1.0, cut))
 
 
+@pytest.mark.slow
 def test_equations_without_a_solution_are_an_error_at_one_time():
     """Three hinges that lock: every function that solves for accelerations says so, and is NaN under a trace."""
     hinges = [hinge("x", (1.0, 0.0, 0.0)), hinge("y", (0.0, 1.0, 0.0)), hinge("z")]
@@ -162,6 +166,7 @@ class Coupled(jk.System):
         return jk.Force(6.0 * motion.N.x, motion["one"])
 
 
+@pytest.mark.slow
 def test_where_the_force_of_a_residual_is_read():
     forces = jk.constraint_forces(Coupled(), 0.0, {"y": 1.0}, {})  # 6 N move 3 kg: 2 kg of them by 4 N
     for name, force in {"A": -4.0, "B": 4.0, "twice": 0.0}.items():
@@ -198,6 +203,7 @@ def test_motions_of_the_same_names_are_taken(ride):
     refuse_other_system("f", Disc(radius=0.1), ride)
 
 
+@pytest.mark.slow_cases("jaxkane.speed_rates", "jaxkane.fit.base_parameters")
 @pytest.mark.parametrize("name", OF_A_TRAJECTORY)
 def test_every_public_function_refuses_the_motion_of_another_system(ride, name):
     f, other = OF_A_TRAJECTORY[name], type("Other", (Disc,), OTHERS["inputs"])()

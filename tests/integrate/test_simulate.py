@@ -116,6 +116,7 @@ class Wheel(jk.System):
         return jk.Torque(inputs["torque"] * motion.N.y, motion["wheel"])
 
 
+@pytest.mark.slow
 def test_a_controller_reads_the_state_by_name():
     """A coordinate, a speed and a dependent speed: 1.5 x'' = -3 x - 0.6 x', by the matrix exponential."""
 
@@ -130,6 +131,7 @@ def test_a_controller_reads_the_state_by_name():
     np.testing.assert_allclose(ride["torque"], -3.0 * x - 0.6 * x_dot, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_statuses():
     few = jk.simulate(PENDULUM, START, TS, max_steps=5)
     assert few.status == jk.Status.MAX_STEPS
@@ -174,6 +176,7 @@ def bicycle_for_a_second():
     return of
 
 
+@pytest.mark.slow
 def test_how_bicycles_end(bicycle_for_a_second):
     """A roll beyond 78 degrees is a fall. Steered to 1.6 rad it is just beside 91.77 degrees, where for the upright
     bicycle the dependent speeds are singular."""
@@ -228,6 +231,7 @@ def test_gradients_of_a_simulation_against_central_differences(torque, forward, 
 NAMES = {"auto": "ForwardMode", "both": "DirectAdjoint", "reverse": "RecursiveCheckpointAdjoint"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("adjoint", "mode"),
     [
@@ -274,6 +278,7 @@ def test_a_derivative_forward_of_what_was_compiled_before_says_what_to_do():
     np.testing.assert_allclose(seen, alone[None], rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["reverse over reverse", "reverse of forward", "reverse over forward"])
 def test_derivatives_in_reverse_mode_that_do_not_exist_say_what_to_do(mode):
     def read(rate, **options):
@@ -294,6 +299,7 @@ def test_a_state_that_is_not_finite_is_refused_by_name():
         jk.simulate(Pendulum(), jk.State([np.nan], [0.0]), TS)
 
 
+@pytest.mark.slow
 def test_a_state_of_two_types_has_the_wider_one():
     state = jk.State(jnp.array([0.4], jnp.float32), jnp.array([0.1]))
     assert jk.simulate(Pendulum(), state, TS[:3], step=0.05, max_steps=4).q.dtype == jnp.float64
@@ -336,6 +342,7 @@ def test_float32_and_what_follows_from_it():
     np.testing.assert_allclose(np.asarray(ride.q), np.asarray(reference.q), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_another_accuracy_compiles_nothing():
     coarse, fine = (jk.simulate(PENDULUM, START, TS, step=x) for x in (0.1, 0.05))
     programs = len(solve.programs)
@@ -347,6 +354,7 @@ def test_another_accuracy_compiles_nothing():
     assert len(solve.programs) <= programs + 1
 
 
+@pytest.mark.slow
 def test_under_jit_and_vmap():
     run = lambda u: jk.simulate(PENDULUM, jk.State(START.q, u), TS)  # noqa: E731
     us = jnp.array([[0.0, 0.3], [1.0, -1.0]])
@@ -357,6 +365,7 @@ def test_under_jit_and_vmap():
     np.testing.assert_allclose(rides.q[1], run(us[1]).q, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_going_on_from_where_a_ride_ended():
     whole = jk.simulate(PENDULUM, START, TS, rtol=1e-11, atol=1e-11)
     first = jk.simulate(PENDULUM, START, TS[:6], rtol=1e-11, atol=1e-11)
@@ -364,6 +373,7 @@ def test_going_on_from_where_a_ride_ended():
     np.testing.assert_allclose(second.q[-1], whole.q[-1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_times_and_samples_that_cannot_be_are_told_under_a_trace():
     """Where no check sees the numbers."""
     kinds = (False, True)
@@ -475,6 +485,7 @@ def test_a_step_that_ends_beside_a_sample():
     assert sampled.stats["accepted"] < 4 * len(ts)
 
 
+@pytest.mark.slow
 def test_a_motion_that_ends_at_a_sample_with_others_behind_it():
     """The last step ended a rounding error before that sample, which then was never reached: NaN, and "completed"."""
     ts, start = jnp.linspace(0.0, 2.5, 51), jk.State(jnp.array([0.1]), jnp.zeros(1))

@@ -66,6 +66,7 @@ def ride(cart):
     return jk.simulate(cart, START, ts, {"command": 5.0})
 
 
+@pytest.mark.slow
 def test_the_exact_motion_of_a_linear_system(cart, ride):
     A, B = matrices(cart)
     augmented = np.block([[A, 5.0 * B], [np.zeros((1, 5))]])
@@ -82,6 +83,7 @@ def test_the_exact_motion_of_a_linear_system(cart, ride):
     np.testing.assert_allclose(again["force"][-1], ride["force"][-1], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_what_is_asked_at_one_time(cart, ride):
     at = (0.3, [0.1], [0.5], {"force": 2.0, "command": 1.0, "filtered": 0.4})
     assert float(jk.accelerations(cart, *at)[0]) == pytest.approx((2.0 - 3.0) / 2.0)
@@ -147,6 +149,7 @@ def test_linear_models_and_steady_motions(cart):
         linearize(cart, jk.State([0.1], [0.0], [3.0, 0.0]), {"command": 5.0})
 
 
+@pytest.mark.slow
 def test_a_controller_reads_a_state(cart):
     ride = jk.simulate(cart, START, ts, lambda t, state: {"command": -2.0 * state["force"] + state.x[1]})
     np.testing.assert_allclose(ride["command"], -2.0 * ride["force"] + ride["filtered"], atol=1e-12)
@@ -264,6 +267,7 @@ def variant(**members):
     return type("Variant", (Cart,), members)()
 
 
+@pytest.mark.slow_cases(all_but=["members10-*", "members4-*", "members11-*"])
 @pytest.mark.parametrize(
     ("members", "message"),
     [

@@ -25,6 +25,7 @@ def test_a_solver_without_an_estimate_of_its_error_asks_for_a_step():
         jk.simulate(system, state, jnp.linspace(0.0, 0.5, 3), solver=diffrax.SemiImplicitEuler(), step=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [diffrax.Heun(), pytest.param(diffrax.Kvaerno3(), marks=pytest.mark.slow)])
 def test_half_steps_have_the_tolerances_and_the_derivatives_of_the_method(method):
     _, state = pendulum()
@@ -40,6 +41,7 @@ def test_half_steps_have_the_tolerances_and_the_derivatives_of_the_method(method
     assert float(slope) == pytest.approx(float(exact_slope), abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), diffrax.ImplicitEuler()])
 def test_implicit_steps_of_one_length(solver):
     system, state = pendulum()
@@ -74,6 +76,7 @@ def controller(duration, step=None, first=0.01, tolerance=1e-7, discontinuities=
     return StepSizeController(tolerance, tolerance, step, first, longest, duration, discontinuities, None, none)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "adjoint", "step"),
     [
@@ -146,6 +149,7 @@ class Oscillator(jk.System):
 AT_REST = jk.State([1.0], [0.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
 def test_a_fixed_step_to_what_is_no_number_ends_the_motion(adjoint):
     """As one with tolerances: with a reason, and derivatives that are NaN where there is no motion."""
@@ -169,6 +173,7 @@ def test_a_fixed_step_to_what_is_no_number_ends_the_motion(adjoint):
     np.testing.assert_allclose(first, [np.sin(1.0) / 2, np.nan], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_as_many_steps_as_are_allowed():
     system, state = pendulum()
     ride = lambda most: jk.simulate(system, state, [0.0, 0.5], max_steps=most)  # noqa: E731
@@ -186,6 +191,7 @@ class Growth(Oscillator):
         return [x[0] ** 2 + 1.0]
 
 
+@pytest.mark.slow
 def test_an_implicit_step_without_a_solution_ends_the_motion():
     """Of y = y0 + h (y^2 + 1), for h = 1."""
     state = jk.State([1.0], [0.0], [0.0])
@@ -193,6 +199,7 @@ def test_an_implicit_step_without_a_solution_ends_the_motion():
         jk.simulate(Growth(), state, [0.0, 1.0, 2.0], step=1.0, solver=diffrax.ImplicitEuler())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not native.is_on(), reason="XLA alone leaves out a term for the time that it takes to compile")
 def test_the_derivative_of_an_event_early_in_a_long_motion():
     def end(level):
@@ -209,6 +216,7 @@ def _of_the_first(x, y):
     return jnp.sin(x) + 1.0
 
 
+@pytest.mark.slow
 def test_what_a_program_does_not_read_is_not_computed_for_it(native):
     def f(x):
         return _of_the_first(x, jnp.exp(x))
@@ -228,6 +236,7 @@ def _doubled_if_positive(x):
     return jnp.where(positive, 2.0 * x, x), positive
 
 
+@pytest.mark.slow
 def test_a_program_that_also_tells_what_is_true_has_derivatives(kernels):
     value = lambda x: _doubled_if_positive(x)[0]  # noqa: E731
     for x, slope in ((0.7, 2.0), (-0.7, 1.0)):
@@ -238,6 +247,7 @@ def test_a_program_that_also_tells_what_is_true_has_derivatives(kernels):
     np.testing.assert_array_equal(jax.jit(jax.vmap(jax.grad(value)))(jnp.array([-1.0, 1.0])), [1.0, 2.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jacobian", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 def test_the_last_time_and_the_first_have_derivatives(jacobian):
     system, state = pendulum()
@@ -252,6 +262,7 @@ def test_the_last_time_and_the_first_have_derivatives(jacobian):
     np.testing.assert_allclose(slopes[:, 0], -u_end, rtol=1e-6)  # where nothing depends on the time itself
 
 
+@pytest.mark.slow
 def test_a_step_ends_at_a_discontinuity_or_leaves_half_of_the_way_to_it():
     stops = Discontinuities(jnp.array([0.5, 1.0]), jumps=False, restart=False)
     for length in (0.1, 0.3, 0.5 - 1e-9, 0.5, 0.7, 1.2):
@@ -260,6 +271,7 @@ def test_a_step_ends_at_a_discontinuity_or_leaves_half_of_the_way_to_it():
         assert end == 0.5 or end == min(length, 0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ["forward", "reverse"])
 def test_a_motion_that_cannot_begin_takes_no_steps(adjoint):
     """Beside one that can: a body with a negative mass, and a parameter that is no number."""

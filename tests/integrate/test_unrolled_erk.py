@@ -38,6 +38,7 @@ def motion(solver, jump, args):
 
 
 # FSAL with a jump, after which the first stage is made anew; one that is neither FSAL nor SSAL.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "jump"), [(diffrax.Tsit5, True), pytest.param(diffrax.Dopri8, False, marks=pytest.mark.slow)]
 )
@@ -53,6 +54,7 @@ def test_the_same_steps_numbers_and_derivatives(method, jump):
     np.testing.assert_allclose(other_slope, slope, rtol=rtol, atol=rtol)
 
 
+@pytest.mark.slow
 def test_they_are_written_out_where_the_right_hand_side_is_a_native_kernel(native):
     system = jk.catalog.DoublePendulum(mass=1.0, length=0.7)
     y = packed(jk.State(jnp.zeros(2), jnp.zeros(2)))
@@ -78,6 +80,7 @@ class Rod(jk.System):
         return jk.weight(motion, -9.81 * motion.N.y)
 
 
+@pytest.mark.slow
 def test_a_member_without_mass_leaves_the_gradient_of_the_others():
     def ends(length, masses):
         start, ts = jk.State({"angle": 0.3}, {}), jnp.linspace(0.0, 0.5, 3)

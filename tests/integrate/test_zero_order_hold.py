@@ -50,6 +50,7 @@ def test_the_exact_motion_and_its_derivative_by_a_delay():
     assert float(reverse) == pytest.approx(float(slope[-1]), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_steps_of_one_length_that_end_at_the_samples():
     push = jk.Samples(ts, values, zero_order_hold=True)
     ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())
@@ -59,6 +60,7 @@ def test_steps_of_one_length_that_end_at_the_samples():
     np.testing.assert_allclose(ride["place"], [place(t, 0.0) for t in ts], atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_steps_of_one_length_have_a_derivative_by_values_and_none_by_times(mode):
     def end(delay, factor):
@@ -70,6 +72,7 @@ def test_steps_of_one_length_have_a_derivative_by_values_and_none_by_times(mode)
     assert np.isnan(mode(end)(0.0, 1.0))
 
 
+@pytest.mark.slow
 def test_a_rejected_step_behind_a_jump_begins_anew():
     """Its first stage is not the last one before the jump, for the step that is repeated neither."""
     system, state = jk.catalog.DoublePendulum(), jk.State([0.5, -0.2], [0.7, 1.0])
@@ -136,6 +139,7 @@ def end_with(system, push):
     return ride["place"][-1]
 
 
+@pytest.mark.slow
 def test_a_delay_inside_a_function_has_its_derivative():
     rtol, h = 1e-8, 1e-6
     slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
@@ -228,6 +232,7 @@ class Two(Cart):
         return jk.Force((inputs["push"] - 2.0 * inputs["pull"]) * motion.N.x, motion["cart"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shift", "slope"), [(0.0, np.nan), (0.05, values[0] - values[4])], ids=["same", "other"])
 @pytest.mark.parametrize("mode", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
 def test_jumps_of_two_signals_at_one_time_have_no_silent_derivative(mode, shift, slope):

@@ -55,6 +55,7 @@ def test_both_forms_agree(name, monkeypatch):
     jax.tree.map(close, *found)
 
 
+@pytest.mark.slow
 def test_both_forms_agree_in_reverse(monkeypatch):
     system, t, q, u, inputs = SYSTEMS["double pendulum"]()
     found = []
@@ -84,6 +85,7 @@ def test_a_long_chain_keeps_its_energy():
     assert float(jnp.abs(ride.q[-1] - ride.q[0]).max()) > 0.3
 
 
+@pytest.mark.slow
 def test_the_work_grows_with_the_number_of_links():
     def operations(n):
         leaves, treedef = jax.tree.flatten((*at(Chain(n=n), n), jnp.ones(n)))

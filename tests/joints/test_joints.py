@@ -90,6 +90,7 @@ def tree_of_all_joints():
     )
 
 
+@pytest.mark.slow
 def test_a_tree_of_every_joint_accelerates_as_in_mujoco():
     system = tree_of_all_joints()
     for state in FIGURES["states"]:
@@ -98,6 +99,7 @@ def test_a_tree_of_every_joint_accelerates_as_in_mujoco():
         np.testing.assert_allclose(u_dot, state["u_dot"], rtol=RTOL, atol=RTOL * np.abs(state["u_dot"]).max())
 
 
+@pytest.mark.slow
 def test_two_hinges_are_the_double_pendulum_of_the_catalogue():
     m, l = 1.3, 0.7
     bar = {"mass": m, "center": (0, -l / 2, 0), "inertia": (m * l**2 / 12, 0, m * l**2 / 12)}
@@ -111,6 +113,7 @@ def test_two_hinges_are_the_double_pendulum_of_the_catalogue():
     np.testing.assert_allclose([angles[0], angles[0] + angles[1]], rates, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_armature_stands_on_the_diagonal_of_the_mass_matrix_and_nowhere_else():
     chain = [
         Link("a", None, free("r", armature=0.3), **BAR),
@@ -128,6 +131,7 @@ def test_armature_stands_on_the_diagonal_of_the_mass_matrix_and_nowhere_else():
     np.testing.assert_allclose(f, f0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_planar_joint_and_a_universal_joint_move_as_their_parts():
     disk = Link("disk", None, planar("p", ((0, 0, 1), (1, 0, 0)), damping=0.4), mass=2.0, inertia=(0.2, 0.3, 0.2))
     system = mechanism([disk], gravity=(0, 0, -9.0), actuators=[Actuator("F", "p_x"), Actuator("T", "p_angle")])
@@ -202,6 +206,7 @@ def four_bar(across=0.0, **more):
     return mechanism(links, gravity=(0, 0, 0), sites=sites, loops=[Loop("ground", "end")], **more)
 
 
+@pytest.mark.slow
 def test_a_four_bar_linkage_accelerates_as_in_sympy():
     system = four_bar(dependent=("q2", "q3"))
     assert system.dependent_speeds == ("q2_rate", "q3_rate")  # of three residuals two, since it lies in a plane
@@ -222,6 +227,7 @@ def test_what_is_dependent_is_found_and_may_be_assembled():
     np.testing.assert_allclose(found.q, [state["q"][c] for c in system.coordinates], rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kept", ["q1", "q2", "q3"])
 def test_a_named_joint_is_independent(kept):
     pose = FOUR_BAR["states"][0]["q"]
@@ -289,6 +295,7 @@ def test_a_rigid_loop_is_a_body():
     np.testing.assert_allclose(rate[speed], jk.accelerations(both, 0.0, [0.4], [0.9])[0], rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "turned", [(1.0, 0.0, 0.0, 0.0), (0.0, 0.6, -0.8, 0.0), (0.5, 0.5, 0.5, 0.5), (0.0, 0.0, 0.0, 1.0)]
 )
@@ -311,6 +318,7 @@ def test_a_turned_weld_holds_in_one_orientation_only(turned):
         np.testing.assert_allclose(Q.position_from(P).to(A), 0.0, rtol=0, atol=TOLERANCE)
 
 
+@pytest.mark.slow
 def test_a_rigid_loop_in_a_plane_is_not_closed_half_a_turn_away():
     links = [Link("a", None, hinge("a"), mass=1.0), Link("b", "a", hinge("b"), (0.5, 0.0, 0.0), mass=1.0)]
     links.append(Link("c", "b", hinge("c"), (0.5, 0.0, 0.0), mass=1.0))
@@ -387,6 +395,7 @@ def test_a_mechanism_is_swept_by_the_names_of_its_parameters():
     np.testing.assert_allclose(sweep.trajectory.q[1], one.q, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_mechanism_may_be_made_of_traced_numbers():
     def alpha(mass):
         bar = Link("a", None, hinge("q", (0, 1, 0)), mass=mass, center=(0.2, 0, 0), inertia=(0.1, 0.1, 0.1))
@@ -547,6 +556,7 @@ def test_half_a_turn_away_a_weld_is_open():
             jk.simulate(welded, jk.State(q, np.zeros(0)), np.linspace(0.0, 1.0, 3))
 
 
+@pytest.mark.slow
 def test_a_coordinate_that_is_named_stays_though_the_library_chose_it_as_dependent():
     system = crank_with_slider(1.0)
     first, second = system.dependent_coordinates

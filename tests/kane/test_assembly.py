@@ -47,6 +47,7 @@ class Plane(jk.System):
         return [q["y"] - self.height - q["x"] ** 2]
 
 
+@pytest.mark.slow
 def test_what_is_named_is_held_and_other_orientations_are_none(balls):
     for given in ({"a4": 1.0}, {"x": 2.0, "a1": 0.0}):
         expected = np.array([given.get("x", 0.0), 0.0, 0.0, *IDENTITY, *IDENTITY])
@@ -76,6 +77,7 @@ def test_what_is_named_and_contradicts_the_constraints_is_refused(balls):
     np.testing.assert_allclose(everything, [1.0, 0, 0, *IDENTITY, 0, 0, 0.6, 0.8], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_is_left_out_is_found():
     np.testing.assert_allclose(jk.assemble(Plane(), {"x": 2.0, "angle": 0.5}).q, [2.0, 5.0, 0.5], atol=1e-15)
     np.testing.assert_allclose(
@@ -89,6 +91,7 @@ def test_what_is_left_out_is_found():
     np.testing.assert_array_equal(jk.assemble(OnACircle(), {"x": 0.6, "y": 0.8}, free=()).q, [0.6, 0.8])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [{"x": 2.0}, {"x": 1.0}])  # no such place; a place where y has no derivative
 def test_the_derivatives_of_what_is_not_found_are_nan(given):
     found = jax.jit(lambda x: jk.assemble(OnACircle(), {"x": x}).q[1])
@@ -114,6 +117,7 @@ def test_one_that_is_not_found_leaves_the_others_as_they_are():
     np.testing.assert_allclose(mean, [-0.375, 0, 0, 0, 0], atol=1e-14)
 
 
+@pytest.mark.slow
 def test_parameters_move_what_is_found():
     def y(height):
         return jk.assemble(Plane(height=height), {"x": 2.0}).q
@@ -122,6 +126,7 @@ def test_parameters_move_what_is_found():
     np.testing.assert_allclose(jax.jit(jax.jacrev(y))(1.0), [0.0, 1.0, 0.0], atol=1e-14)
 
 
+@pytest.mark.slow
 def test_euler_parameters_among_many_coordinates():
     """120 quaternions between 120 other coordinates: with one random point, some of 600 windows matched by accident."""
 

@@ -179,6 +179,7 @@ class TwoHingesOnOneAxis(jk.System):
         return jk.Torque(self.scale * (0.1 * motion.N.x + 0.4 * motion.N.z), motion.bodies[1].frame)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_mass_matrix_that_is_singular_but_for_rounding(many):
     system = TwoHingesOnOneAxis(many=many)
@@ -276,6 +277,7 @@ ASKED = {
 }
 
 
+@pytest.mark.slow_cases(all_but=["assemble"])
 @pytest.mark.parametrize("asked", ASKED.values(), ids=ASKED)
 def test_one_rule_for_inertias_that_no_body_can_have(asked):
     with warnings.catch_warnings():
@@ -420,6 +422,7 @@ def test_shapes_and_names():
         jk.accelerations(bike, 0.0, {"lean": 0.1}, u)
 
 
+@pytest.mark.slow
 def test_assemble_says_when_it_cannot():
     bike = WhippleBicycle.benchmark()
     with pytest.raises(ValueError, match=r"constraints do not determine pitch with roll = 1\.571"):
@@ -455,6 +458,7 @@ def test_assemble_is_differentiable_twice_and_maps():
     assert np.isnan(many[1:]).all()  # under a trace there is nobody to raise to
 
 
+@pytest.mark.slow
 def test_assemble_and_simulate_in_one_program():
     bead = Bead(ends=False)
 
@@ -522,6 +526,7 @@ class Coincident(jk.System):
         return jk.loads.spring(motion["O"], motion["P"], 3.0, self.length)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [lambda f: f, jax.grad, jax.jacfwd])
 def test_a_force_without_direction_is_refused_under_derivatives_too(derivative):
     def end(length):

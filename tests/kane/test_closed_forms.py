@@ -10,6 +10,7 @@ from jaxkane._kane.kanes_method import KaneEquations
 from jaxkane.catalog import CATALOG
 
 
+@pytest.mark.slow
 @pytest.mark.many_steps
 def test_steady_precession_of_the_top():
     # About O, with I_O = I + m L^2 and the axis at the angle theta from the vertical (Goldstein, section 5.7):
@@ -29,6 +30,7 @@ def test_steady_precession_of_the_top():
     np.testing.assert_allclose(jnp.arccos(z), theta, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_VC_dot_of_the_bicycle_and_the_books_order_of_products():
     # Example 7, [VC-dot]: in its second and third lines the products stand in the wrong order, R_B2C and [J] are
     # missing. Right is the expression of [VD-dot], with C in the place of D.

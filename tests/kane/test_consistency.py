@@ -224,6 +224,7 @@ def test_a_velocity_residual_that_contradicts_the_configuration():
         jk.assemble(OnACircle(0.5), {"x": 0.6, "y": 0.7})
 
 
+@pytest.mark.slow
 def test_rates_of_euler_parameters_that_leave_the_constraint():
     class Top(jk.System):
         factor: float = eqx.field(static=True)
@@ -346,6 +347,7 @@ def test_what_asks_for_the_value_of_what_is_traced(ask, error, method):
     assert "jax.errors" in str(caught.value.__cause__)
 
 
+@pytest.mark.slow
 def test_constraints_are_numbers_and_vectors_however_nested():
     class Nested(Slider):
         speeds, dependent_speeds = ("x_dot",), ("angle_dot",)
@@ -403,6 +405,7 @@ def test_methods_without_a_return():
 # -- dependent speeds that no residual holds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [1, 2])
 def test_a_residual_that_its_dependent_speed_does_not_enter(k):
     class Blind(jk.System):

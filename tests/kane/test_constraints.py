@@ -32,6 +32,7 @@ def test_a_minute_of_a_four_bar_linkage():
     assert projected.energy_balance < 1e-5
 
 
+@pytest.mark.slow
 def test_the_nearest_coordinates_that_meet_the_constraints():
     """Of Euler parameters those of the same direction."""
     entry = jk.catalog.CATALOG["SpinningTop"]
@@ -70,6 +71,7 @@ def test_a_projected_motion_has_gradients_also_where_it_ends_early():
     np.testing.assert_allclose(jax.jacfwd(place)(top.gravity, True, steps // 2), held, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_best_dependent_speeds_of_the_bicycle():
     bicycle = jk.catalog.WhippleBicycle.benchmark()
     upright = best_dependent_speeds(bicycle, 0.0, jk.assemble(bicycle, {}).q)
@@ -234,6 +236,7 @@ class Repeated(jk.System):
         return [h, 2.0 * h, 0.0 * q["z"]]
 
 
+@pytest.mark.slow
 def test_residuals_that_repeat_or_vanish_are_projected_with_derivatives():
     q = jnp.array([0.6001, 0.8001, 0.3])
 
@@ -251,6 +254,7 @@ def test_residuals_that_repeat_or_vanish_are_projected_with_derivatives():
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=1e-9), found, expected)
 
 
+@pytest.mark.slow
 def test_a_simulation_is_led_back_where_residuals_repeat():
     state = jk.State(jnp.array([0.6, -0.8, 0.0]), jnp.array([1.0, 0.5]))
     ts = jnp.linspace(0.0, 1.0, 3)

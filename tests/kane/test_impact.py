@@ -88,6 +88,7 @@ PINOCCHIO = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [pytest.param(x, marks=[pytest.mark.slow] * (x[0] > "3")) for x in PINOCCHIO])
 def test_impulses_of_pinocchio(case):
     q, before, residuals, e, u, p = PINOCCHIO[case]
@@ -117,6 +118,7 @@ class Massless(CompassGait):
     leg_mass: Scalar = parameter(0.0)
 
 
+@pytest.mark.slow
 def test_heel_strike_of_the_compass_gait():
     # the periodic gait at a slope of 3 degrees; the legs have not been exchanged yet
     walker = CompassGait()
@@ -129,6 +131,7 @@ def test_heel_strike_of_the_compass_gait():
     np.testing.assert_allclose(after.energy_lost, before - exchanged, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_walker_that_does_not_release_its_foot_stops():
     after = jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe)
     np.testing.assert_allclose(after.u, 0.0, atol=RTOL)
@@ -162,6 +165,7 @@ def over_kerb(hoop, release=("ground",)):
     return jk.impact(hoop, 0.0, [0.0, 0.0, 0.35], [4.5], edge, release=release)
 
 
+@pytest.mark.slow
 def test_a_hoop_strikes_a_kerb():
     # Angular momentum about the edge. The velocity residuals of the road are released.
     after = over_kerb(Hoop())
@@ -173,6 +177,7 @@ def test_a_hoop_strikes_a_kerb():
     np.testing.assert_allclose(over_kerb(Hoop(), release=()).u, 0.0, atol=RTOL)
 
 
+@pytest.mark.slow
 def test_a_struck_slider_crank_stays_closed():
     system = SliderCrank()
     q = jk.assemble(system, {"crank": 0.9, "rod": -0.3, "x": 0.5}, {}).q
@@ -245,6 +250,7 @@ def both_corners(t, q, u, motion):
     return *left(t, q, u, motion), *in_plane("right")(t, q, u, motion)
 
 
+@pytest.mark.slow
 def test_both_corners_of_a_block_stick():
     """Four residuals have the rank 3. Impulses are those of the pseudo-inverse."""
     after = jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, both_corners)
@@ -258,6 +264,7 @@ def test_both_corners_of_a_block_stick():
     np.testing.assert_allclose(slopes, -np.linalg.pinv(C.T) @ M, rtol=0, atol=RTOL)
 
 
+@pytest.mark.slow
 def test_a_repeated_residual_shares_its_impulse():
     once = jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda *args: left(*args)[1], 0.5)
     twice = jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda *args: left(*args)[1:] * 2, 0.5)
@@ -267,6 +274,7 @@ def test_a_repeated_residual_shares_its_impulse():
     np.testing.assert_allclose(twice.impulses, 0.5 * np.repeat(once.impulses, 2), rtol=RTOL)
 
 
+@pytest.mark.slow
 def test_residuals_that_contradict_each_other():
     def after(u, e):
         return jk.impact(Block(), 0.0, FALLS_Q, u, lambda *a: left(*a)[1:] * 2, (0.5, e)).u
@@ -294,6 +302,7 @@ class Bat(jk.System):
         return u["v"] - self.speed * t
 
 
+@pytest.mark.slow
 def test_restitution_is_relative_to_a_moving_surface():
     bat, t = Bat(), 2.0
     after = jk.impact(bat, t, [0.0], {"v": -4.0}, bat.gap_rate, 0.7)
@@ -314,6 +323,7 @@ class Carried(jk.System):
         return jk.Motion([jk.Body(2.0, 0.0, pivot.fixed(-1.5 * B.y), name="bob")])
 
 
+@pytest.mark.slow
 def test_a_prescribed_pivot_keeps_its_velocity():
     system, q, u, t = Carried(), [0.4], [1.3], 0.8
     after = jk.impact(system, t, q, u, lambda t, q, u, m: m["bob"].center.velocity.dot(m.N.x), 0.25)
@@ -352,6 +362,7 @@ def test_a_released_hinge_leaves_a_free_body():
     np.testing.assert_allclose(after.energy_lost, free.energy_lost, rtol=RTOL)
 
 
+@pytest.mark.slow
 def test_a_released_point_that_already_moves_stays_with_its_speeds():
     """Its auxiliary speeds along x and y have the same partial velocities as the speeds."""
     free, released = (jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, left, release=x) for x in ((), ("center",)))
@@ -365,6 +376,7 @@ def strike(x, e, leg, q):
     return jnp.concatenate([after.u, after.impulses, after.energy_lost[None]])
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     # central differences; truncation h^2 = 1e-10
     point = STRIKE_U, jnp.array(0.3), jnp.array(5.0), STRIKE_Q
@@ -378,6 +390,7 @@ def test_derivatives_are_those_of_differences():
             np.testing.assert_allclose(a[(..., *place)], (high - low) / (2 * h), rtol=0, atol=1e-8 * np.abs(a).max())
 
 
+@pytest.mark.slow
 def test_a_batch_equals_its_members():
     us = STRIKE_U[None] + jnp.array([[0.0, 0.0], [0.3, -0.1], [-0.2, 0.4]])
     e = jnp.array([0.0, 0.5, 1.0])
@@ -391,6 +404,7 @@ def test_an_elastic_impact_loses_no_energy():
     assert abs(after.energy_lost) < RTOL * jk.kinetic_energy(CompassGait(), 0.0, STRIKE_Q, STRIKE_U)
 
 
+@pytest.mark.slow
 def test_float32_stays_float32():
     walker = jax.tree.map(lambda x: x.astype(jnp.float32), CompassGait())
     after = jk.impact(walker, 0.0, STRIKE_Q.astype(jnp.float32), STRIKE_U.astype(jnp.float32), toe, 0.3, ("foot",))
@@ -416,6 +430,7 @@ class Train(jk.System):
         return jk.Motion([jk.Body(1.0 + i, 0.0, P) for i, P in enumerate(points.values())], points=points)
 
 
+@pytest.mark.slow
 def test_many_speeds():
     u = np.linspace(-1.0, 2.0, 13)
     after = jk.impact(Train(), 0.0, np.ones(13), u, lambda t, q, u, m: m["P5"].velocity.dot(m.N.x), 0.2)
@@ -426,6 +441,7 @@ def test_many_speeds():
     np.testing.assert_allclose(after.energy_lost, 3.0 * (1 - 0.2**2) * np.sum(u[:6]) ** 2, rtol=1e-11)
 
 
+@pytest.mark.slow_cases(all_but=["hoop"])
 @pytest.mark.parametrize("case", ["walker", "block", "hoop", "singular"])
 def test_arrays_equal_written_out_scalars(case, monkeypatch):
     cases = {

@@ -30,6 +30,7 @@ class BeadOnTurningRod(jk.System):
         return jk.Force((inputs["push"] - self.stiffness * q["x"]) * motion["rod"].x, motion["bead"])
 
 
+@pytest.mark.slow
 def test_prescribed_motion():
     bead = BeadOnTurningRod(mass=2.0, stiffness=3.0, rate=0.7)
     t, x = 1.3, 0.4
@@ -60,6 +61,7 @@ class CartesianPendulum(jk.System):
         return [q["x"] ** 2 + q["y"] ** 2 - self.length**2]
 
 
+@pytest.mark.slow
 def test_a_closed_loop_moves_as_the_pendulum_in_its_angle():
     loop = CartesianPendulum(length=1.3)
     state = jk.assemble(loop, {"x": 0.5, "y": -1.0}, {"x_dot": 0.8})
@@ -92,6 +94,7 @@ class RollingCoin(jk.System):
         return jk.Motion([body], [contact.dot(N.x) - self.belt * t])
 
 
+@pytest.mark.slow
 def test_a_residual_with_a_term_in_time_is_affine_not_only_linear():
     coin = RollingCoin(belt=3.0)
     at = (coin, 2.0, [0.3, 0.1], [1.5])
@@ -102,6 +105,7 @@ def test_a_residual_with_a_term_in_time_is_affine_not_only_linear():
     np.testing.assert_allclose(jk.dependent_accelerations(*at), [0.5 * spin_dot + 3.0], rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_results_add_up_to_kanes_equations():
     bike = WhippleBicycle.benchmark()
     state = jk.assemble(bike, {"roll": 0.1, "steer": 0.2}, {"rear_wheel_rate": -10.0, "roll_rate": 0.3})
@@ -130,6 +134,7 @@ SYSTEMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_derivatives_in_every_argument_both_modes_and_twice(name):
     """Parameters, time, state and inputs, against central differences."""
@@ -166,6 +171,7 @@ def test_derivatives_in_every_argument_both_modes_and_twice(name):
     np.testing.assert_allclose(second, numeric, atol=1e-5 * float(jnp.abs(second).max()))
 
 
+@pytest.mark.slow
 def test_eager_jit_and_vmap_agree():
     pendulum = DoublePendulum()
     q = jnp.array([[0.4, -0.7], [1.2, 0.1], [0.0, 3.0]])
@@ -187,6 +193,7 @@ def test_a_batch_of_parameters():
     np.testing.assert_allclose(jax.vmap(f)(masses), jnp.stack([f(m) for m in masses]), rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_float32_stays_float32():
     pendulum = jax.tree.map(lambda x: x.astype(jnp.float32), DoublePendulum())
     q, u = jnp.array([0.4, -0.7], jnp.float32), jnp.array([0.9, 0.3], jnp.float32)

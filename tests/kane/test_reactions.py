@@ -33,6 +33,7 @@ def moving(name):
     return entry.example(), jnp.array(entry.q), jnp.array(entry.u)
 
 
+@pytest.mark.slow
 def test_wheel_loads_of_the_benchmark_bicycle_at_rest():
     # Meijaard et al. (2007), Table 1, by the lever rule; N.z points down, and the ground pushes up
     bicycle = jk.catalog.WhippleBicycle.benchmark()
@@ -42,6 +43,7 @@ def test_wheel_loads_of_the_benchmark_bicycle_at_rest():
     np.testing.assert_allclose(forces["Q"], [0.0, 0.0, -309.303529411765], rtol=1e-13, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_wheel_forces_of_the_moving_bicycle_balance_its_momentum():
     bicycle, q, u = moving("WhippleBicycle")
     inputs = {"roll_torque": 2.0, "drive_torque": -5.0, "steer_torque": 1.5}
@@ -78,6 +80,7 @@ class Disc(jk.System):
         return jk.weight(motion, 9.81 * motion.N.z)
 
 
+@pytest.mark.slow
 def test_contact_force_of_a_disc_is_the_sum_at_its_contact_and_at_the_ground():
     disc, q, u = Disc(), jnp.array([0.2, 0.1, 0.0, 0.0, 0.0]), jnp.array([0.5, -0.4, 2.0])
     forces = constraint_forces(disc, 0.0, q, u)
@@ -86,6 +89,7 @@ def test_contact_force_of_a_disc_is_the_sum_at_its_contact_and_at_the_ground():
     np.testing.assert_allclose(forces["contact"], [*whole[:2], 0.0], rtol=RTOL, atol=10 * RTOL)
 
 
+@pytest.mark.slow
 def test_joint_forces_of_a_pendulum_are_newtons():
     # By hand: link 2 is carried at A, both at O; the acceleration of a mass centre from angles, rates and their rates.
     system, q, u = moving("DoublePendulum")
@@ -103,6 +107,7 @@ def test_joint_forces_of_a_pendulum_are_newtons():
     np.testing.assert_allclose(forces["O"], m * (a1 + a2 - 2 * g), rtol=RTOL, atol=RTOL)
 
 
+@pytest.mark.slow
 def test_joint_forces_of_the_spatial_pendulum_are_newtons():
     system, q, u = moving("SpatialDoublePendulum")
     forces = constraint_forces(system, 0.0, q, u)
@@ -112,6 +117,7 @@ def test_joint_forces_of_the_spatial_pendulum_are_newtons():
     np.testing.assert_allclose(forces["A"], second + weights[1], rtol=RTOL, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_rail_carries_a_slider():
     # Exercise 5.2: along the rail nothing but the loads, across it the weights and the bar's momentum
     system, q, u = moving("SliderWithPinnedBar")
@@ -131,6 +137,7 @@ def test_walls_of_the_piston_and_of_the_slider():
     np.testing.assert_allclose(forces["slider_guide"], p_dot[1] + 3.0 * 9.81 + F, rtol=RTOL)
 
 
+@pytest.mark.slow
 def test_a_declared_auxiliary_speed_agrees_with_sympy():
     figures = FIGURES["rolling_disc_dependent_q_u_aux"]
     system = RollingDiscDependent(**figures["params"])
@@ -147,6 +154,7 @@ def test_a_declared_auxiliary_speed_agrees_with_sympy():
         np.testing.assert_allclose(multipliers, [x, c * y + s * z, c * z - s * y], rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_closed_loop_carries_forces_at_all_its_joints():
     figures = FIGURES["four_bar_linkage"]
     system = FourBarLinkage(**figures["params"])
@@ -202,6 +210,7 @@ class Sleigh(jk.System):
         return jk.Motion([body], [P.velocity.dot(B.y)])
 
 
+@pytest.mark.slow
 def test_the_multiplier_of_a_scalar_residual_is_a_force_along_it():
     system, q, u = Sleigh(), jnp.array([0.1, 0.2, 0.5]), jnp.array([1.0, 0.7])
     (force,) = constraint_multipliers(system, 0.0, q, u)

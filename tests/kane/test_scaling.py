@@ -22,6 +22,7 @@ def residual(q, L):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_sizes_of_terms_follow_the_units(dtype):
     def sizes(factor):
@@ -43,6 +44,7 @@ def test_no_derivative_is_taken_through_sizes():
     assert jax.grad(lambda x: term_sizes(lambda y: y - 1.0, x))(3.0) == 0.0
 
 
+@pytest.mark.slow
 def test_ranks_do_not_follow_the_units():
     rng = np.random.default_rng(0)
     A = rng.normal(size=(3, 5))
@@ -61,6 +63,7 @@ def test_ranks_do_not_follow_the_units():
             np.testing.assert_allclose(A @ found, A @ x, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_least_norm_solution_has_derivatives_where_rows_repeat():
     def x(a, xp=jnp):
         row = xp.stack([a, 2.0 + a * a, 1.0])

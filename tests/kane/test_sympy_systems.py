@@ -9,6 +9,7 @@ import jaxkane as jk
 RTOL = 1e-11
 
 
+@pytest.mark.slow_cases("pendulum_cartesian_nonminimal", "four_bar_linkage", "n_link_pendulum_on_cart_n3")
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_accelerations_of_all_speeds_agree_with_sympy(name):
     system = SYSTEMS[name](**FIGURES[name]["params"])
@@ -25,6 +26,7 @@ def test_accelerations_of_all_speeds_agree_with_sympy(name):
         np.testing.assert_allclose(np.concatenate([u_dot, u_dep_dot]), expected, rtol=RTOL)
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 @pytest.mark.published
 def test_four_bar_linkage_at_the_state_printed_in_sympys_test(published):

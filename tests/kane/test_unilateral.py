@@ -26,6 +26,7 @@ def strike(M, C, u, e, mu, closed=None):
     return u + Y @ result.impulses.reshape(-1), result
 
 
+@pytest.mark.slow
 def test_ten_bounces_of_a_ball_with_spin_and_drag():
     # m = 0.15, r = 0.1, I = 2/5 m r^2, e = 0.85, mu = 0.12, drag 0.02 |v| v; 40 digits, here to those of DOP853
     m, r, c = 0.15, 0.1, 0.02
@@ -90,6 +91,7 @@ def test_a_contact_that_is_not_closed_transmits_nothing():
     np.testing.assert_array_equal(result.impulses[1], 0.0)
 
 
+@pytest.mark.slow
 def test_balls_that_touch():
     # masses (4/5)^i, e = 9/10, exact fractions; three equal balls at once by Newton's law
     M, u = np.diag([0.8**i for i in range(3)]), [1.0, 0.0, 0.0]
@@ -173,6 +175,7 @@ def test_random_impacts_satisfy_the_contact_laws(c, rows):
     assert {SLIDES, STICKS} <= {*np.unique(result.states)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("c", "rows"), [(2, 2), pytest.param(1, 3, marks=pytest.mark.slow)])
 def test_derivatives_are_those_of_differences(c, rows):
     # central differences of step 1e-5; at least one contact slides
@@ -192,6 +195,7 @@ def test_derivatives_are_those_of_differences(c, rows):
             np.testing.assert_allclose(slope[(..., *place)], (high - low) / (2 * h), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_float32_stays_float32():
     G, v, e, mu = (x.astype(jnp.float32) for x in random_problem(2, 2, 0))
     result = compiled(G, v, e, mu, jnp.ones(2, bool))

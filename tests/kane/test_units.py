@@ -95,6 +95,7 @@ def slider_crank(L, M, T, dtype=jnp.float64):
 SYSTEMS = [four_bar, slider_crank]
 
 
+@pytest.mark.slow_cases("four_bar")
 @pytest.mark.parametrize("make", SYSTEMS)
 def test_assembly_in_other_units(make):
     system, named, _ = make(1.0, 1.0, 1.0)
@@ -117,6 +118,7 @@ def test_assembly_in_other_units(make):
             jk.assemble(scaled, named, rate | {name: 2 * x for name, x in given.items()})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", SYSTEMS)
 def test_dependent_speeds_in_other_units(make):
     system, named, _ = make(1.0, 1.0, 1.0)
@@ -129,6 +131,7 @@ def test_dependent_speeds_in_other_units(make):
         np.testing.assert_allclose([x for _, x in found.choices], [x for _, x in best.choices], rtol=RTOL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", SYSTEMS)
 def test_assembly_in_float32(make):
     guess = {four_bar: [1.0, -0.5, -1.5], slider_crank: [0.0, 1.0, 0.0]}[make]
@@ -144,6 +147,7 @@ def test_assembly_in_float32(make):
         assert (best.rank, best.current) == (2, system.dependent_speeds)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "options"),
     [

@@ -54,6 +54,7 @@ def test_laws_tend_to_the_sharp_ones_with_the_square_of_the_width(law, sharp):
     np.testing.assert_allclose(errors[0][large] / errors[1][large], 4.0, rtol=1e-3)
 
 
+@pytest.mark.slow_cases(all_but=["quadratic-float32", "quadratic-float64"])
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 @PAIRS
 def test_all_slopes_are_finite_at_rest_too(law, sharp, dtype):
@@ -74,6 +75,7 @@ def test_all_slopes_are_finite_at_rest_too(law, sharp, dtype):
         np.testing.assert_allclose(forward, (f(v + step) - f(v - step)) / (2 * step), rtol=1e-5, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_slopes_at_rest_are_what_they_should_be():
     at_rest = lambda law: float(jax.grad(law)(0.0))  # noqa: E731
     assert at_rest(lambda v: coulomb(v, 0.7, width=0.02)) == pytest.approx(0.7 / 0.02, rel=RTOL)
@@ -91,6 +93,7 @@ def test_smoothing_is_off_by_what_is_stated():
     assert float(smooth_abs(jnp.array(0.0), width)) == pytest.approx(width, rel=RTOL)
 
 
+@pytest.mark.slow
 def test_a_stribeck_curve_has_its_peak_before_it_falls():
     v = jnp.linspace(1e-4, 1.0, 4000)
     force = stribeck(v, 0.3, 0.5, 0.1, width=1e-4)
@@ -121,6 +124,7 @@ def level(v):
     return 1.0 + 0.5 * np.exp(-((v / 0.01) ** 2))
 
 
+@pytest.mark.slow
 def test_bristles_at_a_steady_rate_are_the_stribeck_curve():
     v = np.array([-0.5, -0.02, 0.003, 0.2])
     z = np.sign(v) * level(v) / 1e4
@@ -129,6 +133,7 @@ def test_bristles_at_a_steady_rate_are_the_stribeck_curve():
     np.testing.assert_allclose(force, np.sign(v) * level(v) + 0.4 * v, rtol=RTOL)
 
 
+@pytest.mark.slow
 def test_bristles_at_rest_are_a_spring_and_a_damper():
     force = lambda v, z: lugre(v, z, damping=30.0, viscous=0.4, **BRISTLES)  # noqa: E731
     (dv, dz), (z_dot_v, z_dot_z) = jax.jacfwd(force, (0, 1))(0.0, 0.0)
@@ -138,6 +143,7 @@ def test_bristles_at_rest_are_a_spring_and_a_damper():
     np.testing.assert_allclose(back, jax.jacfwd(force, (0, 1))(0.0, 1e-5))
 
 
+@pytest.mark.slow
 def test_bristles_bend_no_farther_than_static_friction_bends_them():
     """Where |z| = static / stiffness, z_dot is not outwards, whatever the rate."""
     v = jnp.linspace(-2.0, 2.0, 401)
@@ -146,6 +152,7 @@ def test_bristles_bend_no_farther_than_static_friction_bends_them():
         assert np.all(side * np.asarray(z_dot) <= 1e-15)
 
 
+@pytest.mark.slow
 def test_bristles_give_back_no_more_than_they_took_up_to_the_stated_damping():
     """force v - d/dt (stiffness z^2 / 2) = a y^2 - damping a v y + damping v^2, a = |v| / level, y = stiffness z."""
     v, z = (x.ravel() for x in np.meshgrid(np.linspace(-0.3, 0.3, 41), np.linspace(-1.5e-4, 1.5e-4, 601)))
@@ -198,6 +205,7 @@ def bench():
     return jk.simulate(Bench(), state, TS, {"voltage": 12.0}, rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_block_slides_as_far_as_smoothed_friction_lets_it(bench):
     """x = integral of |v| dv / (mu g), |v| = sqrt(v^2 + w^2): its energy goes into friction; and the same of time."""
     v, w, a = bench["block_rate"], 0.05, 0.4 * 9.81
@@ -223,6 +231,7 @@ def test_a_motor_starts_in_its_time_constant(bench):
     np.testing.assert_allclose(bench["shaft_rate"], 240.0 * (1 - np.exp(-TS / 0.16)), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_slopes_of_a_system_at_rest(kernels):
     """By hand: d a / d v of the block is -mu g / width, of the ball -c width / m, of the motor -k^2 / (R J)."""
     system, zeros = Bench(), jnp.zeros(3)
@@ -245,6 +254,7 @@ def test_slopes_of_a_system_at_rest(kernels):
     np.testing.assert_allclose(by_parameters.air[:, 1], -v[:, 1] * np.abs(v[:, 1]) / 1.5, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_system_in_single_precision(by_xla):
     small = jax.tree.map(lambda x: x.astype(jnp.float32), Bench())
     u = jnp.array([0.02, -2.0, 5.0], jnp.float32)
@@ -281,6 +291,7 @@ def test_a_stribeck_curve_of_a_sliding_point_and_in_a_hinge():
     assert float(turning) == pytest.approx((expected + 0.02 * 0.12) / 2.0, rel=RTOL)
 
 
+@pytest.mark.slow
 def test_a_gear_with_play_turns_its_link_beyond_the_gap_only():
     class Gear(jk.System):
         coordinates, speeds = ("motor", "link"), ("motor_rate", "link_rate")
@@ -323,6 +334,7 @@ class Arms(jk.System):
         return jk.Motion([*arms, jk.loads.rotor(self.J, A.z, self.ratio * u[1], A, arms[0])])
 
 
+@pytest.mark.slow
 def test_the_reflected_inertia_of_a_geared_rotor():
     """2 T = 0.5 u1^2 + 0.2 (u1 + u2)^2 + J (u1 + ratio u2)^2."""
     M = jk.mass_matrix(Arms(), 0.0, jnp.array([0.3, 0.2]), jnp.array([1.0, 2.0]))
@@ -355,6 +367,7 @@ class Gimbal(jk.System):
         return jk.Torque(0.1 * motion.N.x, motion["case"])
 
 
+@pytest.mark.slow
 def test_a_rotor_feels_its_carrier_turn():
     spinning = type("Spinning", (Gimbal,), {"spins": True})()
     for q, u in (((0.3, 0.5, 0.2), (1.0, -2.0, 30.0)), ((0.0, -1.0, 4.0), (0.5, 0.7, -80.0))):
@@ -379,6 +392,7 @@ def test_what_yields_gives_back_no_more_than_it_took_and_stays_within(share):
     assert np.max(np.asarray(outwards)) < 1e-12
 
 
+@pytest.mark.slow
 def test_what_yields_is_a_spring_at_first_and_then_has_its_yield_force():
     force = lambda v, z: bouc_wen(v, z, **YIELDS)  # noqa: E731
     (dv, dz), (z_dot_v, z_dot_z) = jax.jacrev(force, (0, 1))(0.0, 0.0)
@@ -420,6 +434,7 @@ def held():
     return jk.sweep.sweep(Held(), jk.State({}, {}, {}), ts, {"push": push}, rtol=1e-9, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_bristles_and_yielding_as_integrated_by_hand(held):
     def rates(t, y, push):
         v, w, z, s = y[2:]
@@ -442,6 +457,7 @@ def test_bristles_hold_what_smoothed_friction_lets_creep(held):
     assert held["rubbed_rate"][1, -1] > 0.5
 
 
+@pytest.mark.slow
 def test_slopes_of_states_at_rest(kernels):
     """By hand: of accelerations by speeds, and by states."""
     system, zeros = Held(), jnp.zeros(2)
@@ -478,6 +494,7 @@ class Tilted(jk.System):
         return {"encoder": q["angle"] + self.zero}
 
 
+@pytest.mark.slow
 def test_zeros_that_nobody_knows_are_parameters():
     """It hangs along the vertical, which is off by the tilt; the encoder reads that less its zero."""
     f = jax.jit(lambda tilt, angle: jk.accelerations(Tilted(tilt=tilt), 0.0, angle[None], jnp.zeros(1))[0])

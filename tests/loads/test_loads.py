@@ -56,6 +56,7 @@ def test_struts_pull_along_their_line_with_their_reaction(law, tension):
     np.testing.assert_allclose(on_Q, -tension * ALONG, rtol=RTOL)
 
 
+@pytest.mark.slow
 def test_a_spring_of_no_length_may_shrink_to_a_point():
     law = lambda P, Q, i: jk.loads.spring(P, Q, 10.0)  # noqa: E731
     system = type("Two", (Two,), {"law": staticmethod(law)})()
@@ -64,6 +65,7 @@ def test_a_spring_of_no_length_may_shrink_to_a_point():
     np.testing.assert_allclose(stiffness[0], [-5.0, 0.0, 5.0, 0.0])
 
 
+@pytest.mark.slow
 def test_friction_is_coulombs_but_for_its_smoothing():
     def law(P, Q, inputs):
         return jk.loads.friction(P, Q, 20.0, 0.5, speed=1e-6)

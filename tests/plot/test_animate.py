@@ -80,6 +80,7 @@ def shapes(animation, kind):
     return [shape for shape in animation.scene.shapes if shape.kind == kind]
 
 
+@pytest.mark.slow
 def test_bodies_and_points_are_where_the_description_says(swing):
     """1e-12, at a time of the trajectory. N.y is up, so it is the page's z."""
     system, trajectory, animation = swing
@@ -139,6 +140,7 @@ def test_points_are_joined_where_nothing_moves_between_them(swing):
     np.testing.assert_allclose(lengths, 0.5, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_wheels_turn_although_their_frames_do_not(ride, weaving):
     """0.03 rad: the spokes turn by the wheel's angle, which the pose of its frame does not hold."""
     scene, system = weaving.scene, ride[0]
@@ -233,6 +235,7 @@ def test_the_page_needs_nothing_from_elsewhere(weaving):
     assert '"' not in frame.split('srcdoc="')[1].split('" title=')[0]
 
 
+@pytest.mark.slow
 def test_a_figure_lives_no_longer_than_its_user_wants(swing):
     system, trajectory, _ = swing
     size = np.ones(1000)
@@ -360,6 +363,7 @@ def test_corners_of_a_spring_lie_on_both_sides_of_its_axis():
     assert np.isfinite(zigzag([(1.0, 1.0), (1.0, 1.0)])).all()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(NODE is None, reason="no node on the PATH")
 def test_the_pages_script_draws_without_a_browser(weaving, tmp_path):
     """In node, on a canvas that only notes what is asked of it: all finite, and keys do what they say."""
@@ -497,6 +501,7 @@ class Pushed(jk.System):
         return (10.0 - x["push"],)
 
 
+@pytest.mark.slow
 def test_loads_that_read_states_are_drawn():
     system, ts = Pushed(), np.linspace(0.0, 1.0, 3)
     ride = moved(system, ts, ts[:, None], np.ones((3, 1)))

@@ -128,6 +128,7 @@ def test_a_line_has_a_gap_at_each_jump():
 ODD = ("a$_{b$", "$c")
 
 
+@pytest.mark.slow
 def test_names_are_no_mathematics():
     """Dollars in names are written as they stand."""
     ride = dataclasses.replace(
@@ -194,6 +195,7 @@ def test_eigenvalues_and_the_stable_range(style):
     assert jk.plot.eigenvalues(v, values, ax=ax) is ax
 
 
+@pytest.mark.slow
 def test_an_axis_is_called_after_what_varies():
     """A parameter or a speed of the system with its unit, anything else by its name alone."""
     pendulum = jk.catalog.DoublePendulum()
@@ -215,6 +217,7 @@ def test_stable_ranges_end_where_the_values_end():
     assert stable_ranges(x, np.ones((5, 1)) + 0j) == []
 
 
+@pytest.mark.slow
 def test_results_of_stability_are_taken_as_they_are(style):
     """Columns of one name share a colour; the number of names is checked."""
     bicycle = jk.catalog.WhippleBicycle.benchmark()
@@ -296,6 +299,7 @@ def fitted(n):
     )
 
 
+@pytest.mark.slow
 def test_fits(style):
     fit = fitted(9)
     axes = jk.plot.fits(fit, degrees=True)

@@ -92,6 +92,7 @@ def sweep(system):
     jk.sweep.sweep(class_of_cell()(), START, TS, table={"mass": np.array([1.0, 2.0])})
 
 
+@pytest.mark.slow
 @on_linux
 @pytest.mark.parametrize(
     ("cell", "times", "each"),
@@ -143,6 +144,7 @@ KINDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_programs_are_freed_with_the_functions_that_they_were_traced_with(kind, system):
     def simulated(push):
@@ -160,6 +162,7 @@ def test_programs_are_freed_with_the_functions_that_they_were_traced_with(kind, 
     assert memory_mappings()[0] < mapped + 30  # a program has some 80
 
 
+@pytest.mark.slow
 def test_reduce_functions_are_freed_with_their_programs(system):
     def swept(factor):
         reduce = lambda trajectory: factor * trajectory["x"][-1]  # noqa: E731
@@ -172,6 +175,7 @@ def test_reduce_functions_are_freed_with_their_programs(system):
     assert gone() is None
 
 
+@pytest.mark.slow
 def test_a_method_of_an_object_without_weak_references_is_compiled_once(system):
     controller, other = Controller(1.0), Controller(1.0)
     pushed = [last(system, {"push": controller.method}, step=0.1)]
@@ -186,6 +190,7 @@ def test_a_method_of_an_object_without_weak_references_is_compiled_once(system):
     assert counts[id(other)] > 0
 
 
+@pytest.mark.slow
 def test_functions_with_the_same_code_keep_their_own_programs(system):
     functions = [{"push": lambda t, state, push=push: push} for push in (1.0, 2.0, 3.0)]
     for _ in range(2):
@@ -193,6 +198,7 @@ def test_functions_with_the_same_code_keep_their_own_programs(system):
         assert values == pytest.approx([expected(4.0, push) for push in (1.0, 2.0, 3.0)], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_classes_of_the_same_name_keep_their_own_programs():
     systems = [class_of_cell(k)() for k in (4.0, 9.0)]
     for forget in (False, True):
@@ -201,6 +207,7 @@ def test_classes_of_the_same_name_keep_their_own_programs():
         assert [last(s) for s in systems] == pytest.approx([expected(4.0), expected(9.0)], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_class_that_was_copied_by_cloudpickle_is_simulated():
     """`motion_number` was copied with it, and counted for itself."""
     cloudpickle = pytest.importorskip("cloudpickle")
@@ -231,6 +238,7 @@ class EqualToAll(Constant):
     __hash__ = lambda self: 1  # noqa: E731
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Constant, ConstantWithSlots, EqualToAll])
 def test_controllers_that_are_compared_by_value(kind, system):
     """The first two have no hash, the second no weak references."""
@@ -238,6 +246,7 @@ def test_controllers_that_are_compared_by_value(kind, system):
         assert last(system, kind(push), step=0.1) == pytest.approx(expected(4.0, push), rel=1e-5)
 
 
+@pytest.mark.slow
 @on_linux
 def test_models_that_are_used_in_turn_are_not_compiled_in_every_round(limit):
     systems = [class_of_cell(k)() for k in (4.0, 5.0, 6.0)]
@@ -289,6 +298,7 @@ def test_the_limit_rises_where_dropped_programs_are_used_again(monkeypatch):
     assert process.limit.mappings == 8000
 
 
+@pytest.mark.slow
 def test_mappings_of_other_code_do_not_drop_programs_each_time(monkeypatch):
     process = Mapped(monkeypatch, each=10, others=5000)
     for i in range(20):

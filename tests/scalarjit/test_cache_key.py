@@ -349,6 +349,7 @@ def bytes_of(answer):
     return answer if isinstance(answer, str) else [np.asarray(x).tobytes() for x in jax.tree.leaves(answer)]
 
 
+@pytest.mark.slow_cases(all_but=["orientations", "symbolic.equations"])
 @pytest.mark.parametrize(
     "name", [*QUESTIONS, *(pytest.param(name, marks=pytest.mark.slow) for name in QUESTIONS_THAT_COMPILE)]
 )
@@ -362,6 +363,7 @@ def test_every_public_function_sees_the_change(name, monkeypatch):
     assert before != after == bytes_of(ask())
 
 
+@pytest.mark.slow
 def test_output_functions_of_a_linear_model_are_looked_into(monkeypatch):
     model = lambda: jk.stability.linearize(Still(), CENTER_OF_STILL, outputs=OUTPUTS)  # noqa: E731
     assert float(model().C[0, 0]) == pytest.approx(9.81, rel=RTOL)
@@ -392,6 +394,7 @@ REST = jk.State(np.zeros(1), np.zeros(1))
 SHORT = {"step": 0.1, "solver": diffrax.Midpoint()}  # exact here, and compiled quickly
 
 
+@pytest.mark.slow
 def test_simulate_follows_descriptions_and_controllers(monkeypatch):
     controller = Controller()
     last = lambda: float(jk.simulate(Drop(), REST, TS, controller, **SHORT)["x"][-1])  # noqa: E731
@@ -421,6 +424,7 @@ class Walled(Still):
         return {"wall": q[0] - 0.52}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [pytest.param(jax.jacrev, marks=pytest.mark.slow), jax.jacfwd])
 def test_a_closure_of_an_input_function_has_the_derivatives_of_an_input(derivative):
     start = jk.State(np.array([0.5]), np.array([0.3]))
@@ -431,6 +435,7 @@ def test_a_closure_of_an_input_function_has_the_derivatives_of_an_input(derivati
     assert np.isnan(slopes[-1])  # the wall is met before
 
 
+@pytest.mark.slow
 def test_a_sweep_is_differentiated_forward_by_what_its_functions_read():
     start = jk.State(np.array([0.5]), np.array([0.3]))
 
@@ -454,6 +459,7 @@ def test_a_traced_number_in_the_closure_of_a_description_is_refused(method):
         jax.grad(ends_at)(0.52)
 
 
+@pytest.mark.slow
 def test_traced_numbers_that_a_description_has_kept_are_no_closure():
     """What an earlier trace left behind is nobody's."""
     kept = []
@@ -592,6 +598,7 @@ def test_objects_that_name_each_other_and_long_chains_come_to_an_end():
     assert version_of(space["f"]) != before
 
 
+@pytest.mark.slow
 def test_forget_reads_what_cannot_be_seen():
     hidden = array.array("d", [9.81])  # of a C extension
     system = with_gravity(lambda self: hidden[0])
@@ -602,6 +609,7 @@ def test_forget_reads_what_cannot_be_seen():
     assert accelerate(system) == float(outer(jnp.zeros(1))) == pytest.approx(1.62, rel=RTOL)
 
 
+@pytest.mark.slow
 def test_what_is_gone_is_not_kept():
     """JAX's registry keeps every class of a pytree for ever; nothing else does, and no controller is kept."""
 
@@ -618,6 +626,7 @@ def test_what_is_gone_is_not_kept():
     assert not any(ref() for ref in gone)
 
 
+@pytest.mark.slow
 def test_systems_and_their_arrays_are_not_kept():
     """A program takes the numbers of a system; it keeps neither them nor the system."""
     system = Bead(jnp.array(3.0))
@@ -632,6 +641,7 @@ def test_systems_and_their_arrays_are_not_kept():
     assert [ref() for ref in gone] == [None, None]
 
 
+@pytest.mark.slow
 def test_threads_agree():
     found, n = [], 8
 

@@ -105,11 +105,13 @@ print("right")
 """
 
 
+@pytest.mark.slow
 def test_without_what_programs_are_made_of_results_stay_right():
     run = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, timeout=300, check=False)
     assert run.stdout.strip() == "right", run.stderr[-2000:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flags", ["", "--xla_cpu_enable_fast_math=false"])
 def test_a_release_that_computes_wrongly_is_repaired_before_it_starts(flags):
     code = (

@@ -112,6 +112,7 @@ def first(cache, python):
     return python(f"jk.configure(cache={str(cache)!r})\n" + RIDE).stdout.splitlines()
 
 
+@pytest.mark.slow
 def test_it_says_what_it_did(first, cache):
     assert first[0] == f"jaxkane: float64, {KERNELS}"
     assert first[1].startswith(f"  Compiled programs are stored in {cache} (none yet)")
@@ -188,6 +189,7 @@ def test_without_llvm_xla_does_the_work_and_says_so(python):
     assert run.stdout.splitlines()[1] == "(2,)"
 
 
+@pytest.mark.slow
 def test_the_environment_may_switch_native_kernels_off():
     code = [sys.executable, "-c", "import jaxkane\njaxkane.configure(cache=False)"]
     assert b"switched off" in subprocess.check_output(code, env=CLEAN | {"JAXKANE_NATIVE": "0"})
@@ -288,6 +290,7 @@ def test_devices_that_are_no_number(devices):
         _split_cpu(devices)
 
 
+@pytest.mark.slow
 def test_a_cache_in_the_place_of_a_file(tmp_path):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "inside"):

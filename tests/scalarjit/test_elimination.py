@@ -54,12 +54,14 @@ def numbers(batch=()):
     return jnp.asarray(rng.uniform(0.5, 2.0, N)), jnp.asarray(rng.normal(size=(*batch, N)))
 
 
+@pytest.mark.slow
 def test_the_solution_is_that_of_the_matrix():
     p, b = numbers()
     assert tree.is_native(p, b)
     np.testing.assert_allclose(tree(p, b), solved(along_a_tree, p, b), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_in_batches_of_sides_of_matrices_and_of_both():
     p, b = numbers((11,))
     ps = p[None] * jnp.linspace(1.0, 1.3, 11)[:, None]
@@ -73,6 +75,7 @@ def test_in_batches_of_sides_of_matrices_and_of_both():
         np.testing.assert_allclose(of_both[i], solved(along_a_tree, ps[i], b[i]), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_in_float32():
     p, b = (x.astype(jnp.float32) for x in numbers())
     assert tree(p, b).dtype == jnp.float32

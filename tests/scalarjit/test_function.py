@@ -61,6 +61,7 @@ def by_plain_jax(name):
     return jax.jit(TRANSFORMATIONS[name](plain))(*ARGUMENTS)
 
 
+@pytest.mark.slow_cases(all_but=["native-jit-*", "native-eager-itself", "XLA-jit-itself", "XLA-jit-batch"])
 @pytest.mark.parametrize("name", TRANSFORMATIONS)
 @pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
 def test_the_same_as_plain_jax(name, compiled, kernels):
@@ -72,6 +73,7 @@ def test_the_same_as_plain_jax(name, compiled, kernels):
     )
 
 
+@pytest.mark.slow_cases(all_but=["short-*", "long-itself"])
 @pytest.mark.parametrize("name", TRANSFORMATIONS)
 @pytest.mark.parametrize("long", [False, True], ids=["short", "long"])
 def test_a_program_as_windows(name, long, by_xla, monkeypatch):
@@ -81,6 +83,7 @@ def test_a_program_as_windows(name, long, by_xla, monkeypatch):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14), found, by_plain_jax(name))
 
 
+@pytest.mark.slow_cases(all_but=["jit"])
 @pytest.mark.parametrize("name", ["jit", "reverse", "batch", "batch of gradients", "gradient of a loop"])
 def test_a_long_program_that_chooses(name, by_xla, monkeypatch):
     monkeypatch.setattr(xla, "_SHORT", 0)
@@ -107,6 +110,7 @@ def many(a, x, flag):
     return {"numbers": jnp.stack([smooth, steps, others]), "is_less": y < w, "given": x, "fixed": jnp.array([1.0, a])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_every_operation_as_windows(dtype, by_xla, monkeypatch):
     monkeypatch.setattr(xla, "_SHORT", 0)
@@ -127,6 +131,7 @@ def test_every_operation_as_windows(dtype, by_xla, monkeypatch):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 def test_windows_are_not_cut(by_xla, on_cpu, monkeypatch):
     """Else a division that is read more than once ends a kernel, and every kernel has sines of its own."""
@@ -225,6 +230,7 @@ def test_the_process_stays_alive():
     assert run.stdout.strip() == "alive", run.stderr[-2000:]
 
 
+@pytest.mark.slow
 def test_a_batch_without_jit_is_compiled_once(on_cpu, monkeypatch):
     f = ScalarFunction(lambda x, a: jnp.sin(a * x))
     lowered, lower = [], programs.Program.target
@@ -238,6 +244,7 @@ def test_a_batch_without_jit_is_compiled_once(on_cpu, monkeypatch):
     assert len(lowered) == 3  # another size, and another argument that varies
 
 
+@pytest.mark.slow
 def test_a_value_of_the_trace_under_way_is_not_kept():
     box = {}
     f = ScalarFunction(lambda x: box["k"] * jnp.sin(x))
@@ -307,6 +314,7 @@ SLOW = {
 }
 
 
+@pytest.mark.slow_cases(all_but=["cond", "while"])
 @pytest.mark.parametrize("name", SLOW)
 def test_what_cannot_be_one_function_is_told_once_by_name(name, monkeypatch):
     monkeypatch.setattr(programs, "_warned", set())
@@ -318,6 +326,7 @@ def test_what_cannot_be_one_function_is_told_once_by_name(name, monkeypatch):
     np.testing.assert_allclose(found[:2], np.full(2, SLOW[name](ball, x)), rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_products_of_small_matrices_are_written_out():
     A, B = (np.random.default_rng(i).normal(size=s) for i, s in ((0, (2, 3, 4)), (1, (4, 2, 5))))
@@ -328,6 +337,7 @@ def test_products_of_small_matrices_are_written_out():
     np.testing.assert_allclose(jax.jacfwd(lambda x: ScalarFunction(f)(ball, x))(x), exact / 0.4, rtol=1e-13, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_lapack_of_the_method_itself_is_not_told():
     def solved(x):
@@ -368,6 +378,7 @@ def moving_about(a, x, y):
     return z, jnp.sum(z * jnp.cos(a), axis=1), x, y * 0.0 + x[2] + x[2], jnp.sin(a)
 
 
+@pytest.mark.slow
 def test_a_program_is_transposed_as_jax_transposes_it():
     rtol = 1e-14
     x, y, unused = jnp.arange(1.0, 5.0), jnp.array(0.7), jnp.array(3.0)
@@ -391,6 +402,7 @@ def of_many_operations(a, x, y, n):
     return z @ z, jnp.clip(z, -1.0, 1.0) + 0.0 * y, flag, jnp.floor(y), a, jnp.where(flag, 1.0, still), n, jnp.ones(2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moving", [(0, 1, 2), (1,), (0, 2)], ids=str)
 def test_the_derivative_of_a_program_is_that_of_jax(moving):
     rtol = 1e-14
@@ -429,6 +441,7 @@ def test_numbers_of_two_types_and_shapes_are_converted(operation):
     assert found.dtype == jnp.float64
 
 
+@pytest.mark.slow
 def test_packed_numbers_are_the_tree(kernels):
     rtol = 1e-14
     single = jnp.array(2.0, jnp.float32)  # of another type, and not read
@@ -495,6 +508,7 @@ FWD, REV = jax.jacfwd, jax.jacrev
 NESTED = [(FWD,), (REV,), (FWD, FWD), (FWD, REV), (REV, FWD), (FWD, FWD, FWD)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("modes", NESTED, ids=lambda modes: "-".join(mode.__name__ for mode in modes))
 @pytest.mark.parametrize("shape", [once, in_a_loop])
 def test_value_and_derivative_as_one_operation(shape, modes, native):
@@ -507,6 +521,7 @@ def test_value_and_derivative_as_one_operation(shape, modes, native):
     np.testing.assert_allclose(jax.jit(jax.vmap(ours))(vs), jax.jit(jax.vmap(plain))(vs), rtol=1e-13, atol=1e-14)
 
 
+@pytest.mark.slow_cases(all_but=["XLA-once"])
 @pytest.mark.parametrize("shape", [once, in_a_loop])
 def test_value_and_derivative_as_one_operation_by_linearize_and_in_batches(shape, kernels):
     ours, plain = shape(_pair.in_forward_mode), shape(_pair.__wrapped__)

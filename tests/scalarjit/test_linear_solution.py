@@ -96,6 +96,7 @@ def by_plain_jax(name, f):
     return jax.jit(TRANSFORMATIONS[name](f))(*ARGUMENTS)
 
 
+@pytest.mark.slow_cases(all_but=["native-a batch in another-*", "native-alone-linearize"])
 @pytest.mark.parametrize("name", TRANSFORMATIONS)
 @pytest.mark.parametrize(
     ("f", "g"),
@@ -110,6 +111,7 @@ def test_the_same_as_plain_jax(name, f, g, kernels):
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-13), found, expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
 def test_it_is_the_equations_that_are_differentiated(jacobian):
     """Told that the residual is twice what it is, the derivative of the solution is twice what it was, and nothing
@@ -175,6 +177,7 @@ def singular_equations(a, z, x, r):
     return as_vector(residual, z), as_vector(solve_positive([[a, a], [a, a]], (r[0], r[1])), z)
 
 
+@pytest.mark.slow
 def test_a_derivative_takes_one_and_a_half_times_the_operations_of_the_rates():
     """Of the bicycle, beside its rates; it was 2.1 times as long as the solution was differentiated."""
     bicycle = catalog.WhippleBicycle.benchmark()

@@ -49,6 +49,7 @@ def derivative(modes, f):
     return jax.jit(f)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("modes", ORDERS, ids=named)
 def test_who_reads_what_exists_gets_clean_derivatives(modes):
     a, b = P["a"], P["b"]
@@ -60,6 +61,7 @@ def test_who_reads_what_exists_gets_clean_derivatives(modes):
         np.testing.assert_allclose(second, exact, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("modes", ORDERS, ids=named)
 def test_who_reads_what_is_missing_gets_nan(modes):
     """Also where the cotangents of two rows, or the tangents of two parameters, would cancel."""
@@ -81,6 +83,7 @@ def test_what_does_not_move_has_the_derivative_zero():
     np.testing.assert_array_equal(x_dot[:2], np.zeros((2, 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_the_derivative_by_a_part_of_the_origin(mode):
     """Single numbers are one part of an origin, each other array is one; those that do not move take no part."""
@@ -93,6 +96,7 @@ def test_the_derivative_by_a_part_of_the_origin(mode):
         assert np.isnan(jax.jacfwd(first[i], argnums=j)(*at)[1]).all(), (i, j)
 
 
+@pytest.mark.slow
 def test_members_of_a_batch_are_told_apart():
     """In a shared parameter only the sum over who exists is clean; each member's own are its own."""
     missing = jnp.stack([MISSING, jnp.zeros(4, bool), jnp.ones(4, bool)])
@@ -120,6 +124,7 @@ def test_a_trial_value_that_is_not_finite_has_the_derivative_zero(mode):
     np.testing.assert_array_equal(mode(trial)(0.5), 0.0)
 
 
+@pytest.mark.slow
 def test_complex_and_single_precision():
     for missing, dtype in itertools.product((False, True), (jnp.complex64, jnp.float32)):
         f = lambda a: nan_where(jnp.array(missing), (a * 2).astype(dtype), a)  # noqa: B023, E731
@@ -149,6 +154,7 @@ def test_a_batch_in_a_loop_of_values_that_all_members_share(mask, batched):
     np.testing.assert_array_equal(np.isnan(slopes), [[batched == "origin", True]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mask", [nan_where, nan_derivative_where])
 def test_a_batch_in_a_loop_of_one_part_of_the_origin(mask):
     """To the second derivative, along the part that all members share, and along each member's own."""
@@ -171,6 +177,7 @@ def test_values_without_entries_in_a_batch_in_a_loop():
     assert jax.jvp(f, (x,), (x,))[1].shape == (1, 2, 4, 0)
 
 
+@pytest.mark.slow
 def test_derivatives_beyond_the_second_order_are_nan_only_where_they_are_not_exact():
     def f(rough, x):
         return nan_beyond_second_derivative(rough, x**3, x)

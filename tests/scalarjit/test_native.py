@@ -38,6 +38,7 @@ def every_operation(x):
 
 
 # Whoever is told that something cannot be part of one function, or of a kernel, compares XLA with itself.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error:.*its description uses")
 @pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
 def test_every_operation(plainly, kernels):
@@ -52,6 +53,7 @@ def test_every_operation(plainly, kernels):
             jax.tree.map(check, found[name], jax.tree.map(lambda a, n=n: a[:n], expected[name]))
 
 
+@pytest.mark.slow_cases(all_but=["native-float32"])
 @pytest.mark.filterwarnings("error:.*its description uses")
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32], ids=["float64", "float32"])
 def test_no_number_and_signed_zeros_as_by_xla(dtype, kernels):
@@ -69,6 +71,7 @@ def test_no_number_and_signed_zeros_as_by_xla(dtype, kernels):
                 np.testing.assert_array_equal(np.signbit(a[~np.isnan(a)]), np.signbit(b[~np.isnan(b)]), err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("native")
 def test_a_member_does_not_depend_on_its_place():
     f = ScalarFunction(lambda x, a: jnp.sin(a * x) / (1.0 + x * x))
@@ -78,6 +81,7 @@ def test_a_member_does_not_depend_on_its_place():
         np.testing.assert_array_equal(jax.jit(jax.vmap(f, (0, None)))(x[:n], 0.3), together[:n])
 
 
+@pytest.mark.slow_cases(all_but=["once-3"])
 @pytest.mark.usefixtures("native")
 @pytest.mark.parametrize("long", [10_000, 3])
 @pytest.mark.parametrize("made", [ScalarFunction, ScalarFunction.compile_cheaply], ids=["optimized", "once"])
@@ -112,6 +116,7 @@ def test_the_order_depth_first():
     assert place[int(outputs[4])] < place[int(outputs[0])]
 
 
+@pytest.mark.slow
 def test_batches_of_batches():
     def plain(a, b, x):
         return jnp.stack([jnp.sin(a) * x[0], b * x[1] + a, a / b])
@@ -133,6 +138,7 @@ def spring(parameters, x):
     return -k / m * (x - rest) * signs
 
 
+@pytest.mark.slow
 def test_numbers_that_stay_are_one_argument_of_a_kernel(native, monkeypatch):
     """m, k and rest are one array, where all lanes share them; values and derivatives are those of plain JAX."""
     monkeypatch.setattr(programs, "_FEW", 1)
@@ -198,6 +204,7 @@ def test_the_bicycle_and_its_derivatives_as_by_xla(bicycle):
     jax.tree.map(close, *both(lambda *args: jax.jvp(motion_rates, args, moved), *bicycle))
 
 
+@pytest.mark.slow
 def test_a_derivative_costs_a_few_values(bicycle):
     """Operations of the graphs; all directions of a derivative are lanes of one kernel, which share what they can."""
     leaves, treedef = jax.tree.flatten(bicycle)
@@ -223,6 +230,7 @@ def test_kernels_are_kept_beside_the_cache_of_jax(tmp_path):
         jax.config.update("jax_compilation_cache_dir", was)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not native_kernels.is_on(), reason="no native kernels here")
 def test_single_precision_without_x64():
     """Numbers that are written in a program are rounded to its type, where JAX keeps them as floats of Python."""

@@ -46,6 +46,7 @@ def the_same(found, right, **tolerance):
         np.testing.assert_allclose(x, y, **tolerance)
 
 
+@pytest.mark.slow
 def test_values_are_those_of_jax():
     assert functions.is_numpy(*ARGUMENTS)
     the_same(functions.numpy(*ARGUMENTS), functions.__wrapped__(*jax.tree.map(jnp.asarray, ARGUMENTS)), rtol=1e-14)
@@ -60,6 +61,7 @@ def test_what_is_no_number_is_so_in_numpy_too_and_nothing_is_said(recwarn):
     assert not recwarn
 
 
+@pytest.mark.slow
 def test_derivatives_along_several_directions_are_those_of_jax():
     directions = np.array([[1.0, 0.0], [0.5, 2.0], [0.0, -1.0]])  # (x,d)
     along_b = np.array([0.3, 0.0])
@@ -70,6 +72,7 @@ def test_derivatives_along_several_directions_are_those_of_jax():
     assert functions.numpy_jvp(ARGUMENTS, (None, None, np.zeros((3, 0))))["both"].shape == (3, 0)
 
 
+@pytest.mark.slow
 def test_what_is_no_program_of_scalars_is_left_to_jax():
     b, x = np.array(2.0), np.array([0.5, 3.0])
     with pytest.warns(UserWarning, match="its description uses"):
@@ -78,6 +81,7 @@ def test_what_is_no_program_of_scalars_is_left_to_jax():
     np.testing.assert_allclose(by_a_library.numpy_jvp((b, x), (None, np.eye(2))), [6.0, 1.0], rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_single_precision_stays_single():
     arguments = jax.tree.map(lambda x: np.asarray(x, np.float32), ARGUMENTS)
     found = functions.numpy(*arguments)
@@ -103,6 +107,7 @@ class Rods(jk.System):
         return [x, self.length * (jnp.sin(q["a"]) + jnp.sin(q["b"]))]
 
 
+@pytest.mark.slow_cases("start0-1.5")
 @pytest.mark.parametrize("base", [1.5, 2.0, 3.0, np.nan])
 @pytest.mark.parametrize("start", [(0.5, -0.3), (0.0, 0.0), (np.pi, np.pi)])
 def test_newtons_method_finds_in_numbers_what_it_finds_compiled(base, start):

@@ -14,6 +14,7 @@ def rows_of(A, values=None):
     return [[values[i, j] if x else 0.0 for j, x in enumerate(row)] for i, row in enumerate(A)]
 
 
+@pytest.mark.slow_cases("sizes8", "sizes7", "sizes6")
 @pytest.mark.parametrize("sizes", [(3, 3, 3), (1, 3, 3), (2, 3), (1, 1, 1, 3), (4,), (1, 4), (5, 6), (7,), (1, 7)])
 def test_systems_in_blocks(sizes):
     """1e-12: against NumPy, rows and columns shuffled; a block of seven goes to LAPACK."""
@@ -37,6 +38,7 @@ def test_a_system_that_is_singular_by_its_zeros_has_no_number():
     assert not np.any(np.isfinite(np.array(solve(rows_of(A), [jnp.ones(())] * 5)[0])[4:]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [4, 6])
 def test_elimination_exchanges_rows(n):
     """1e-10: numbers that are zero on the diagonal, and pivots of 1e-17; derivatives by the linear equations."""

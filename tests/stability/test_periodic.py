@@ -82,6 +82,7 @@ def numbers(mu, guess=NEAR):
     return jnp.stack([orbit["x"], orbit.period, orbit.multipliers[0].real])
 
 
+@pytest.mark.slow
 def test_van_der_pol():
     orbit = periodic(WithSections(1.0), NEAR, section="top", period=6.6)
     np.testing.assert_allclose([orbit["x"], orbit.period], MU_1[:2], rtol=1e-11)
@@ -307,6 +308,7 @@ def wheel(half, slope):
     return jnp.stack([orbit["rate"], orbit.multipliers[0].real])
 
 
+@pytest.mark.slow
 def test_rimless_wheel():
     orbit = periodic(RimlessWheel(), jk.State([-0.32, 0.0], [1.2]), section="step")
     np.testing.assert_allclose([orbit["rate"], orbit.multipliers[0].real], wheel_by_formula(0.4, 0.08), rtol=1e-11)

@@ -35,6 +35,7 @@ WAYS = {"eig": lambda A: eig(A).values, "eigvals": eigvals}
 QUICK = {("eig", "reverse over reverse"), ("eigvals", "forward over reverse")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("way", "mode"),
     [
@@ -86,6 +87,7 @@ def test_third_derivatives_and_vectors_against_differences():
 COALESCING = [jnp.array([[1.0, coupled, 0.2], [0.0, 1.0, 0.3], [0.0, 0.0, 3.0]]) for coupled in (1.0, 0.0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mode", [m if m == "reverse over reverse" else pytest.param(m, marks=pytest.mark.slow) for m in MODES]
 )
@@ -154,6 +156,7 @@ def standing(length, torque):
 LIMIT = 2.0 * 9.81 * 0.5  # [N m] that weight can balance at 0.5 m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_an_equilibrium_that_is_not_found_has_no_derivative(derivative):
     value_and_slope = jax.jit(lambda *at: (standing(*at), derivative(standing, (0, 1))(*at)))
@@ -164,6 +167,7 @@ def test_an_equilibrium_that_is_not_found_has_no_derivative(derivative):
     np.testing.assert_allclose(slope[1], 1 / (LIMIT * np.cos(value)), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_member_that_is_not_found_leaves_the_others_their_derivative():
     """Shared length, a batch of torques, of which the second is too large: nobody reads it, or everything is told."""
     torques = jnp.array([0.3, 1.2, 0.5]) * LIMIT
@@ -212,6 +216,7 @@ def sprung(system, spring):
     return dataclasses.replace(system, spring=spring), jk.State(jnp.zeros(1), jnp.zeros(1))
 
 
+@pytest.mark.slow
 def test_critical_values_do_not_depend_on_the_order_of_those_given():
     up = critical_speeds(Pushed(), jnp.array([-20.0, -3.0, 5.0]), sprung)
     np.testing.assert_allclose(up.values, [-LIMIT], rtol=1e-12)
@@ -226,6 +231,7 @@ def test_critical_values_do_not_depend_on_the_order_of_those_given():
             function(Pushed(), jnp.zeros((1, 3)), sprung)
 
 
+@pytest.mark.slow
 def test_eigenvalues_that_cease_to_grow_without_passing_the_axis_are_told():
     """Without a damper it becomes neutral; with a spring that passes its limit flatly, the crossing is too flat."""
     with pytest.warns(UserWarning, match="falls by 1 more than the detected"):
@@ -236,6 +242,7 @@ def test_eigenvalues_that_cease_to_grow_without_passing_the_axis_are_told():
         critical_speeds(Pushed(), jnp.array([-1.0, 0.0, 1.0]), flat)
 
 
+@pytest.mark.slow
 def test_a_parameter_that_cannot_be_has_no_linear_model_under_a_trace():
     """A length that passes zero is no way to become stable: alone that is an error."""
     hanging = jk.State(jnp.zeros(1), jnp.zeros(1))
@@ -270,6 +277,7 @@ def test_a_motion_that_is_not_steady_has_no_linear_model_under_a_trace():
         linearize(Pushed(), jk.State(jnp.array([jnp.nan]), jnp.zeros(1)), steady=False)
 
 
+@pytest.mark.slow
 def test_off_the_constraints_there_is_no_linear_model_of_an_instant_either():
     rod = RodOnPin(length=0.7)
     off = jk.State(jnp.array([0.1, 0.1]), jnp.zeros(1))
@@ -278,6 +286,7 @@ def test_off_the_constraints_there_is_no_linear_model_of_an_instant_either():
     assert np.isnan(jax.jit(lambda q: linearize(rod, jk.State(q, off.u), steady=False).A)(off.q)).all()
 
 
+@pytest.mark.slow
 def test_a_family_along_which_an_input_is_found():
     """The torque that holds a pendulum, as it is led aside: one equation fewer than unknowns."""
     found = family(Pushed(), equilibrium(Pushed()), towards={"angle": 1}, until={"angle": 1.0}, find=("torque",))

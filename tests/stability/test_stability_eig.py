@@ -86,6 +86,7 @@ def test_each_is_an_eigenvalue_of_a_matrix_as_near_as_rounding(kind, by_qr):
     np.testing.assert_array_equal(np.sort_complex(found.conj()), np.sort_complex(found))  # in pairs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["scaled", "stiff"])
 def test_small_ones_beside_large_ones_are_right(kind, by_qr):
     """Against forty digits, each to its own size; balancing sees to that. LAPACK is off by up to 1e-9 there."""
@@ -97,6 +98,7 @@ def test_small_ones_beside_large_ones_are_right(kind, by_qr):
     assert far.min(axis=1).max() < rtol
 
 
+@pytest.mark.slow
 def test_what_is_no_number_stays_with_its_matrix():
     A = np.tile(np.eye(4), (4, 1, 1))
     A[1, 2, 0], A[2, 3, 3] = np.nan, np.inf
@@ -106,6 +108,7 @@ def test_what_is_no_number_stays_with_its_matrix():
     assert np.isnan(found[1:3]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(3, marks=pytest.mark.slow), 7])
 def test_a_batch_is_what_its_members_are(n):
     """Whether by QR or by LAPACK, with one leading axis or two, in single precision too."""
@@ -119,6 +122,7 @@ def test_a_batch_is_what_its_members_are(n):
         assert (far < tolerance * np.abs(single).max(axis=1)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
 def test_a_batch_its_members_and_their_derivatives_have_one_order(kernels):
     """Pendulums without and with damping, whose real parts are rounding errors or not: the values of a batch are those
@@ -162,6 +166,7 @@ def test_a_batch_of_bicycles_against_the_literature(bicycles, kernels):
         np.testing.assert_allclose((pair[1] - pair[0]) ** 2, (other[1] - other[0]) ** 2, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
 def test_derivatives_of_values_alone_are_those_of_both(kernels):
     rtol = 1e-12

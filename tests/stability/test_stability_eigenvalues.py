@@ -58,6 +58,7 @@ def found():
     return eigenvalues_of_the_benchmark()
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 @pytest.mark.published
 def test_eigenvalues_of_the_benchmark_at_eleven_speeds(published):
@@ -72,6 +73,7 @@ def test_eigenvalues_of_the_benchmark_at_eleven_speeds(published):
     published(MEIJAARD, "eigenvalues of the bicycle from 0 to 10 m/s, Table 2 [1/s]", theirs, ours, 1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 @pytest.mark.published
 def test_matrices_of_the_benchmark(published):
@@ -81,6 +83,7 @@ def test_matrices_of_the_benchmark(published):
     published(MEIJAARD, "matrices of the linear bicycle", theirs, [getattr(found, name) for name in names], 1e-12)
 
 
+@pytest.mark.slow
 def test_modes_are_followed_and_named(found):
     """Capsize and castering decay, castering ever faster; the weave swings from 0.68 m/s on."""
     assert found.modes == ("weave", "weave", "capsize", "castering")
@@ -155,6 +158,7 @@ def test_where_modes_coalesce_there_is_no_derivative():
 # -- critical speeds
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 @pytest.mark.published
 def test_weave_and_capsize_speeds(published, recwarn):
@@ -170,6 +174,7 @@ def test_weave_and_capsize_speeds(published, recwarn):
     assert not recwarn  # as many eigenvalues come to grow as pass the axis
 
 
+@pytest.mark.slow
 def test_riding_backwards_is_riding_forwards_with_time_reversed():
     """Each mode keeps its name: it was castering that capsized."""
     speeds = jnp.linspace(1.0, 10.0, 19)
@@ -276,6 +281,7 @@ def every_crossing_is_found(seed):
         assert abs(slope - by_hand) <= 1e-6 * abs(by_hand) or np.linalg.norm(y) > 1e6
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(st.integers(0, 2**20))
 def test_every_crossing_of_a_random_pencil_is_found(seed):
@@ -291,6 +297,7 @@ def test_every_crossing_of_many_random_pencils_is_found(seed):
     every_crossing_is_found(seed)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(st.integers(0, 2**20), st.integers(2, 12))
 def test_a_pair_is_not_torn_while_it_is_one(seed, n):
@@ -344,6 +351,7 @@ def reference():
     return values
 
 
+@pytest.mark.slow
 @given(first=st.integers(0, 900), n=st.integers(1, 12), step=st.integers(1, 1000))
 @settings(max_examples=200, deadline=None, derandomize=True)
 def test_names_are_right_or_not_given(reference, first, n, step):

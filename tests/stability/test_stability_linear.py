@@ -27,6 +27,7 @@ def models():
     return jax.jit(jax.vmap(lambda v: linearize(BIKE, straight_ahead(BIKE, v), states=LATERAL)))(jnp.arange(11.0))
 
 
+@pytest.mark.slow
 def test_the_bicycle_at_eleven_speeds_is_meijaards(models):
     atol = 1e-11
     M, C1, K0, K2 = (np.array(PUBLISHED[name]) for name in ("M", "C1", "K0", "K2"))
@@ -47,6 +48,7 @@ def test_canonical_matrices():
     np.testing.assert_allclose(damped.C0, [[0.0, 0.0], [0.0, 3.0]], atol=atol)
 
 
+@pytest.mark.slow
 def test_default_states_and_outputs_of_dependent_speeds():
     """Without cyclic coordinates; yaw rate = (v steer + c steer_rate) cos(lam) / w to first order."""
     atol = 1e-12
@@ -59,6 +61,7 @@ def test_default_states_and_outputs_of_dependent_speeds():
     assert repr(model).startswith("LinearModel(states: roll, steer, roll_rate")
 
 
+@pytest.mark.slow
 def test_dependent_coordinates_follow_the_constraint():
     """Hanging: y_ddot = -(g / l) y - (d / m) y_dot + push / m; and a position that is curved, by a function."""
     atol = 1e-14
@@ -71,6 +74,7 @@ def test_dependent_coordinates_follow_the_constraint():
     np.testing.assert_allclose(model.C, [[1 / 0.7, 0]], atol=atol)
 
 
+@pytest.mark.slow
 def test_about_a_displaced_equilibrium_against_differences():
     """Pushed aside by 5 N; differences of the rates along the circle."""
     atol = 1e-8
@@ -90,6 +94,7 @@ def test_about_a_displaced_equilibrium_against_differences():
     np.testing.assert_allclose(np.linalg.eigvals(other.A), np.linalg.eigvals(A), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_linear_models_are_differentiable():
     rtol = 1e-12
     frequency_squared = lambda length: -linearize(rod := RodOnPin(length=length), _hanging(rod)).A[1, 0]  # noqa: E731
@@ -101,6 +106,7 @@ def _hanging(rod):
     return jk.State(jnp.stack([jnp.zeros_like(rod.length), rod.length]), jnp.zeros(1))
 
 
+@pytest.mark.slow
 def test_faults_are_named():
     moving = jk.State(jnp.zeros(8).at[0].set(0.1), jnp.array([0.0, -10.0, 0.0]))
     with pytest.raises(ValueError, match=r"this motion is not steady: roll_rate is accelerated by .*equilibrium or"):
@@ -136,6 +142,7 @@ def test_where_constraints_do_not_determine_a_coordinate_there_is_no_linear_mode
         assert np.isnan(jax.jit(lambda q: model(q, (dependent,)).A)(jnp.array(q))).all()  # noqa: B023
 
 
+@pytest.mark.slow
 def test_singular_equations_and_derivatives_are_errors():
     """A ball joint at half a turn, where its norm does not give the last Euler parameter; a speed that is not
     determined; an output without a slope."""

@@ -45,6 +45,7 @@ class Top(jk.System):
 TOP = Top(mass=0.5, distance=0.1, across=0.006, axial=0.0008)
 
 
+@pytest.mark.slow
 def test_cyclic_coordinates():
     assert cyclic_coordinates(BIKE) == ("rear_wheel_angle", "yaw", "front_wheel_angle", "x", "y")
     assert cyclic_coordinates(TOP) == ("precession", "spin")
@@ -79,6 +80,7 @@ class Sailing(jk.System):
         )
 
 
+@pytest.mark.slow
 def test_what_matters_under_an_input_or_far_away_is_not_cyclic():
     """x_ddot = wind (1 + x / 2) / m: the model about a wind that another force balances has its mode."""
     system = Sailing()
@@ -139,6 +141,7 @@ def test_steady_precession_of_the_top_and_its_derivatives():
     np.testing.assert_allclose(curvature, second, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_fast_and_slow_precession_are_one_family():
     """Followed at one nutation, the spin falls to its least value, where the two meet, and rises again."""
     rtol = 1e-10
@@ -153,6 +156,7 @@ def test_fast_and_slow_precession_are_one_family():
     np.testing.assert_allclose(turns["precession_rate"][-1], fast, rtol=rtol)
 
 
+@pytest.mark.slow
 def test_a_disc_rolls_on_a_circle():
     """r/4 u3^2 tan(lean) - 3/2 r u2 u3 = g sin(lean): moments about the centre of a uniform disc."""
     atol = 1e-12
@@ -172,6 +176,7 @@ def test_equilibria():
     np.testing.assert_array_equal(at.u, 0.0)
 
 
+@pytest.mark.slow
 def test_torques_that_hold_a_lean_are_found():
     """Trim: turning at 3 m/s with a lean of 0.2 rad and a steer of 0.1 rad needs a roll and a steer torque."""
     atol = 1e-11
@@ -183,6 +188,7 @@ def test_torques_that_hold_a_lean_are_found():
     assert float(turn["drive_torque"]) == 0.0
 
 
+@pytest.mark.slow
 def test_what_was_held_too_little_or_wrongly_is_named():
     with pytest.raises(ValueError, match=r"family of dimension 1, along which roll, steer, .* change\. Hold 1 more"):
         steady_turn(BIKE, {"roll": 0.1, "steer": 0.05}, {"rear_wheel_rate": -20.0})
@@ -229,6 +235,7 @@ def test_handlebar_forward_from_capsize_to_rest(beside_capsize):
     assert abs((4 * v[0] - v[1]) / 3 - CAPSIZE) < 1e-9  # the speed is even in the roll
 
 
+@pytest.mark.slow
 def test_rest_with_a_turned_front_wheel_is_an_equilibrium():
     atol = 1e-12
     at = equilibrium(BIKE, {"steer": 1.3})
@@ -237,6 +244,7 @@ def test_rest_with_a_turned_front_wheel_is_an_equilibrium():
     assert residuals(jax.tree.map(lambda x: x[None], at)) < 1e-11
 
 
+@pytest.mark.slow
 def test_handlebar_reversed_from_its_capsize_to_spinning_flat():
     atol = 1e-11
     q = jk.assemble(BIKE, {"steer": np.pi + 0.01, "roll": 0.02}).q
@@ -351,6 +359,7 @@ def test_a_turn_depends_on_parameters_as_differences_say():
         np.testing.assert_allclose(found[:, i], (8 * (a - b) - (c - d)) / (12 * h), rtol=rtol)
 
 
+@pytest.mark.slow
 def test_faults_of_a_family_are_named(beside_capsize):
     with pytest.raises(ValueError, match=r"`towards` must be one name with .*; did you mean .steer."):
         family(BIKE, beside_capsize, towards={"speed": 1})

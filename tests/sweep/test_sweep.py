@@ -30,6 +30,7 @@ def rides():
     return jk.sweep.sweep(RING, starts(6), TS)
 
 
+@pytest.mark.slow
 def test_members_move_as_if_alone(rides):
     state = starts(6)
     assert rides.q.shape == (6, 6, 2)
@@ -43,6 +44,7 @@ def test_members_move_as_if_alone(rides):
             np.testing.assert_allclose(q, alone.end.q, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_off_the_cpu_chunks_are_larger_and_one_batch(monkeypatch):
     sizes, solve = [], Task.solve
 
@@ -61,6 +63,7 @@ def test_off_the_cpu_chunks_are_larger_and_one_batch(monkeypatch):
     np.testing.assert_allclose(there.q, here.q, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_samples_whose_times_differ_and_a_recording_with_a_gap():
     ts, values = np.array([0.1, 0.4, 0.8]), np.array([1.0, -2.0, 0.5])
     names = {"shoulder_torque": np.outer([1.0, np.nan], np.ones(6))}
@@ -78,6 +81,7 @@ def test_samples_whose_times_differ_and_a_recording_with_a_gap():
         jk.simulate(pendulum, rest, TS, {"elbow_torque": shifted})
 
 
+@pytest.mark.slow
 def test_a_member_with_a_body_that_cannot_be_is_invalid():
     swept = jk.sweep.sweep(Slider(inertia=np.array([0.1, -0.1])), jk.State(np.array([0.0, 0.3]), np.ones(2)), TS)
     np.testing.assert_array_equal(swept.status, [jk.Status.COMPLETED, jk.Status.INVALID])

@@ -60,6 +60,7 @@ def fallen(module, client):
     return jk.sweep.sweep(module.Drop(), start, TS, table=table, client=client, **STEPS)["x"][:, -1]
 
 
+@pytest.mark.slow
 def test_a_worker_with_another_global_is_refused(module, client, monkeypatch):
     assert cloudpickle.loads(cloudpickle.dumps(module.Drop)) is module.Drop  # travels by its name
     np.testing.assert_allclose(fallen(module, client), 9.81 / 2, rtol=1e-7)
@@ -76,6 +77,7 @@ def test_a_worker_with_another_global_is_refused(module, client, monkeypatch):
     np.testing.assert_allclose(fallen(module, client), 1.62 / 2, rtol=1e-7)  # now both have it
 
 
+@pytest.mark.slow
 def test_a_program_is_the_same_wherever_it_was_traced_first(module):
     t = jnp.zeros(())
 

@@ -81,6 +81,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHANGES)
 def test_numbers_that_the_description_reads_belong_to_the_sweep(name, copy, monkeypatch, rides):
     CHANGES[name](monkeypatch)
@@ -90,6 +91,7 @@ def test_numbers_that_the_description_reads_belong_to_the_sweep(name, copy, monk
     np.testing.assert_array_equal(run(copy).q, rides.q)
 
 
+@pytest.mark.slow
 def test_numbers_that_inputs_and_reduce_read_belong_to_the_sweep(tmp_path):
     held = {"push": np.array([1.0]), "scale": [1.0]}
     inputs = {"push": lambda t, state: held["push"][0]}
@@ -104,6 +106,7 @@ def test_numbers_that_inputs_and_reduce_read_belong_to_the_sweep(tmp_path):
     np.testing.assert_array_equal(run(tmp_path, inputs=inputs, reduce=reduce).values, first)
 
 
+@pytest.mark.slow
 def test_numbers_in_the_closure_of_a_callback_belong_to_the_sweep(tmp_path):
     """A function that the program calls back is part of it, with all that it reads."""
 
@@ -225,6 +228,7 @@ def damaged(data, how):
     return {"empty": b"", "zeros": bytes(len(data)), "cut": data[:-30], "text": b"thesis"}[how]
 
 
+@pytest.mark.slow
 def test_a_folder_is_known_again_whatever_the_order_of_the_columns(tmp_path):
     columns = {"mass": [1.0, 2.0], "x": [0.1, 0.2]}
     first = run(tmp_path / "sweep", table=columns)
@@ -410,6 +414,7 @@ def test_a_lost_manifest_is_written_again(copy, finished, rides, tmp_path_factor
         run(only_damaged)
 
 
+@pytest.mark.slow
 def test_batches_of_none_and_of_one():
     for table, shape in (({"mass": []}, (0,)), (jk.sweep.grid(mass=[], x=[0.1, 0.2]), (0, 2))):
         none = run(table=table)

@@ -84,6 +84,7 @@ def same(a, b):
         assert x.tobytes() == y.tobytes()
 
 
+@pytest.mark.slow
 def test_a_folder_holds_every_chunk_and_changes_nothing(rides, folder):
     assert [path.name for path in chunks(folder)] == [f"chunk-{i:08d}.npz" for i in range(0, 600, 32)]
     same(rides, run())
@@ -103,6 +104,7 @@ def test_a_sweep_that_was_killed_goes_on(rides, folder, script, tmp_path):
     assert {path: path.stat().st_mtime_ns for path in done} == done  # they were not computed again
 
 
+@pytest.mark.slow
 def test_a_chunk_that_cannot_be_read_is_computed_again(rides, tmp_path):
     run(tmp_path)
     chunks(tmp_path)[2].write_bytes(chunks(tmp_path)[2].read_bytes()[:1000])
@@ -110,6 +112,7 @@ def test_a_chunk_that_cannot_be_read_is_computed_again(rides, tmp_path):
         same(run(tmp_path), rides)
 
 
+@pytest.mark.slow_cases("folder")
 @pytest.mark.parametrize("kept", [True, False], ids=["folder", "memory"])
 def test_after_an_interruption_the_rest_is_called_so_and_not_kept(rides, tmp_path, monkeypatch, kept):
     import jaxkane.sweep._chunks as solving

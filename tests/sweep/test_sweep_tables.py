@@ -40,6 +40,7 @@ def test_a_grid_has_an_axis_for_every_name(rides):
     assert repr(rides) == "Sweep(72 members: theta1 (12) x mass (3) x elbow_torque (2); 72 completed)"
 
 
+@pytest.mark.slow
 def test_members_of_a_grid_move_as_if_alone(rides):
     state = jk.State(np.array([GRID.axis("theta1")[7], 0.0]), np.zeros(2))
     alone = jk.simulate(DoublePendulum(mass=3.0, length=1.0), state, TS, {"elbow_torque": 0.5}, **STEPS)
@@ -49,6 +50,7 @@ def test_members_of_a_grid_move_as_if_alone(rides):
         rides.member(7)
 
 
+@pytest.mark.slow
 def test_what_reduce_keeps_is_what_it_would_make_of_the_motions(rides):
     kept = jk.sweep.sweep(PENDULUM, REST, TS, table=GRID, chunk=32, reduce=largest, **STEPS)
     np.testing.assert_array_equal(kept["largest"], np.abs(rides["theta2"]).max(axis=-1))
@@ -229,6 +231,7 @@ def test_grids_that_are_refused():
         jk.sweep.sweep(PENDULUM, REST, TS, lambda t, state: {"elbow_torque": t}, table={"elbow_torque": [1.0, 2.0]})
 
 
+@pytest.mark.slow
 def test_a_column_that_a_function_reads_takes_no_place_by_its_name():
     table = {"theta1": [0.1, 0.2], "mass": [1.0, 2.0]}
     twice = jk.sweep.sweep(

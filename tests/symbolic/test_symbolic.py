@@ -32,6 +32,7 @@ FAST = ["DoublePendulum", "SpinningTop", "Bob", "Odd"]
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in CATALOG if name not in FAST]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*FAST, *SLOW])
 def test_formulas_give_the_numbers_of_the_library(name):
     """At three random states about the case's own, off the constraints too: formulas know of all coordinates."""
@@ -84,6 +85,7 @@ def with_rationals(x):
     return x.xreplace({number: exact(float(number), "float64") for number in x.atoms(sp.Float)})
 
 
+@pytest.mark.slow_cases("DoublePendulum")
 @pytest.mark.parametrize("name", [*PRINTED, *MORE])
 def test_what_the_book_prints(name):
     system = CATALOG[name].example()
@@ -107,6 +109,7 @@ def test_what_the_book_prints(name):
         assert sp.simplify(difference) == 0, f"{name}: {sp.simplify(difference)}"
 
 
+@pytest.mark.slow
 def test_simplified_formulas_are_those_of_the_book():
     m, l = (jk.symbolic.equations(CATALOG["DoublePendulum"].example()).symbols[name] for name in ("mass", "length"))
     found = jk.symbolic.equations(CATALOG["DoublePendulum"].example()).simplified()
@@ -186,6 +189,7 @@ def test_dependent_speeds_stand_by_their_names_and_are_replaced_first():
     assert found.operations["J"] <= 5 < found.operations["all"]
 
 
+@pytest.mark.slow
 def test_a_large_system_never_becomes_a_tree():
     """The bicycle's tree has more operations than could be counted one by one; its replacements no more than nodes."""
     bicycle = CATALOG["WhippleBicycle"].example()
@@ -226,6 +230,7 @@ def at_numbers(model, system, **more):
     return [np.asarray(x, float) for x in f(*values.values())]
 
 
+@pytest.mark.slow
 def test_linear_models_on_constraints_are_those_of_stability():
     rtol = 1e-12
     bob = Bob()
@@ -284,6 +289,7 @@ def test_what_is_no_linear_model_is_refused():
         jk.symbolic.linearize(Bob(), {"y": -1}, dependent=())
 
 
+@pytest.mark.slow
 def test_what_came_from_sympy_goes_back():
     """A model of `sympy.physics.mechanics`, made a system, has SymPy's own mass matrix and right side again."""
     me = pytest.importorskip("sympy.physics.mechanics")

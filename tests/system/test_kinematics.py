@@ -148,6 +148,7 @@ def test_an_axis_without_a_direction():
     assert np.isnan(lost.angular_velocity.to(N)).all()
 
 
+@pytest.mark.slow
 def test_the_direction_of_an_axis_has_derivatives():
     def place(a):
         return N.rotate(N.vector(a, 1.0, 2.0), 0.7, 0.0).y.to(N)

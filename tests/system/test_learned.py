@@ -64,6 +64,7 @@ def by_hand(pendulum, angle, rate):
     return (-0.4 * 9.81 * 0.15 * np.sin(angle) - torque) / (0.003 + 0.4 * 0.15**2)
 
 
+@pytest.mark.slow
 def test_it_is_one_program_of_scalars(pendulum):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

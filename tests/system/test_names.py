@@ -27,6 +27,7 @@ def test_a_hint_is_short():
     assert hint("x", []) == "there are none."
 
 
+@pytest.mark.slow
 def test_every_look_up_says_what_was_meant(ride):
     meant = "did you mean 'theta1'"
     state = jk.State([0.1, 0.2], [0.0, 0.0])
@@ -110,6 +111,7 @@ def test_a_state_of_traced_numbers_in_a_list():
     assert jax.eval_shape(q, np.float32(0.3)).dtype == np.float32
 
 
+@pytest.mark.slow
 def test_a_description_that_is_mixed_in_reads_by_name():
     class Spring:  # no System
         def loads(self, t, q, u, motion, inputs):
@@ -172,6 +174,7 @@ def test_one_name_alone_is_a_name_and_not_its_letters(ask, ride):
         ask("wobble", ride)
 
 
+@pytest.mark.slow
 def test_one_name_alone_says_the_same_as_a_list_of_it():
     assert (
         _posed(zero_order_hold="shoulder_torque").model.zero_order_hold

@@ -53,6 +53,7 @@ def test_parts_print_their_parameters_and_omit_empty_fields():
     assert repr(Learning()) == "Learning(friction=Linear with 9 numbers)"
 
 
+@pytest.mark.slow
 def test_traced_values_print_their_shapes():
     found = []
 
@@ -69,6 +70,7 @@ def test_traced_values_print_their_shapes():
     assert list(map(repr, batch)) == ["State(q=f64[2,1], u=f64[2,1])", "SteadyMotion(shape=(2,): x, x_dot, pull)"]
 
 
+@pytest.mark.slow
 def test_states_and_trajectories_print_their_numbers():
     assert repr(STATE) == "State(q=[0.25], u=[-1.5])"
     assert repr(jk.State({"x": 0.25}, {"x_dot": -0.0})) == "State(q={x: 0.25}, u={x_dot: 0})"

@@ -89,6 +89,7 @@ class Arm(jk.System):
         return {"force": force, "moment": moment}
 
 
+@pytest.mark.slow
 @needs_mujoco
 def test_load_cells_in_a_joint():
     import mujoco

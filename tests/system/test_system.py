@@ -143,6 +143,7 @@ class AboutWhatSlides(Rod):
     """The same, about a point that slides along the rod."""
 
 
+@pytest.mark.slow
 def test_inertia_about_another_point():
     at = ([0.3, 0.4], [0.5, 0.6])
     for function in (jk.mass_matrix, jk.forcing):
@@ -168,6 +169,7 @@ class Wheel(jk.System):
         )
 
 
+@pytest.mark.slow
 def test_one_moment_about_another_point():
     """M is the moment about the pin."""
     at = (0.0, [0.3], [0.5])
@@ -211,6 +213,7 @@ def test_a_sensor_sits_on_its_body_by_a_quaternion():
     np.testing.assert_allclose(S.angular_velocity.to(N), [2.0, 0.0, 0.0], atol=1e-15)
 
 
+@pytest.mark.slow
 def test_the_pendulum_of_the_page_for_sympys_users_moves_as_sympys():
     """Figures: SymPy 1.14, `kane.mass_matrix.LUsolve(kane.forcing)` of the page at x = 0.6, vx = 0.5, m = 2, l = 1."""
     page = (Path(__file__).parents[2] / "docs" / "coming_from_sympy.md").read_text(encoding="utf-8")
