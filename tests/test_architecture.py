@@ -64,7 +64,7 @@ FILES = sorted(path for path in SOURCE.rglob("*.py") if path != SOURCE / "__init
 
 
 @pytest.mark.slow
-def test_imports_point_down():
+def test_modules_import_only_from_lower_layers():
     for path in FILES:
         room = room_of(path)
         assert room in FLOORS, f"{room} has no floor yet: give it one in this test"
@@ -76,11 +76,11 @@ def test_imports_point_down():
 
 
 @pytest.mark.slow
-def test_no_files_import_each_other_in_a_circle_not_by_types_either():
+def test_no_circular_imports_including_imports_for_type_checking():
     graphlib.TopologicalSorter({path: set(imports_of(path, types=True)) - {path} for path in FILES}).prepare()
 
 
-def test_what_stands_in_the_house_itself():
+def test_top_level_modules_and_package_docstrings():
     """The public names, the public modules that are one file, and rooms that say what they are."""
     one_file = {"__init__.py", "__main__.py", "_version.py", "rotations.py", "sensors.py"}
     assert {path.name for path in SOURCE.glob("*.py")} == one_file
@@ -94,22 +94,22 @@ NOT_PROMISED = r"jax\.(core|extend|interpreters|experimental|_src)|equinox\._|ja
 OF_JAXPRS = r"(?<!_scalarjit)\.(eqns|invars|outvars|constvars|consts|jaxpr|primitive)\b"
 
 
-def test_one_file_uses_what_is_not_promised():
+def test_only_compat_uses_private_interfaces():
     the_file = SOURCE / "_scalarjit" / "compat.py"
     assert [path for path in SOURCE.rglob("*.py") if re.search(NOT_PROMISED, path.read_text())] == [the_file]
 
 
-def test_one_file_uses_the_internals_of_equinox():
+def test_only_the_integrator_uses_internals_of_equinox():
     users = [path for path in SOURCE.rglob("*.py") if re.search(r"equinox(\.| import )internal", path.read_text())]
     assert [room_of(path) for path in users] == ["_integrate"]
 
 
-def test_one_room_reads_jaxprs():
+def test_only_scalarjit_reads_jaxprs():
     readers = {path for path in SOURCE.rglob("*.py") if re.search(OF_JAXPRS, path.read_text())}
     assert {room_of(path) for path in readers} == {"_scalarjit"}
 
 
-def test_few_files_see_the_integrator():
+def test_only_listed_modules_import_diffrax():
     users = {path for path in SOURCE.rglob("*.py") if "import diffrax" in path.read_text()}
     assert {room_of(path) for path in users} == {"_integrate", "fit", "stability"}
     of_integrate = {path.stem for path in users if room_of(path) == "_integrate"}
@@ -144,7 +144,7 @@ def test_fit_exports_at_most_46_names():
     assert len(names) == len(set(names)) <= 46
 
 
-def test_every_public_function_says_what_it_does():
+def test_every_public_name_has_a_docstring():
     rooms = (jk.loads, jk.sensors, jk.fit, jk.sweep, jk.stability, jk.catalog, jk.bicycles, jk.rotations)
     for module in (jk, *rooms, jk.symbolic, jk.export):
         for name, thing in vars(module).items():

@@ -53,7 +53,7 @@ def test_a_full_disk_leaves_the_old_file(old, monkeypatch, where):
     assert names(old.parent) == ["report.html"]
 
 
-def test_an_error_that_hides_a_full_disk(old):
+def test_a_full_disk_is_reported_when_zipfile_raises_another_error(old):
     """`zipfile` raises a ValueError of its own when it closes a file that the disk cut short."""
 
     def put(file):
@@ -71,7 +71,7 @@ def test_an_error_that_hides_a_full_disk(old):
             atomic_write(old, lambda file: 1 / 0)
 
 
-def test_what_cannot_be_a_file(tmp_path, old, monkeypatch):
+def test_invalid_file_paths_raise_an_explained_error(tmp_path, old, monkeypatch):
     (tmp_path / "folder").mkdir()
     for path, kind, reason in (
         (tmp_path / "folder", IsADirectoryError, r"folder could not be written: Is a directory. Remove that folder"),
@@ -92,7 +92,7 @@ def test_what_cannot_be_a_file(tmp_path, old, monkeypatch):
     assert old.read_bytes() == b"old"
 
 
-def test_folders_are_made_and_links_and_modes_are_kept(tmp_path, old):
+def test_missing_folders_are_created_and_links_and_file_modes_preserved(tmp_path, old):
     atomic_write(tmp_path / "a" / "b" / "x.c", lambda file: file.write(b"new"))
     assert names(tmp_path / "a" / "b") == ["x.c"]
     if os.name == "posix":
@@ -106,7 +106,7 @@ def test_folders_are_made_and_links_and_modes_are_kept(tmp_path, old):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="kills a process")
-def test_what_a_killed_writer_left_is_removed_by_the_next(old):
+def test_temporary_files_of_a_killed_writer_are_removed_by_the_next_write(old):
     process = subprocess.run([sys.executable, "-c", KILLED, files.__file__, old])
     assert process.returncode == -signal.SIGKILL
     assert old.read_bytes() == b"old"
@@ -134,7 +134,7 @@ class Weight(jk.System):
 
 
 @pytest.mark.slow
-def test_animations_and_exports_replace_old_files_as_a_whole(tmp_path, monkeypatch):
+def test_animations_and_exports_replace_files_atomically(tmp_path, monkeypatch):
     ride = jk.simulate(Weight(), jk.State([0.0], [0.0]), np.linspace(0.0, 0.5, 6))
     animation = jk.animate(Weight(), ride)
     writers = {

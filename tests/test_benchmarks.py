@@ -51,7 +51,7 @@ def joint_torques(system, q, u, u_dot):
 
 
 @pytest.mark.slow
-def test_the_joints_of_a_free_chain_give_no_torque():
+def test_joint_torques_of_a_freely_moving_chain_are_zero():
     rtol = 1e-12
     q, u = chain.states(CHAIN.n, 3)
     u_dot = chain.accelerations_by_jaxkane(CHAIN, q, u)
@@ -61,7 +61,7 @@ def test_the_joints_of_a_free_chain_give_no_torque():
 
 
 @pytest.mark.parametrize("peer", ["mujoco", "pinocchio"])
-def test_engines_accelerate_the_chain_alike(peer):
+def test_accelerations_of_the_chain_agree_with_other_engines(peer):
     rtol = 1e-9
     pytest.importorskip(peer)
     q, u = chain.states(CHAIN.n, 3)
@@ -69,14 +69,14 @@ def test_engines_accelerate_the_chain_alike(peer):
     np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=rtol * np.abs(ours).max())
 
 
-def test_operations_of_a_bicycle_are_counted_where_one_program_calls_another():
+def test_operation_counts_include_nested_programs():
     every = assemblies.assemblies()
     count = lambda name: assemblies.operations(every[name], assemblies.states(every[name], 1)[0])  # noqa: E731
     whipple, full = count(assemblies.WHIPPLE), count(assemblies.FULL)
     assert 1000 < whipple < full < 3 * whipple
 
 
-def test_files_for_engines_hold_the_same_chain():
+def test_mjcf_and_sdf_files_contain_the_same_chain():
     bodies = list(ET.fromstring(chain.mjcf(CHAIN)).iter("body"))
     links = [link for link in ET.fromstring(chain.sdf(CHAIN)).iter("link") if link.get("name") != "ground"]
     assert (len(bodies), len(links)) == (CHAIN.n, CHAIN.n)
@@ -89,7 +89,7 @@ def test_files_for_engines_hold_the_same_chain():
         assert body.get("pos") == ("0 0 -0.2" if i else "0 0 0.0")
 
 
-def test_what_is_not_installed_is_named(monkeypatch):
+def test_missing_packages_are_reported_by_name(monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pinocchio" else found(name))
     assert "pip install pin" in _peers.missing()["Pinocchio"]
@@ -99,7 +99,7 @@ def test_what_is_not_installed_is_named(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_part_runs_without_its_peers(tmp_path):
+def test_a_benchmark_runs_without_the_compared_packages(tmp_path):
     blocked = "import sys; sys.modules.update(dict.fromkeys(['mujoco', 'pinocchio', 'jaxsim', 'rod']))\n"
     (tmp_path / "sitecustomize.py").write_text(blocked)
     command = [sys.executable, "-m", "benchmarks", "chains", "--quick", "--out", str(tmp_path / "out")]
@@ -114,7 +114,7 @@ def test_a_part_runs_without_its_peers(tmp_path):
     assert str(tmp_path) not in table
 
 
-def test_verdicts():
+def test_figures_are_compared_with_their_limits():
     fast, slow = Figure("p", "a", 1.9, at_most=2.0), Figure("p", "a", 2.1, column="native", at_most=2.0)
     more, none = Figure("p", "b", 5.0, "rides/s", at_least=6.0), Figure("p", "c", 5.0, "ms")
     assert [f.met for f in (fast, slow, more, none)] == [True, False, False, None]
@@ -125,7 +125,7 @@ def test_verdicts():
     ]  # fmt: skip
 
 
-def test_the_table_puts_columns_side_by_side_and_keeps_what_was_measured_here(tmp_path):
+def test_the_table_has_parallel_columns_and_keeps_local_measurements(tmp_path):
     results = Results({"cores": "2"}, {"MJX": "pip install mujoco-mjx"})
     results.figures["rides"] = [
         Figure("rides", "faster than odeint", 3.0, column="XLA", at_least=2.5),
@@ -143,7 +143,7 @@ def test_the_table_puts_columns_side_by_side_and_keeps_what_was_measured_here(tm
     assert not draw([], tmp_path / "speed.png")
 
 
-def test_rivals_run_in_turns():
+def test_compared_functions_are_timed_alternately():
     order = []
     best = in_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, seconds=0.0, rounds=2)
     assert order == ["a", "b"] * 3  # once to warm up, and two rounds
@@ -151,13 +151,13 @@ def test_rivals_run_in_turns():
     assert all(0 <= seconds < 1 for seconds in best.values())
 
 
-def test_a_child_that_fails_says_why():
+def test_a_failed_child_process_reports_the_reason():
     with pytest.raises(RuntimeError, match="No module named no_such_module"):
         list(child("no_such_module"))
 
 
 @pytest.mark.slow
-def test_the_floor_of_first_calls_solves_its_equation():
+def test_the_baseline_of_first_calls_solves_its_equation():
     rtol = 1e-7
     slopes = first_calls.floor("sensitivities", samples=3, parameters=4)()
     np.testing.assert_allclose(slopes, np.full(4, -5 * np.exp(-5) / 4), rtol=rtol)  # y = exp(-k t), k their mean
@@ -165,7 +165,7 @@ def test_the_floor_of_first_calls_solves_its_equation():
         assert jax.eval_shape(first_calls.floor(call, samples=3, parameters=4)).shape == shape
 
 
-def test_parts_of_first_calls_are_seconds_of_the_wall():
+def test_overlapping_intervals_of_first_calls_are_counted_once():
     assert first_calls.union([(5.0, 6.0), (1.0, 3.0), (2.0, 4.0), (1.5, 2.0)]) == 4.0
     seconds = {"floor": 2.0, "native": 3.0, "XLA alone": 7.0}
     assert first_calls.row("sweep", seconds) == "| sweep | 2 s | 3 s | 1.5 | 7 s | 3.5 |"

@@ -25,7 +25,7 @@ EXPECTED = {
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_a_recording_is_whole(name):
+def test_a_recording_is_complete(name):
     load, n, seconds, channels = EXPECTED[name]
     found = load()
     assert len(found.trials) == n
@@ -42,7 +42,7 @@ def slope(x, y):
     return float(x @ y / (x @ x)), float(np.corrcoef(x, y)[0, 1])
 
 
-def test_rates_are_those_of_the_angles():
+def test_measured_rates_agree_with_the_measured_angles():
     for trial in jk.data.multi_arm_pendulum(2).trials[:3]:
         found, agreement = slope(np.gradient(trial.measured["angle1"], trial.t), trial.initial["rate1"])
         assert abs(found - 1.0) < 0.01
@@ -54,7 +54,7 @@ def test_rates_are_those_of_the_angles():
         assert np.quantile(off, 0.99) < 0.01  # [rad]; single samples jump
 
 
-def test_the_elbow_turns_as_its_rates_say():
+def test_angular_velocities_of_the_elbow_agree_with_its_quaternions():
     """The angular velocity along the body's axes, by two quaternions q1, q2: about 2 vec(q1^-1 q2) / dt."""
     trial = jk.data.tossed_elbow().trials[0]
     e = np.stack([trial.measured[f"e{i + 1}"] for i in range(4)])
@@ -65,7 +65,7 @@ def test_the_elbow_turns_as_its_rates_say():
     assert slope((2 * turned / np.diff(trial.t)).ravel(), omega.ravel())[1] > 0.95
 
 
-def test_bicycles_have_the_parameters_of_their_makers():
+def test_bicycles_can_be_built_from_the_published_parameters():
     for values in (
         jk.data.steer_by_wire().parameters,
         jk.data.robot_bicycle().parameters,
@@ -75,7 +75,7 @@ def test_bicycles_have_the_parameters_of_their_makers():
         assert float(bicycle.w) == values["w"]
 
 
-def test_torques_and_channels_may_be_chosen():
+def test_torque_source_and_channels_can_be_selected():
     measured, commanded = (jk.data.driven_double_pendulum(which).trials[3] for which in ("measured", "commanded"))
     assert np.all(commanded.inputs["torque1"] == 0.0)  # only the elbow is driven
     assert np.std(measured.inputs["torque1"]) > 0.01  # yet its drive feels something
@@ -90,7 +90,7 @@ def test_torques_and_channels_may_be_chosen():
     assert len(jk.data.steer_by_wire(seconds=0.5).trials[0].t) == 50
 
 
-def test_other_files_of_the_same_columns_are_read(tmp_path):
+def test_other_files_with_the_same_columns_can_be_read(tmp_path):
     shipped = FILES / "multi_arm_pendulum" / "single.csv.gz"
     plain = tmp_path / "another.csv"
     plain.write_bytes(gzip.decompress(shipped.read_bytes()))
@@ -103,7 +103,7 @@ def test_other_files_of_the_same_columns_are_read(tmp_path):
         jk.data.multi_arm_pendulum(2, file=plain)
 
 
-def test_what_is_shipped_is_small_and_has_its_licence():
+def test_data_files_are_small_and_have_a_licence():
     assert sum(path.stat().st_size for path in FILES.rglob("*")) < 3e6
     for folder in FILES.iterdir():
         assert len((folder / "LICENCE").read_text(encoding="utf-8")) > 500

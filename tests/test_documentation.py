@@ -25,7 +25,7 @@ def assert_power_is_the_rate_of_energy(system, state):
 
 
 @pytest.mark.slow
-def test_the_recipes_describe_mechanisms():
+def test_mechanisms_of_the_recipes_satisfy_the_power_balance():
     names = {}
     for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL):
         exec(block, names)

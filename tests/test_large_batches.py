@@ -23,7 +23,7 @@ def assert_equal(whole, parts):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(b).max())
 
 
-def test_products_of_matrices_by_jax_itself():
+def test_matrix_products_in_user_code_are_correct_in_large_batches():
     """As a user writes them. See `jaxkane._scalarjit.compat.switch_off_wrong_fusions`."""
     turn, rows = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.5], [0.0, 0.0, 1.0]]), np.arange(3.0 * N).reshape(N, 3)
     squares = jax.jit(jax.vmap(lambda row: jnp.sum((turn @ row) ** 2)))(rows)
@@ -33,7 +33,7 @@ def test_products_of_matrices_by_jax_itself():
 @pytest.mark.slow
 @pytest.mark.optimized
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_equations_of_many_states(name, kernels):
+def test_accelerations_of_large_batches_are_correct(name, kernels):
     """Scalar programs, and above twelve speeds products of matrices."""
     system, rng = SYSTEMS[name], np.random.default_rng(0)
     q, u = (jnp.asarray(rng.uniform(-1.0, 1.0, (N, len(names)))) for names in (system.coordinates, system.speeds))
@@ -49,7 +49,7 @@ def test_equations_of_many_states(name, kernels):
 
 @pytest.mark.slow
 @pytest.mark.optimized
-def test_reduced_members_of_a_sweep():
+def test_reduce_functions_with_matrix_products_in_large_sweeps():
     """`reduce` is code of the user, which may multiply matrices."""
     system, turn = SYSTEMS["double pendulum"], jnp.array([[0.0, 1.0], [-1.0, 0.5]])
     starts = jk.State(jnp.asarray(np.random.default_rng(0).uniform(-1.0, 1.0, (N, 2))), jnp.zeros(2))
@@ -63,7 +63,7 @@ def test_reduced_members_of_a_sweep():
 
 @pytest.mark.slow
 @pytest.mark.optimized
-def test_elimination_in_many_windows():
+def test_elimination_in_large_batches_of_windows():
     n_z, n_b, n_x = 2, 1, 3
     k = n_z + n_b + n_x + 1
     R = np.triu(np.random.default_rng(0).normal(size=(N, k, k))) + 2.0 * np.eye(k)

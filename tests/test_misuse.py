@@ -54,7 +54,7 @@ def halved(self, t, q, u):
 
 
 @pytest.mark.slow
-def test_methods_set_on_a_class_read_by_name():
+def test_methods_assigned_to_a_class_can_read_by_name():
     """Moment about the pivot: m l^2 = 2 kg m^2; the torque is -0.5 N m."""
     kind = fresh()
     pendulum = kind()
@@ -75,7 +75,7 @@ def test_methods_set_on_a_class_read_by_name():
     assert acceleration(pendulum) == pytest.approx(-9.81 * np.sin(0.3) - 0.3, rel=1e-12)
 
 
-def test_an_autoreload_puts_in_new_methods():
+def test_autoreload_replaces_methods():
     """As IPython's does it: what a method was made from changes in its `__dict__`, and its closure cannot."""
     old, new = fresh(), fresh()
     old.loads, new.loads = Pendulum.loads.__wrapped__, damped
@@ -86,7 +86,7 @@ def test_an_autoreload_puts_in_new_methods():
     assert acceleration(pendulum) == pytest.approx(-0.25, rel=1e-12)
 
 
-def test_names_and_units_set_on_a_class_are_checked():
+def test_names_and_units_assigned_to_a_class_are_checked():
     kind = fresh()
     with pytest.raises(TypeError, match=r"Pendulum.coordinates must be a tuple of names, got the string 'angle'"):
         kind.coordinates = "angle"
@@ -110,12 +110,12 @@ def test_names_and_units_set_on_a_class_are_checked():
         ),
     ],
 )
-def test_units_are_texts_of_names_that_there_are(units, error, match):
+def test_invalid_units_raise(units, error, match):
     with pytest.raises(error, match=match):
         type("Pendulum", (Pendulum,), {"units": units})()
 
 
-def test_units_that_are_inherited_may_name_more():
+def test_inherited_units_may_contain_additional_names():
     base = type("Base", (Pendulum,), {"units": {"angle": "rad", "torque": "N m"}})
     assert units_of(type("Free", (base,), {"inputs": ()})()) == {"angle": "rad", "rate": "rad/s"}
 
@@ -148,7 +148,7 @@ def saveat_and_adjoint(part):
 
 @pytest.mark.slow_cases("loads", "rates")
 @pytest.mark.parametrize("part", ["motion", "center", "number", "loads", "rates"])
-def test_what_is_kept_from_an_earlier_call_is_refused(part):
+def test_stored_results_of_an_earlier_call_are_rejected(part):
     KEPT.clear()
     pendulum = saveat_and_adjoint(part)()
     with pytest.raises(TypeError, match=r"Keeping: its description returns .* of an earlier call, which it has stored"):
@@ -157,7 +157,7 @@ def test_what_is_kept_from_an_earlier_call_is_refused(part):
         jk.simulate(pendulum, jk.State([0.3], [0.0]), TS)
 
 
-def test_a_motion_of_numbers_that_was_kept_is_refused():
+def test_a_stored_motion_of_plain_numbers_is_rejected():
     """Which would be a motion that does not depend on the coordinates."""
     KEPT.clear()
     pendulum = saveat_and_adjoint("motion")()
@@ -180,7 +180,7 @@ def four_bar(across):
 
 
 @pytest.mark.slow
-def test_a_loop_that_cannot_be_closed_any_more_is_refused():
+def test_a_parameter_change_that_prevents_loop_closure_is_rejected():
     system = four_bar(jnp.zeros(()))
     broken = system.replace({"site.ground.y": 0.1})
     state = jk.assemble(system, {"q1": 0.9})
@@ -200,14 +200,14 @@ def test_a_loop_that_cannot_be_closed_any_more_is_refused():
 
 
 @pytest.mark.slow
-def test_a_member_whose_loop_cannot_be_closed_is_invalid():
+def test_a_batch_member_whose_loop_cannot_be_closed_has_status_invalid():
     system = four_bar(jnp.zeros(()))
     apart = np.linspace(0.0, 0.1, 2)
     members = jk.sweep.sweep(system.replace({"site.ground.y": apart}), jk.assemble(system, {"q1": 0.9}), TS)
     assert list(members.reason) == ["completed", "invalid"]
 
 
-def test_a_mechanism_of_one_link_is_a_list():
+def test_mechanism_arguments_must_be_lists():
     link = Link("a", joints=hinge("q"), **BAR)
     with pytest.raises(TypeError, match=r"mechanism: `links` must be a list, e\.g\. \[Link\(...\), ...\]"):
         mechanism(link)
@@ -218,7 +218,7 @@ def test_a_mechanism_of_one_link_is_a_list():
     assert mechanism(x for x in [link]).coordinates == ("q",)
 
 
-def test_a_parameter_that_is_zero_in_the_structure_says_so():
+def test_reading_a_structural_zero_raises_an_explanation():
     arm = mechanism([Link("a", joints=hinge("q", damping=0.1), **BAR)])
     assert arm.damping["q"] == 0.1
     assert arm.center["a"]["x"] == 0.5
@@ -251,7 +251,7 @@ def test_a_parameter_that_is_zero_in_the_structure_says_so():
         (1j, TypeError, r"the time `t` must be one number"),
     ],
 )
-def test_the_time_of_an_assembly_is_a_number(t, error, match):
+def test_the_time_passed_to_assemble_must_be_a_number(t, error, match):
     with pytest.raises(error, match=f"Pendulum: {match}"):
         jk.assemble(Pendulum(), {}, t=t)
 
@@ -261,7 +261,7 @@ def test_a_table_of_labels_alone_is_refused():
         jk.sweep.sweep(Pendulum(), jk.State([0.1], [0.0]), TS, table={"label": ["a", "b"]})
 
 
-def test_parameters_by_name_are_a_tree_as_a_dict_is():
+def test_named_parameters_are_a_pytree_like_a_dict():
     arm = mechanism([Link("a", joints=hinge("q", damping=0.1), **BAR)])
     doubled = jax.tree.map(lambda x: 2.0 * x, arm.center)
     assert doubled == {"a": {"x": 1.0}}
@@ -295,7 +295,7 @@ def test_parameters_by_name_are_a_tree_as_a_dict_is():
         ),
     ],
 )
-def test_elements_that_cannot_be(element, error, match):
+def test_invalid_load_elements_raise(element, error, match):
     N, O = jk.inertial()
     with pytest.raises(error, match=match):
         element(N.rotate(3, 0.1, 0.2), O)
@@ -326,7 +326,7 @@ OF_A_STATE = [
 
 @pytest.mark.parametrize("wrong", NO_NUMBERS)
 @pytest.mark.parametrize("name", OF_A_STATE)
-def test_what_is_no_number_is_refused_by_name(name, wrong):
+def test_non_numeric_arguments_are_rejected_by_name(name, wrong):
     """By every public function of a state, in one line."""
     f, value = getattr(jk, name), NO_NUMBERS[wrong]
     system = Welded() if name == "best_dependent_speeds" else Pendulum()
@@ -354,7 +354,7 @@ class Welded(Pendulum):
 
 
 @pytest.mark.parametrize("wrong", NO_NUMBERS)
-def test_what_is_no_number_is_refused_in_a_simulation(wrong):
+def test_non_numeric_values_are_rejected_in_a_simulation(wrong):
     value, start = NO_NUMBERS[wrong], jk.State([0.3], [0.5])
     simulate = functools.partial(jk.simulate, Pendulum())
     cases = [
@@ -450,12 +450,12 @@ def parts():
         ),
     ],
 )
-def test_what_is_no_number_of_its_kind_is_refused_in_words(wrong, words):
+def test_numbers_of_the_wrong_kind_raise_an_explained_error(wrong, words):
     with pytest.raises((TypeError, ValueError), match=words):
         wrong(*parts())
 
 
-def test_masked_numbers_are_refused_and_those_that_are_not_masked_taken():
+def test_masked_values_are_rejected_and_unmasked_arrays_accepted():
     masked = np.ma.array([0.3], mask=[True])
     for make in (lambda: jk.State(masked, [0.5]), lambda: Pendulum(mass=np.ma.masked)):
         with pytest.raises(ValueError, match="Some values are masked"):
@@ -467,7 +467,7 @@ def test_masked_numbers_are_refused_and_those_that_are_not_masked_taken():
 
 
 @pytest.mark.parametrize("name", ["q_dot", "events", "outputs", "loads"])
-def test_a_parameter_with_the_name_of_a_method_is_refused(name):
+def test_a_parameter_named_like_a_method_is_rejected(name):
     """It replaced the method: events never came, and accelerations were those of other rates."""
     kind = type("Named", (Pendulum,), {"__annotations__": {name: jk.Scalar}, name: jk.parameter(1.0)})
     with pytest.raises(
@@ -476,7 +476,7 @@ def test_a_parameter_with_the_name_of_a_method_is_refused(name):
         kind()
 
 
-def test_a_parameter_with_the_name_of_names_is_refused():
+def test_a_parameter_named_like_a_class_attribute_is_rejected():
     members = {"__annotations__": {"inputs": jk.Scalar}, "inputs": jk.parameter(1.0)}
     with pytest.raises(TypeError, match=r"Named.inputs must be a tuple of names, such as .*Rename the field"):
         type("Named", (Pendulum,), members)
@@ -492,7 +492,7 @@ def test_a_parameter_with_the_name_of_names_is_refused():
         (None, TypeError, "must be a name, an integer or a slice, got None"),
     ],
 )
-def test_a_place_that_there_is_not(key, error, message):
+def test_an_invalid_index_or_name_raises(key, error, message):
     def loads(self, t, q, u, motion, inputs):
         return jk.Torque(jnp.sum(jnp.asarray(q[key])) * motion.N.z, motion["L"])
 
@@ -500,7 +500,7 @@ def test_a_place_that_there_is_not(key, error, message):
         acceleration(type("Pendulum", (Pendulum,), {"loads": loads})())
 
 
-def test_a_traced_place_reads_an_array():
+def test_a_traced_index_can_be_used():
     def loads(self, t, q, u, motion, inputs):
         return jk.Torque(q[jnp.asarray(t, int)] * motion.N.z, motion["L"])
 

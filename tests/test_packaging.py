@@ -25,7 +25,7 @@ def test_there_is_one_version():
     assert re.search(r"^## \[(.+?)\]", changes, re.MULTILINE)[1] in (jk.__version__, "Unreleased")
 
 
-def test_the_citation_is_of_this_version_and_says_what_it_stands_on():
+def test_the_citation_file_has_this_version_and_its_references():
     """Required keys of the Citation File Format 1.2.0; a reference has at least its kind, title and authors."""
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["cff-version"] == "1.2.0"
@@ -42,7 +42,7 @@ def test_the_library_is_typed():
     assert "Typing :: Typed" in PROJECT["classifiers"]
 
 
-def test_every_python_that_is_named_is_checked():
+def test_every_supported_python_version_is_tested_in_ci():
     checks = yaml.safe_load((ROOT / ".github/workflows/checks.yml").read_text(encoding="utf-8"))
     assert checks["jobs"]["tests"]["strategy"]["matrix"]["python"] == PYTHONS
     assert PROJECT["requires-python"] == f">={PYTHONS[0]}"
@@ -52,7 +52,7 @@ def test_every_python_that_is_named_is_checked():
     assert f"Python {PYTHONS[0]} to {PYTHONS[-1]}" in readme
 
 
-def test_every_requirement_says_its_lowest_version_and_jax_its_ceiling():
+def test_requirements_have_lower_bounds_and_jax_an_upper_bound():
     run = subprocess.run([sys.executable, ROOT / ".ci/lowest"], capture_output=True, text=True, check=True)
     floors = dict(line.split("==") for line in run.stdout.splitlines())
     named = {re.match(r"[\w.-]+", entry)[0] for entry in PROJECT["dependencies"]}
@@ -62,7 +62,7 @@ def test_every_requirement_says_its_lowest_version_and_jax_its_ceiling():
     assert floors["jax"] == re.match(r"jax>=([\d.]+)", jax)[1]
 
 
-def test_the_recipe_asks_for_what_the_wheel_asks_for():
+def test_the_conda_recipe_has_the_requirements_of_the_wheel():
     text = (ROOT / "recipe/recipe.yaml").read_text(encoding="utf-8")
     recipe = yaml.safe_load(text)
     asked = {line.replace(" ", "").replace("-base", "") for line in recipe["requirements"]["run"][1:]}
@@ -70,7 +70,7 @@ def test_the_recipe_asks_for_what_the_wheel_asks_for():
     assert recipe["context"] == {"version": jk.__version__, "python_min": PYTHONS[0]}
 
 
-def test_every_row_of_the_validation_page_is_a_test_and_every_such_test_a_row():
+def test_rows_of_the_validation_page_match_the_published_tests():
     page = (ROOT / "docs/validation.md").read_text(encoding="utf-8")
     rows = set(re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", page))
     marked = r"@pytest\.mark\.published\n(?:@.*\n)*def (\w+)"
@@ -82,7 +82,7 @@ def test_every_row_of_the_validation_page_is_a_test_and_every_such_test_a_row():
     assert rows == there
 
 
-def test_files_of_tests_have_names_of_their_own():
+def test_test_files_have_unique_names():
     """pytest imports them by their names alone: two of one name end the whole run."""
     names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
     assert sorted(names) == sorted(set(names))
@@ -97,7 +97,7 @@ def test_the_self_test():
     assert [line.startswith("ok: ") for line in lines[-3:]] == [True] * 3
 
 
-def test_a_self_test_that_fails_says_so(monkeypatch, capsys):
+def test_a_failed_self_test_is_reported(monkeypatch, capsys):
     from jaxkane import __main__ as program
 
     monkeypatch.setattr(
@@ -113,7 +113,7 @@ def test_a_self_test_that_fails_says_so(monkeypatch, capsys):
     assert program.main() == 0
 
 
-def test_the_documentation_is_built_with_what_its_extra_installs():
+def test_the_docs_extra_contains_the_packages_that_the_build_needs():
     """Signatures are formatted by ruff, and notebooks need their kernel and the packages that they import."""
     extra = " ".join(PROJECT["optional-dependencies"]["docs"])
     for package in ("ruff", "mkdocs>", "mkdocs-material", "mkdocstrings[python]", "nbconvert", "latex2mathml"):

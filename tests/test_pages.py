@@ -46,7 +46,7 @@ def names_of_fit():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUN, ids=[page.stem for page in RUN])
-def test_a_page_runs(page, tmp_path, monkeypatch, request):
+def test_the_code_of_each_page_runs(page, tmp_path, monkeypatch, request):
     assert blocks_of(page), f"{page.name} has nothing to type in"
     if page.stem == "symbolic":
         pytest.importorskip("sympy")
@@ -101,7 +101,7 @@ def ride_of(system, q, u, n=101, most=1e-6):
     return ride
 
 
-def test_links_and_pictures_are_there():
+def test_linked_files_and_pictures_exist():
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         for target in re.findall(r"\]\(([^)#:]+)\)", text) + re.findall(r'src="([^"]+)"', text):
@@ -114,7 +114,7 @@ def headings_of(page):
     return re.findall(r"^#+ (.*)", text, re.MULTILINE)
 
 
-def test_links_of_the_readme_lead_to_headings():
+def test_links_of_the_readme_resolve_to_headings():
     """`mkdocs build --strict` checks the links of the pages, but not those of the README."""
     links = re.findall(r"\]\(([^)#:]+)(?:#([^)]+))?\)", (DOCS.parent / "README.md").read_text(encoding="utf-8"))
     for path, anchor in links:
@@ -132,7 +132,7 @@ SEARCHED = (
 
 
 @pytest.mark.parametrize("words", SEARCHED)
-def test_words_that_readers_search_for_are_headings(words):
+def test_common_search_terms_are_headings(words):
     navigation = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
     headings = [heading.lower() for page in PAGES for heading in headings_of(page)]
     assert any(words in heading for heading in (*headings, navigation.lower()))
@@ -162,7 +162,7 @@ def test_the_reference_is_in_the_order_of_use(hooks):
     assert not unknown
 
 
-def test_a_link_that_leads_nowhere_is_found(hooks, tmp_path, caplog):
+def test_broken_links_are_reported(hooks, tmp_path, caplog):
     (tmp_path / "a.html").write_text('<h1 id="there">A</h1><a href="#there"></a><a href="b.html#missing"></a>')
     (tmp_path / "b.html").write_text('<a href="a.html#there"></a><img src="c.png">')
     with caplog.at_level(logging.WARNING):
@@ -172,12 +172,12 @@ def test_a_link_that_leads_nowhere_is_found(hooks, tmp_path, caplog):
     }  # fmt: skip
 
 
-def test_every_picture_of_the_gallery_is_of_an_entry():
+def test_gallery_pictures_match_the_catalogue_entries():
     """The site's gallery is made from the catalogue; a picture is wanted of each, and of nothing else."""
     assert {path.stem for path in (DOCS / "catalogue").glob("*.png")} == set(jk.catalog.CATALOG)
 
 
-def test_code_is_not_wider_than_its_box():
+def test_code_lines_fit_the_page_width():
     for page in PAGES:
         for block in re.findall(r"```(?:python|py)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
             wide = [line for line in block.splitlines() if len(line) > 80]

@@ -151,7 +151,7 @@ LARGE = Units(1e6, 1e9, 1e5)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["BarWithPiston", "SliderWithPinnedBar"])
-def test_systems_in_other_units(name):
+def test_results_do_not_depend_on_the_units(name):
     expected = results(name, Units())
     assert expected["equilibrium"] is not None
     for units in (SMALL, LARGE):
@@ -178,7 +178,7 @@ MODERATE = [Units(1e-3, 1e-3, 1.0), Units(1e2, 1e2, 1e-2), Units(1e-2, 1.0, 1e3)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["BarWithPiston", "DoublePendulum", "RotatingFrameAndBar", "WhippleBicycle"])
-def test_systems_in_other_units_in_float32(name):
+def test_results_do_not_depend_on_the_units_in_float32(name):
     """Within its range: an inertia of 1e-9 kg (1e-9 m)^2 times one of its kind is smaller than any number."""
     expected = results(name, Units())
     for units in (Units(), *MODERATE):
@@ -187,7 +187,7 @@ def test_systems_in_other_units_in_float32(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("i", "name"), [*enumerate(CATALOG)])
-def test_every_system_in_six_of_24_units(i, name):
+def test_results_of_every_system_in_six_of_24_unit_systems(i, name):
     """Four systems in succession have all 24 units."""
     expected = results(name, Units())
     for units in combinations()[i % 4 :: 4]:

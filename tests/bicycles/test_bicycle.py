@@ -31,7 +31,7 @@ def everything(bicycle, q, u, inputs):
 
 
 @pytest.mark.parametrize("i", range(8))
-def test_states_that_three_independent_programs_agree_on(i):
+def test_accelerations_agree_with_three_independent_programs(i):
     """`whipple_nonlinear.json`: SymBRiM, PyDy and Moore's equations, to 2e-14 of each other."""
     rtol = 1e-12
     oracle = load("whipple_nonlinear.json")
@@ -53,7 +53,7 @@ def test_states_that_three_independent_programs_agree_on(i):
 @pytest.mark.slow
 @pytest.mark.optimized
 @pytest.mark.published
-def test_the_published_nonlinear_state_of_basu_mandal(published):
+def test_accelerations_agree_with_the_nonlinear_state_of_basu_mandal(published):
     """Table 1, in the book's coordinates."""
     s = load("basu_mandal2007.json")["seed"]
     pitch_from_constraint = jk.assemble(BIKE, {"roll": s["q"]["phi"], "steer": s["q"]["delta"]}).q[4]
@@ -78,7 +78,7 @@ def moving_state():
 
 
 @pytest.mark.slow
-def test_J_dot_against_differences_and_the_books_wrong_sign():
+def test_J_dot_agrees_with_differences_and_not_with_the_printed_sign():
     """Erratum 1: the book prints C1_dot - C2_dot J; with a plus it agrees with differences of J."""
     q, u = moving_state()
     q_dot = jk.coordinate_rates(BIKE, 0.0, q, u)
@@ -101,7 +101,7 @@ def test_J_dot_against_differences_and_the_books_wrong_sign():
 
 
 @pytest.mark.slow
-def test_partial_velocities_are_the_books():
+def test_partial_velocities_agree_with_the_book():
     """[WA] of Example 7: the rear wheel's partial angular velocities, with the dependent speeds eliminated."""
     q, u = moving_state()
     _, W = jk.partial_velocities(BIKE, 0.0, q, u)
@@ -116,7 +116,7 @@ def test_partial_velocities_are_the_books():
 
 
 @pytest.mark.slow
-def test_power_of_the_inputs_is_what_the_conventions_say():
+def test_generalized_active_forces_of_the_inputs_are_the_torques():
     """The generalized active forces of (roll_rate, rear_wheel_rate, steer_rate) are the three torques themselves."""
     q, u = moving_state()
     none = jk.generalized_active_forces(BIKE, 0.0, q, u)
@@ -135,7 +135,7 @@ def test_steer_damping_takes_power():
 
 
 @pytest.mark.slow
-def test_dependent_speeds_become_singular_where_the_design_says():
+def test_dependent_speeds_are_singular_at_the_predicted_steer_angle():
     """det C_dep changes sign at a steer of 91.77 degrees, upright; its condition number is about 120 at 90."""
     from jaxkane._kane.kanes_method import KaneEquations
     from jaxkane._scalarjit.components import determinant, stack
@@ -161,7 +161,7 @@ def text(**changes):
     return "".join(f"{name} = {value}+/-0.01\n" for name, value in values.items() if value is not None)
 
 
-def test_from_file_reads_values_and_deviations(tmp_path):
+def test_from_file_reads_values_and_standard_deviations(tmp_path):
     path = tmp_path / "Benchmark.txt"
     path.write_text(text(yB=0.0, IRzz=0.0603))
     bicycle = WhippleBicycle.from_file(path)
@@ -184,7 +184,7 @@ def test_from_file_reads_values_and_deviations(tmp_path):
         (text(mB=-85.0), r"WhippleBicycle.mB = -85.0 must be positive"),
     ],
 )
-def test_faults_of_a_file_are_named_with_their_line(tmp_path, content, message):
+def test_errors_in_a_file_are_reported_with_their_line(tmp_path, content, message):
     path = tmp_path / "Faulty.txt"
     path.write_text(content)
     with pytest.raises(ValueError, match=message) as caught:
@@ -192,7 +192,7 @@ def test_faults_of_a_file_are_named_with_their_line(tmp_path, content, message):
     assert "Faulty.txt" in str(caught.value)
 
 
-def test_from_parameters_names_what_is_missing_and_unknown():
+def test_from_parameters_reports_missing_and_unknown_names():
     with pytest.raises(ValueError, match=r"missing: .*IByy.*; unknown: mass"):
         WhippleBicycle.from_parameters({"w": 1.0, "mass": 3.0})
 

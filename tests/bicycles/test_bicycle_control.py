@@ -62,7 +62,7 @@ def split(bicycle, mass, x, z, Ixx, Iyy, Izz):
 
 
 @pytest.mark.slow
-def test_without_parts_it_costs_what_the_whipple_bicycle_costs():
+def test_without_parts_the_operation_count_is_that_of_the_whipple_bicycle():
     """5 % more operations at most, of the equations of motion."""
 
     def size(bicycle):
@@ -81,7 +81,7 @@ def test_without_parts_it_costs_what_the_whipple_bicycle_costs():
 
 
 @pytest.mark.slow
-def test_the_steer_feels_the_inertia_of_a_geared_rotor():
+def test_a_geared_rotor_adds_its_reflected_inertia_to_the_steer():
     """Upright, the frame yaws with the steer by c cos(lam) / w: the rotor turns with ratio + c cos(lam)^2 / w of it."""
     motor = SteeringMotor(rotor_inertia=1e-3, ratio=7.0)
     still = straight_ahead(BENCHMARK, 0.0)
@@ -91,7 +91,7 @@ def test_the_steer_feels_the_inertia_of_a_geared_rotor():
 
 
 @pytest.mark.slow
-def test_a_motor_delays_lags_and_limits():
+def test_a_steering_motor_has_delay_lag_and_torque_limit():
     """At 10 rad/s: a delay of 50 ms to the Pade approximation's error, (s T)^4 / 72 = 9e-4; a lag of 20 ms exactly."""
     motor = SteeringMotor(delay=0.05, lag=0.02, limit=1e9)
     model = straight(BENCHMARK.with_parts(steering=motor), 5.0, outputs=("steer_motor_torque",))
@@ -104,7 +104,7 @@ def test_a_motor_delays_lags_and_limits():
 
 
 @pytest.mark.slow
-def test_dry_friction_is_a_damper_at_slow_rates():
+def test_dry_friction_acts_as_viscous_damping_at_low_rates():
     """To first order level / width is added to the damping of the steer: exact to rounding."""
     still, x = straight_ahead(BENCHMARK, 4.0), ("steer_rate",)
     rough = BENCHMARK.with_parts(steering=SteeringFriction(0.5, width=0.1))
@@ -113,7 +113,7 @@ def test_dry_friction_is_a_damper_at_slow_rates():
     np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
-def test_a_wire_turns_the_fork_and_is_felt_at_the_handlebar():
+def test_steer_by_wire_applies_torques_to_fork_and_handlebar():
     """1e-12: the coupling's torque on the fork, and its share on the handlebar, over their speeds."""
     wire = SteerByWire(1.0, 0.85, -0.95, 0.02, 0.01, 0.015, stiffness=100.0, ratio=0.5, feedback=0.8)
     q, u = {"handlebar": 0.1, "steer": 0.02}, {"rear_wheel_rate": -12.0}
@@ -129,7 +129,7 @@ def test_a_wire_turns_the_fork_and_is_felt_at_the_handlebar():
 
 
 @pytest.mark.slow
-def test_a_stiff_wire_makes_one_piece_of_handlebar_and_fork():
+def test_a_stiff_steer_by_wire_coupling_approaches_a_rigid_steering():
     """1e-4 of the largest slow eigenvalue at 1e5 N m/rad, and ten times that at 1e4: of the first order."""
     bar = {"mass": 0.5, "x": 0.88, "z": -0.8, "Ixx": 0.005, "Iyy": 0.003, "Izz": 0.002}
     whole = sorted_eigenvalues(straight(BENCHMARK, 4.0).A)
@@ -145,7 +145,7 @@ def test_a_stiff_wire_makes_one_piece_of_handlebar_and_fork():
 
 
 @pytest.mark.slow
-def test_by_wire_goes_through_a_motor():
+def test_a_steer_by_wire_command_passes_through_the_motor():
     """The motor's command is the coupling's torque."""
     wire = SteerByWire(1.0, 0.85, -0.95, 0.02, 0.01, 0.015, stiffness=100.0, ratio=0.5, command="steer_command")
     bicycle = BENCHMARK.with_parts(steering=(wire, SteeringMotor(lag=0.01)))
@@ -159,7 +159,7 @@ def test_by_wire_goes_through_a_motor():
 
 
 @pytest.mark.slow
-def test_a_held_speed_tells_the_torque_that_drag_takes():
+def test_constant_speed_outputs_the_torque_that_balances_drag():
     """1e-10: power of the drag, 0.5 * 1.2 * 0.5 * 3^3 W, over the wheel's rate of 10 rad/s."""
     bicycle = BENCHMARK.with_parts(drive=(Drag(area=0.5, height=1.0), ConstantSpeed(3.0)))
     assert bicycle.speeds == ("roll_rate", "steer_rate")
@@ -175,7 +175,7 @@ def test_a_held_speed_tells_the_torque_that_drag_takes():
 # Control
 
 
-def test_what_was_commanded_is_an_output():
+def test_commanded_torques_are_outputs():
     """With what came from outside, and what each part has added: exactly."""
     bicycle = BENCHMARK.with_parts(control=LeanSteerGains(roll=2.0), steering=SteeringMotor(limit=1e9))
     leaning = jk.assemble(bicycle, {"roll": 0.5}, {"rear_wheel_rate": -10.0})
@@ -186,7 +186,7 @@ def test_what_was_commanded_is_an_output():
 
 
 @pytest.mark.slow
-def test_gains_are_those_of_the_feedback():
+def test_feedback_gains_change_the_linear_model_to_A_minus_B_K():
     """A - B K, 1e-12."""
     plain = straight(BENCHMARK, 3.0)
     gains = {"roll": -50.0, "steer": 30.0, "roll_rate": -15.0, "steer_rate": 3.0}
@@ -197,7 +197,7 @@ def test_gains_are_those_of_the_feedback():
     assert max(np.linalg.eigvals(known).real) < 0.0
 
 
-def test_gains_are_linear_between_the_speeds_of_a_schedule():
+def test_scheduled_gains_are_interpolated_linearly_over_speed():
     """1e-3 of the step between two, away from the corners; outside of the schedule the gains of its ends."""
     control = ScheduledGains([2.0, 4.0, 6.0], ("roll",), [[1.0], [2.0], [5.0]], [1.0, 2.0, 5.0])
     motion = lambda v: SimpleNamespace(rear=SimpleNamespace(speed=v))  # noqa: E731
@@ -224,7 +224,7 @@ def test_regulators_are_scheduled_over_speed():
 
 
 @pytest.mark.slow
-def test_a_bicycle_leans_as_far_as_it_is_asked():
+def test_a_bicycle_follows_the_desired_roll_angle():
     """By `follow_gain`, 1e-9: the regulator's own is one at a speed of a schedule of one."""
     regulated = BENCHMARK.with_parts(control=scheduled_lqr(BENCHMARK, [4.0], [10.0, 1.0, 1.0, 0.1], 0.01))
     np.testing.assert_allclose(follow_gain(regulated, 4.0), 1.0, rtol=1e-9)
@@ -267,7 +267,7 @@ def front_trail():
 
 
 @pytest.mark.slow
-def test_a_path_is_met_on_an_arc():
+def test_the_path_follower_steers_along_an_arc_to_the_path():
     """2 aside / (g preview^2), 1e-12 for a small one; limited for a large one; also where it rides back."""
     motion = SimpleNamespace(rear=SimpleNamespace(speed=3.0))
     at = lambda aside: {"x": 5.0, "y": 1.0 - aside, "yaw": 0.0}  # noqa: E731
@@ -287,7 +287,7 @@ def test_a_path_is_met_on_an_arc():
 
 
 @pytest.mark.slow
-def test_everything_goes_into_one_program():
+def test_all_parts_are_compiled_into_one_program():
     """Traced, and not compiled: what cannot be part of one program of scalars is an error in these tests."""
     wire = SteerByWire(1.0, 0.85, -0.95, 0.02, 0.01, 0.015, stiffness=100.0, command="steer_command")
     motor = SteeringMotor(lag=0.01, delay=0.05, limit=20.0, rotor_inertia=1e-4, ratio=5.0)
@@ -306,7 +306,7 @@ def test_everything_goes_into_one_program():
 
 
 @pytest.mark.slow
-def test_the_power_of_all_parts_is_accounted_for():
+def test_the_energy_balance_includes_the_power_of_all_parts():
     """1e-9: of a motor with its rotor, friction, drag and tyres that slip, beside the gains that steer."""
     tyre = Tyre(lateral=LateralSlip(6000.0, 500.0, relaxation_length=0.1))
     motor = SteeringMotor(lag=0.02, delay=0.03, limit=20.0, rotor_inertia=1e-4, ratio=5.0)
@@ -342,13 +342,13 @@ class Wrong(Part):
         (PathFollower(LaneChange()), "desired_roll"),
     ],
 )
-def test_a_command_needs_an_input(control, words):
+def test_a_command_without_a_matching_input_raises(control, words):
     bicycle = BENCHMARK.with_parts(control=control)
     with pytest.raises(KeyError, match=words):
         jk.accelerations(bicycle, 0.0, jnp.zeros(8), jnp.zeros(3))
 
 
-def test_what_is_refused():
+def test_invalid_control_parameters_raise():
     with pytest.raises(ValueError, match=r"LeanSteerGains\.roll = nan is not finite"):
         LeanSteerGains(roll=np.nan)
     with pytest.raises(ValueError, match=r"`at` must be increasing"):

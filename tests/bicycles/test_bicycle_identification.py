@@ -82,7 +82,7 @@ def errors(found):
 
 
 @pytest.mark.slow
-def test_a_leaning_rider_and_the_relaxation_length_are_found():
+def test_rider_and_relaxation_length_are_identified_within_standard_errors():
     """Inside three standard errors of the truth; of 20 seeds 18 at least were."""
     for seed in range(3):  # by one program
         found = identified(seed)

@@ -49,7 +49,7 @@ def instants(tmp_path):
 
 
 @pytest.mark.slow
-def test_accelerations_of_a_bicycle_that_slips(instants):
+def test_accelerations_of_a_bicycle_with_tyre_slip(instants):
     """1e-11 of each; the front wheel's slip follows from the others. Forces and moments are those it was given."""
     for state, at in instants:
         for end in ENDS:
@@ -64,7 +64,7 @@ def test_accelerations_of_a_bicycle_that_slips(instants):
 
 
 @pytest.mark.slow
-def test_normal_loads_of_a_bicycle_that_slips(instants):
+def test_normal_loads_of_a_bicycle_with_tyre_slip(instants):
     """1e-10 N."""
     for state, at in instants:
         forces = jk.constraint_forces(*at)
@@ -73,7 +73,7 @@ def test_normal_loads_of_a_bicycle_that_slips(instants):
 
 
 @pytest.mark.slow
-def test_relaxation_forwards_and_backwards(instants):
+def test_tyre_relaxation_in_forward_and_backward_motion(instants):
     """1e-12 of the rates of the forces [N/s]: relaxation_length / |speed| F' + F = C1 slip + C2 camber."""
     directions = set()
     for state, at in instants:

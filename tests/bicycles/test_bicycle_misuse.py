@@ -95,7 +95,7 @@ class Aside(Part):
         ),
     ],
 )
-def test_what_does_not_fit_is_refused_where_it_is_put_together(made, error, words):
+def test_incompatible_parts_are_rejected_on_assembly(made, error, words):
     with pytest.raises(error, match=words):
         made()
 
@@ -149,14 +149,14 @@ def changed(part, **more):
         (lambda: PathFollower(LaneChange(), limit=17.0), r"PathFollower\.limit = 17 rad .* In degrees\?"),
     ],
 )
-def test_numbers_that_no_bicycle_has_are_refused_with_what_they_probably_are(made, words):
+def test_implausible_parameters_are_rejected_with_the_likely_unit_error(made, words):
     """Degrees for radians, millimetres for metres, newtons for kilograms, a mass centre below the ground."""
     with pytest.raises(ValueError, match=words):
         made()
 
 
 @pytest.mark.slow
-def test_a_member_of_a_batch_with_such_a_number_is_invalid():
+def test_a_batch_member_with_an_implausible_parameter_has_status_invalid():
     swept = sweep(BENCHMARK, straight_ahead(BENCHMARK, 5.0), jnp.array([0.0, 0.1]), table={"zB": [-0.9, 0.9, -0.8]})
     assert swept.counts == {"completed": 2, "invalid": 1}
 
@@ -173,7 +173,7 @@ def test_a_member_of_a_batch_with_such_a_number_is_invalid():
         lambda bicycle: linearize(bicycle, straight_ahead(bicycle, 5.0), states=bicycle.lateral),
     ],
 )
-def test_a_load_beyond_a_measured_tyre_is_told_with_the_tyre(ask):
+def test_a_load_beyond_the_measured_range_is_reported_with_the_tyre(ask):
     """A wheel of 1409 N on a tyre that was measured up to 1000 N."""
     city = Tyre(crown=0.022, lateral=schwalbe_energizer())
     bicycle = BENCHMARK.with_parts(mB=200.0, rear_tyre=city, front_tyre=city)
@@ -203,14 +203,14 @@ def test_a_load_beyond_a_measured_tyre_is_told_with_the_tyre(ask):
         ({"drive": (Drag(), Drag())}, r"drive\[1\], a Drag: .* point with the name 'center of drag'"),
     ],
 )
-def test_two_parts_of_one_kind_are_refused_by_their_places(parts, words):
+def test_two_parts_of_the_same_kind_are_rejected(parts, words):
     """Their values would have one name."""
     with pytest.raises(ValueError, match=words):
         jk.accelerations(BENCHMARK.with_parts(**parts), 0.0, jnp.zeros(8), jnp.zeros(3))
 
 
 @pytest.mark.slow
-def test_what_is_left_without_a_rider_is_a_body():
+def test_separate_rider_rejects_a_remaining_frame_with_invalid_inertia():
     """Here the moments of inertia would be 0.54, 7.82 and 8.86 kg m^2."""
     with pytest.raises(ValueError, match=r"cannot include the rider's body\. Without it: .*triangle inequality"):
         separate_rider(BENCHMARK, LeaningRider(**LEANING | {"Iyy": 1.2}))
@@ -219,7 +219,7 @@ def test_what_is_left_without_a_rider_is_a_body():
 
 
 @pytest.mark.slow
-def test_a_parameter_of_a_part_has_one_name():
+def test_a_parameter_of_a_part_has_the_same_name_everywhere():
     """As Python writes it: in a fit, an export and a copy with other parameters."""
     name, bicycle = "extra[0].mass", BENCHMARK.with_parts(extra=[TRAILER])
     assert name in leaf_names(bicycle)
@@ -237,13 +237,13 @@ def test_a_parameter_of_a_part_has_one_name():
 
 
 @pytest.mark.slow
-def test_a_table_names_a_parameter_of_a_part():
+def test_a_sweep_table_can_name_a_parameter_of_a_part():
     bicycle = BENCHMARK.with_parts(extra=[TRAILER])
     swept = sweep(bicycle, jk.assemble(bicycle, {}), jnp.array([0.0, 0.01]), table={"extra[0].mass": [20.0, 30.0]})
     assert swept.counts == {"completed": 2}
 
 
-def test_arms_belong_to_a_rider_in_any_field():
+def test_arms_can_be_passed_in_the_rider_field():
     bicycle = BENCHMARK.with_parts(rider=(RIDER, ARMS))
     assert bicycle.dependent_coordinates[1:] == Arms.coordinates
 
@@ -295,7 +295,7 @@ class Counts(Filter):
         (Counts(), ValueError, r"Counts\.state_rates must have 1 entries \(filtered\), got 2"),
     ],
 )
-def test_what_a_part_answers_wrongly_is_refused(part, error, words):
+def test_invalid_return_values_of_a_part_are_rejected(part, error, words):
     bicycle = BENCHMARK.with_parts(front_tyre=Tyre(lateral=LateralSlip(9e3)), extra=[part])
     with pytest.raises(error, match=words):
         jk.simulate(bicycle, straight_ahead(bicycle, 5.0), jnp.array([0.0, 0.1]))
@@ -308,7 +308,7 @@ def test_what_a_part_answers_wrongly_is_refused(part, error, words):
         {"control": (LeanSteerGains(roll=-50.0), PathFollower(LaneChange()))},
     ],
 )
-def test_a_command_that_comes_too_late_is_refused(parts):
+def test_a_command_computed_after_its_reader_is_rejected(parts):
     """It would be lost: the part that has the input has read it already."""
     bicycle = BENCHMARK.with_parts(**parts)
     with pytest.raises(ValueError, match="after the part that reads it"):
@@ -329,7 +329,7 @@ def written(folder, suffix=".txt", **more):
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".yml"])
-def test_units_of_files(suffix, tmp_path):
+def test_implausible_units_in_files_are_rejected(suffix, tmp_path):
     assert Bicycle.from_file(written(tmp_path, suffix, v=4.6)).mB == BENCHMARK.mB
     with pytest.raises(ValueError, match=r"lam = 18 rad .* In degrees\?"):
         Bicycle.from_file(written(tmp_path, suffix, lam=18.0))
@@ -357,12 +357,12 @@ def test_units_of_files(suffix, tmp_path):
         ),
     ],
 )
-def test_canonical_matrices_are_refused_where_they_do_not_tell_all(parts, words):
+def test_canonical_matrices_are_rejected_if_they_omit_terms_of_the_parts(parts, words):
     with pytest.raises(ValueError, match=words):
         canonical(BENCHMARK.with_parts(**parts))
 
 
-def test_parts_are_put_together_while_others_are_traced():
+def test_parts_can_be_combined_under_jit():
     thick = jax.jit(
         lambda x: BENCHMARK.with_parts(rear_tyre=Tyre(crown=0.02), front_tyre=Tyre(crown=x)).front_tyre.crown
     )

@@ -66,7 +66,7 @@ def linear_models(bicycle, speeds, states):
 
 
 @pytest.mark.slow
-def test_a_leaning_rider_is_that_of_bicycle_parameters(tmp_path):
+def test_the_linear_model_with_a_leaning_rider_agrees_with_bicycle_parameters(tmp_path):
     """1e-9 asked."""
     bicycle, known = leaning(tmp_path), LITERATURE["lean"]
     A, B = linear_models(bicycle, LITERATURE["speeds"], known["states"])
@@ -80,7 +80,7 @@ def test_a_leaning_rider_is_that_of_bicycle_parameters(tmp_path):
 
 
 @pytest.mark.slow
-def test_feedback_is_that_of_bicycle_parameters():
+def test_rider_feedback_agrees_with_bicycle_parameters():
     """1e-9 asked. T = -K x, with the torques of roll and steer."""
 
     class Feedback(Part):
@@ -120,7 +120,7 @@ def assembled(model):
 @pytest.mark.parametrize(
     "model", [pytest.param(name, marks=[pytest.mark.slow] if name == "arms" else []) for name in SYMBRIM["models"]]
 )
-def test_accelerations_are_those_of_symbrim(model):
+def test_accelerations_agree_with_symbrim(model):
     """1e-11 asked."""
     bicycle = assembled(model)
     for state in SYMBRIM["models"][model]["states"]:
@@ -130,7 +130,7 @@ def test_accelerations_are_those_of_symbrim(model):
         np.testing.assert_allclose(jk.accelerations(bicycle, 0.0, q, u), known, rtol=1e-12, atol=1e-11)
 
 
-def test_a_rider_taken_out_of_the_frame_leaves_what_files_have_for_it():
+def test_separating_the_upper_body_leaves_the_published_values_of_the_frame():
     """The browser with Jason is the browser with his legs, and his upper body."""
     whole = {name: x for name, x in LITERATURE["feedback"]["parameters"].items() if name != "v"}
     bicycle = separate_rider(Bicycle.from_parameters(whole), LeaningRider(**UPPER_BODY, **HINGE))
@@ -140,7 +140,7 @@ def test_a_rider_taken_out_of_the_frame_leaves_what_files_have_for_it():
 
 
 @pytest.mark.slow
-def test_a_rider_who_does_not_move_is_part_of_the_frame():
+def test_a_rigid_rider_is_equivalent_to_a_heavier_frame():
     """1e-12: accelerations of a bicycle that counts him in B."""
     whole = Bicycle.from_parameters({n: x for n, x in LITERATURE["feedback"]["parameters"].items() if n != "v"})
     apart = separate_rider(whole, RigidRider(**UPPER_BODY))
@@ -150,7 +150,7 @@ def test_a_rider_who_does_not_move_is_part_of_the_frame():
     np.testing.assert_allclose(jk.accelerations(apart, 0.0, state.q, state.u), known, rtol=1e-12, atol=1e-12)
 
 
-def test_principal_files_hold_a_rigid_rider(tmp_path):
+def test_files_of_principal_inertias_contain_a_rigid_rider(tmp_path):
     """1e-12: BicycleParameters' own conversion of the same file, rider and frame in one."""
     known = Bicycle.from_parameters({n: x for n, x in LITERATURE["principal"]["meijaard"].items() if n != "v"})
     bicycle = Bicycle.from_file(yaml(LITERATURE["principal"]["parameters"], tmp_path))
@@ -162,7 +162,7 @@ def test_principal_files_hold_a_rigid_rider(tmp_path):
             np.testing.assert_allclose(getattr(bicycle, name), x, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
-def test_a_file_without_a_rider_and_a_riders_own_file(tmp_path):
+def test_files_without_a_rider_and_separate_rider_files_can_be_read(tmp_path):
     values = LITERATURE["feedback"]["parameters"]
     bicycle = Bicycle.from_file(yaml(values, tmp_path))
     assert bicycle.rider is None
@@ -195,7 +195,7 @@ def test_a_file_without_a_rider_and_a_riders_own_file(tmp_path):
         ("parameterization: MooreRiderLean2012\nvalues:\n  d1: 0.9\n", "missing: d2"),
     ],
 )
-def test_a_file_that_cannot_be_read_says_where(text, said, tmp_path):
+def test_an_unreadable_file_reports_the_location_of_the_error(text, said, tmp_path):
     path = tmp_path / "wrong.yml"
     path.write_text(text)
     with pytest.raises(ValueError, match=said):
@@ -208,7 +208,7 @@ def with_arms(**more):
     return separate_rider(whole, rider).with_parts(extra=[Arms(**ARMS | more)])
 
 
-def test_hands_stay_at_the_grips():
+def test_hands_coincide_with_the_grips_after_assembly():
     """1e-12 m, after the assembly from one guess of zeros."""
     bicycle = with_arms()
     state = jk.assemble(bicycle, {"roll": 0.1, "steer": 0.35, "rider_lean": -0.02})
@@ -221,7 +221,7 @@ def test_hands_stay_at_the_grips():
     assert turned["right_elbow"] > turned["left_elbow"] + 0.05  # steered to the right, the left arm stretches
 
 
-def test_arms_need_shoulders_and_reach():
+def test_arms_without_shoulders_or_too_short_raise():
     bicycle = with_arms()
     short = dataclasses.replace(bicycle.extra[0], fore_length=0.05)
     aside = dataclasses.replace(bicycle.extra[0], grip=[0.45, 0.6, -1.3])
@@ -254,7 +254,7 @@ def test_parameters_of_parts_are_swept():
     assert np.isnan(lean[2])
 
 
-def test_parameters_of_parts_are_refused_as_those_of_the_bicycle():
+def test_invalid_batches_of_part_parameters_are_rejected():
     bicycle, start, ts = small_ride()
     stiffness = jnp.array([0.0, 500.0, 500.0])
     batch = bicycle.with_parts(rider=dataclasses.replace(bicycle.rider, stiffness=stiffness))
@@ -270,7 +270,7 @@ def test_parameters_of_parts_are_refused_as_those_of_the_bicycle():
 
 
 @pytest.mark.slow
-def test_batches_of_riders_are_left_to_their_members():
+def test_invalid_riders_in_a_batch_do_not_affect_other_members():
     """A heavier and an impossible rider; arms that reach and that do not."""
     whole = Bicycle.benchmark()
     light = {**UPPER_BODY, "mass": 5.0, "z": -0.9, "Ixx": 0.5, "Iyy": 0.5, "Izz": 0.3}
@@ -286,7 +286,7 @@ def test_batches_of_riders_are_left_to_their_members():
     assert np.isfinite(elbows).tolist() == [True, False]
 
 
-def test_riders_that_are_none_are_refused():
+def test_invalid_riders_are_rejected():
     with pytest.raises(TypeError, match="hinge_z"):
         LeaningRider(**UPPER_BODY, hinge_x=0.2)
     with pytest.raises(ValueError, match=r"LeaningRider\.mass = -1.0 must be positive"):
@@ -319,7 +319,7 @@ def test_a_trailer_follows_the_hitch():
     assert float(leaned.q[bicycle.coordinates.index("trailer_pitch")]) < -0.01  # the hitch sank
 
 
-def test_the_catalogue_holds_the_riders_of_the_literature(tmp_path):
+def test_catalogue_riders_equal_those_read_from_files(tmp_path):
     """As the same set of names is read from a file."""
     read, built = leaning(tmp_path), browser_jason(stiffness=128.0, damping=50.0)
     assert jax.tree.structure(read) == jax.tree.structure(built)
@@ -329,7 +329,7 @@ def test_the_catalogue_holds_the_riders_of_the_literature(tmp_path):
     assert {**built.units}["rider_lean_torque"] == "N m"
 
 
-def test_arms_of_a_person_are_of_his_size():
+def test_arms_scale_with_the_mass_and_height_of_the_person():
     """Winter (2009): an arm with forearm and hand is 5 % of the mass."""
     arms = Arms.of_person(80.0, 1.8, ARMS["grip"], elbow_damping=2.0)
     assert float(arms.upper_mass + arms.fore_mass) == pytest.approx(0.05 * 80.0)
@@ -357,7 +357,7 @@ def test_riders_and_their_parts_are_drawn():
 
 
 @pytest.mark.slow
-def test_energy_of_a_rider_with_arms_is_accounted_for():
+def test_the_energy_balance_of_a_rider_with_arms_holds():
     """1e-9 asked: springs and dampers of the hinge and the arms, weights and a torque at the hinge, along 0.3 s."""
     joints = {"shoulder_stiffness": 5.0, "shoulder_damping": 1.0, "elbow_stiffness": 8.0, "elbow_damping": 0.5}
     bicycle = with_arms(**joints)
@@ -371,7 +371,7 @@ def test_energy_of_a_rider_with_arms_is_accounted_for():
 
 
 @pytest.mark.slow
-def test_formulas_and_fits_know_the_parameters_of_a_rider(tmp_path):
+def test_parameters_of_a_rider_can_be_exported_and_fitted(tmp_path):
     """The stiffness of a hinge is found to three standard errors from a ride with noise, begun 20 % off."""
     truth = browser_jason(stiffness=128.0, damping=50.0)
     start = jk.assemble(truth, {"rider_lean": 0.1}, {"rear_wheel_rate": -6.0 / truth.rR})

@@ -43,7 +43,7 @@ def slow_eigenvalues(bicycle):
     return jax.vmap(one)(SPEEDS)
 
 
-def test_camber_acts_as_so_much_slip():
+def test_camber_is_equivalent_to_a_slip_angle():
     slip = LateralSlip(cornering_stiffness=2e4, camber_stiffness=900.0)
     force = slip.force(0.02 + slip.equivalent(0.1), 800.0, 0.1)
     np.testing.assert_allclose(force, 2e4 * 0.02 + 900.0 * 0.1, rtol=1e-15)
@@ -52,7 +52,7 @@ def test_camber_acts_as_so_much_slip():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("relaxation", [None, 0.1])
-def test_stiff_tyres_roll_ideally(relaxation):
+def test_stiff_tyres_approach_ideal_rolling(relaxation):
     """1e-6 by extrapolation from 1e7 and 1e8 N/rad; the difference itself falls as one over the stiffness."""
     whipple = slow_eigenvalues(Bicycle.benchmark())
     stiffness = [1e7, 1e8]
@@ -66,7 +66,7 @@ def test_stiff_tyres_roll_ideally(relaxation):
 
 
 @pytest.mark.slow
-def test_tyres_of_a_stiffness_over_their_load_roll_ideally():
+def test_tyres_with_large_stiffness_per_load_approach_ideal_rolling():
     """1e-6 asked at 1e8, met where that is the stiffness over the load [1/rad], 3e10 to 6e10 N/rad."""
     tyre = Tyre(lateral=MagicFormula(1e8))
     found = slow_eigenvalues(Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre))
@@ -102,7 +102,7 @@ class RoundedLoad(Part):
 @pytest.mark.slow
 @pytest.mark.optimized
 @pytest.mark.published
-def test_sharps_motorcycle_has_the_eigenvalues_of_his_table(published):
+def test_eigenvalues_of_sharps_motorcycle_agree_with_the_published_table(published):
     """40 of 40 to the printed digits, with the load of the front wheel that he rounds to 226 lb."""
     motorcycle = sharp_motorcycle()
     jk.assemble(motorcycle, {})  # which refuses inertias that no body has
@@ -126,7 +126,7 @@ def test_sharps_motorcycle_has_the_eigenvalues_of_his_table(published):
 
 
 @pytest.mark.slow
-def test_modes_of_tyres_and_frame_have_names():
+def test_modes_of_tyres_and_flexible_frame_are_named():
     """What bounces on the tyres, the wobble of a frame that gives way, and the bicycle's own modes, under jit too."""
     tyre = Tyre(lateral=LateralSlip(9000.0, 900.0, relaxation_length=0.1))
     bicycle = Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre, head=HeadTwist(3000.0, 1.0))
@@ -144,7 +144,7 @@ MOVING = {"roll_rate": 0.3, "rear_wheel_rate": -16.0, "steer_rate": -0.4}
 
 
 @pytest.mark.slow
-def test_a_road_that_rises_evenly_is_a_slope():
+def test_a_road_of_constant_grade_equals_a_slope():
     """1e-12. Its normal is the same everywhere; gravity is tilted against it."""
     slope = Bicycle.benchmark().with_parts(road=Slope(jnp.arctan(0.1)))
     road = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * x))
@@ -175,7 +175,7 @@ def test_linear_models_on_a_grade():
 
 
 @pytest.mark.slow
-def test_a_linear_model_on_a_road_is_made_of_programs(native):
+def test_a_linear_model_on_a_road_uses_compiled_scalar_programs(native):
     """Written out, its derivatives would be eight thousand operations of XLA."""
     bicycle = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * jnp.sin(x)))
     start = jk.assemble(bicycle, {"roll": 0.05}, {"rear_wheel_rate": -5.0 / bicycle.rR})
@@ -184,7 +184,7 @@ def test_a_linear_model_on_a_road_is_made_of_programs(native):
     assert program.count(" = mul ") < 300
 
 
-def test_along_a_road_linear_models_say_what_to_ask():
+def test_linear_models_along_a_road_raise_with_advice():
     road = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * x))
     for ask in (straight_ahead, linearize_straight, eigenvalues):
         with pytest.raises(ValueError, match=r"along a Road .* Slope\(angle\).*steady=False"):
@@ -192,7 +192,7 @@ def test_along_a_road_linear_models_say_what_to_ask():
 
 
 @pytest.mark.slow
-def test_linear_models_where_straight_riding_is_not_steady():
+def test_linear_models_raise_if_straight_riding_is_not_steady():
     """What to do is said; NaN only where a family was given."""
     across = Bicycle.benchmark().with_parts(road=Slope(0.1, towards=0.5 * np.pi))
     with pytest.raises(ValueError, match="no steady motion"):
@@ -205,7 +205,7 @@ def linearize_straight(bicycle, speed):
 
 
 @pytest.mark.slow
-def test_a_flat_road_is_level_ground():
+def test_a_flat_road_equals_level_ground():
     """1e-12, a torus that slips behind, a knife edge that rolls before."""
     tyre = Tyre(crown=0.03, lateral=LateralSlip(9000.0, 900.0), longitudinal=LongitudinalSlip(2e4))
     level = Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre)
@@ -221,7 +221,7 @@ def test_a_flat_road_is_level_ground():
 
 
 @pytest.mark.slow
-def test_energy_is_kept_over_a_bump_and_the_wheels_stay_on_it():
+def test_energy_is_conserved_and_wheels_keep_contact_over_a_bump():
     """1e-8 of the energy, 1e-8 m; 5 cm high, half a metre long, crossed at an angle with toroidal tyres."""
     bump = Road(lambda x, y: 0.05 * jnp.exp(-(((x - 2.0) / 0.5) ** 2)) * (1.0 + 0.2 * jnp.sin(y)))
     bicycle = Bicycle.benchmark().with_parts(road=bump, rear_tyre=Tyre(crown=0.03), front_tyre=Tyre(crown=0.02))
@@ -235,7 +235,7 @@ def test_energy_is_kept_over_a_bump_and_the_wheels_stay_on_it():
 
 
 @pytest.mark.slow
-def test_a_step_in_the_road_ends_the_ride():
+def test_a_step_in_the_road_ends_the_simulation():
     """A kerb of 20 cm that is narrower than the solver's steps, and a start from where the wheel is in it."""
     kerb = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * (1.0 + jnp.tanh((x - 2.5) / 0.02))))
     start = jk.assemble(kerb, {}, {"rear_wheel_rate": -5.0 / 0.3})
@@ -247,7 +247,7 @@ def test_a_step_in_the_road_ends_the_ride():
 
 
 @pytest.mark.slow
-def test_energy_of_tyres_and_frame_is_accounted_for():
+def test_the_energy_balance_includes_tyres_and_flexible_frame():
     """1e-9: lateral slip with relaxation and moments, longitudinal slip, rolling resistance, a frame that gives way."""
     rear = Tyre(0.02, MagicFormula(12.0, 1.1, camber_ratio=0.1, relaxation_length=0.1), rolling_resistance=0.005)
     front = Tyre(
@@ -264,7 +264,7 @@ def test_energy_of_tyres_and_frame_is_accounted_for():
 
 
 @pytest.mark.slow
-def test_forces_on_the_wheels_turn_a_bicycle_that_slips():
+def test_tyre_forces_balance_the_centripetal_acceleration_in_a_steady_turn():
     """1e-10: weight, and mass times speed squared over radius, of all bodies in a steady turn."""
     law = LateralSlip(9000.0, 900.0, relaxation_length=0.1, pneumatic_trail=0.02, twisting_stiffness=5.0)
     tyre = Tyre(crown=0.02, lateral=law)
@@ -295,7 +295,7 @@ def test_forces_on_the_wheels_turn_a_bicycle_that_slips():
 
 
 @pytest.mark.slow
-def test_tyres_with_relaxation_stop_and_go_backwards_with_derivatives():
+def test_tyres_with_relaxation_reverse_direction_with_finite_derivatives():
     """A torque against the motion; everything is finite, and so is the derivative in the stiffness."""
 
     def ride(stiffness):
@@ -319,7 +319,7 @@ def with_load_transfer(lag, **more):
 
 
 @pytest.mark.slow
-def test_tyres_feel_what_the_ground_carries_in_a_steady_turn():
+def test_tyre_loads_equal_the_constraint_forces_in_a_steady_turn():
     """1e-10 of the weight: loads and lateral forces of the tyres, against the forces of constraint at the contacts."""
     bicycle = with_load_transfer(0.02, rolling_resistance=0.005)
     leaning = jk.assemble(bicycle, {"roll": 0.3, "steer": 0.12})
@@ -339,7 +339,7 @@ def test_tyres_feel_what_the_ground_carries_in_a_steady_turn():
 
 
 @pytest.mark.slow
-def test_tyres_feel_what_the_ground_carries_in_braking():
+def test_tyre_loads_equal_the_constraint_forces_during_braking():
     """1e-10: the transfer stands still at what the moments about the rear contact give.
 
     N w = sum of m g x - a (sum of m h + IRyy / rR + IFyy / rF), with the acceleration a forwards.
@@ -364,7 +364,7 @@ def test_tyres_feel_what_the_ground_carries_in_braking():
 
 @pytest.mark.slow_cases(all_but=["law2"])
 @pytest.mark.parametrize("law", [LateralSlip(9000.0), MagicFormula(12.0), LongitudinalSlip(2e4)])
-def test_a_tyre_pulls_against_its_slip(law):
+def test_the_tyre_force_opposes_the_slip(law):
     """Less than the friction that it has, nothing without slip or load, with a slope everywhere, at rest too."""
 
     def force(velocity, speed, load=400.0):
@@ -381,7 +381,7 @@ def test_a_tyre_pulls_against_its_slip(law):
 
 
 @pytest.mark.parametrize("curvature", [-2.0, 0.0, 0.5])
-def test_the_magic_formula_has_its_stiffness_and_its_peak(curvature):
+def test_the_magic_formula_has_the_given_stiffness_and_peak(curvature):
     law = MagicFormula(12.0, friction=0.8, shape=1.4, curvature=curvature)
     np.testing.assert_allclose(jax.grad(law.force)(0.0, 400.0, 0.0), 12.0 * 400.0, rtol=1e-12)
     forces = law.force(jnp.linspace(0.0, 2.0, 2001), 400.0, 0.0)
@@ -405,7 +405,7 @@ MEASURED = [
 
 
 @pytest.mark.parametrize("pressure", [300e3, 400e3, 500e3])
-def test_a_measured_tyre_has_the_forces_of_its_formula(pressure):
+def test_forces_of_a_measured_tyre_agree_with_its_formula(pressure):
     """1e-12, with the offsets of the tyre; without them left and right are alike."""
     law, even = schwalbe_energizer(pressure, offsets=True), schwalbe_energizer(pressure)
     rows = [row for row in MEASURED if row[0] == pressure]
@@ -420,7 +420,7 @@ def test_a_measured_tyre_has_the_forces_of_its_formula(pressure):
 
 
 @pytest.mark.slow
-def test_a_measured_tyre_outside_its_formula():
+def test_a_measured_tyre_outside_its_range_of_validity():
     """Held past the largest slip angle, nothing where the wheel would lift, NaN with NaN slopes above its load."""
     law = schwalbe_energizer(400e3, offsets=True)
     ends = [law.force(np.tan(np.deg2rad(angle)), 400.0, 0.1) for angle in (10.0, 60.0)]
@@ -435,7 +435,7 @@ def test_a_measured_tyre_outside_its_formula():
 
 
 @pytest.mark.slow
-def test_a_bicycle_rides_on_measured_tyres():
+def test_a_bicycle_with_measured_tyres_has_a_slower_weave():
     """Its weave is slower than with ideal tyres, and damped at 6 m/s; with their offsets it cannot ride straight on."""
 
     def on(**law):
@@ -451,7 +451,7 @@ def test_a_bicycle_rides_on_measured_tyres():
         linearize(uneven, straight_ahead(uneven, 5.0))
 
 
-def test_tyres_and_roads_that_cannot_be_are_refused():
+def test_invalid_tyres_and_roads_are_rejected():
     with pytest.raises(ValueError, match=r"cornering_stiffness = 0\.0 must be positive"):
         LateralSlip(0.0)
     with pytest.raises(ValueError, match=r"relaxation_length = 0\.0 must be positive"):

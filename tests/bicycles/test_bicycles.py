@@ -12,7 +12,7 @@ from jaxkane.stability import canonical, eigenvalues, straight_ahead
 WHIPPLE = CATALOG["WhippleBicycle"]
 
 
-def test_without_parts_it_is_the_bicycle_of_the_catalogue():
+def test_a_bicycle_without_parts_equals_the_catalogue_bicycle():
     """1e-13 asked; the operations are the same."""
     q, u = jnp.array(WHIPPLE.q), jnp.array(WHIPPLE.u)
     whipple, bicycle = WhippleBicycle.benchmark(), Bicycle.benchmark()
@@ -22,7 +22,7 @@ def test_without_parts_it_is_the_bicycle_of_the_catalogue():
 
 
 @pytest.mark.slow
-def test_crowns_change_only_what_gravity_does_in_roll_and_steer():
+def test_tyre_crowns_change_only_the_gravity_stiffness_of_roll_and_steer():
     """K0 of the benchmark changes in roll by the normal loads times the crown radii, 94 kg * 0.02 m."""
     tyre = Tyre(crown=0.02)
     found = canonical(Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre))
@@ -55,7 +55,7 @@ class Seat(Part):
 
 
 @pytest.mark.slow
-def test_riding_straight_takes_a_drive_against_drag_and_a_seat_that_gives_way():
+def test_straight_riding_balances_drag_and_seat_deflection():
     """1e-7, the smoothing of the drag at rest: density / 2 area v^2 rR, and weight over stiffness."""
     bicycle = Bicycle.benchmark().with_parts(drive=Drag(area=0.6), extra=[Seat()])
     motion = straight_ahead(bicycle, 5.0)
@@ -65,7 +65,7 @@ def test_riding_straight_takes_a_drive_against_drag_and_a_seat_that_gives_way():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("slipping", [False, True])
-def test_rolling_resistance_moves_the_normal_forces_ahead(slipping):
+def test_rolling_resistance_is_equivalent_to_shifted_normal_forces(slipping):
     """1e-9: eigenvalues with it are those with the moment of the normal forces about the contacts."""
     law = LongitudinalSlip(2e4, relaxation_length=0.1) if slipping else None
     resisting = Tyre(longitudinal=law, rolling_resistance=0.01)
@@ -92,7 +92,7 @@ class Ahead(Part):
 
 
 @pytest.mark.slow
-def test_slip_along_the_wheel_leaves_the_modes_their_names():
+def test_longitudinal_slip_does_not_change_eigenvalues_and_mode_names():
     """1e-10: to first order upright riding does not notice it."""
     tyre = Tyre(longitudinal=LongitudinalSlip(2e4))
     bicycle, speeds = Bicycle.benchmark().with_parts(rear_tyre=tyre), jnp.array([4.0, 5.0])

@@ -26,7 +26,7 @@ def test_bouncing_ball():
 
 
 @pytest.mark.slow
-def test_the_wheel_steps_by_the_impact_of_kanes_equations():
+def test_steps_of_the_rimless_wheel_agree_with_jk_impact():
     """With an inertia: a massless wheel about its hub has a singular mass matrix while its foot is released."""
     wheel = RimlessWheel(inertia=0.3)
     q, rate = jnp.array([0.48, 0.1]), 1.4

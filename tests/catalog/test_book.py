@@ -289,7 +289,7 @@ def random_example(name, rng):
 @pytest.mark.published
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("name", PRINTED)
-def test_printed_equations(name, seed, published):
+def test_equations_of_motion_agree_with_the_printed_ones(name, seed, published):
     system, t, q, u, inputs = random_example(name, np.random.default_rng(seed))
     p = {key: float(value) for key, value in vars(system).items()}
     n = len(u)
@@ -311,7 +311,7 @@ def test_printed_equations(name, seed, published):
     published("Kamman, Volume II, Unit 5", what, f"at random states, {RTOL:.0e}")
 
 
-def test_every_entry_has_its_printed_equations():
+def test_every_entry_of_the_book_is_compared_with_its_printed_equations():
     of_the_book = {name for name, entry in catalog.CATALOG.items() if entry.book.startswith(("Example", "Exercise"))}
     assert of_the_book - {"WhippleBicycle"} == set(PRINTED)  # the bicycle is tested by itself
 
@@ -366,7 +366,7 @@ INPUT_LETTERS = {
 
 @pytest.mark.slow_cases(all_but=["Exercise 5.5", "Example 3", "Exercise 5.3", "Exercise 5.2", "Exercise 5.8"])
 @pytest.mark.parametrize("place", LETTERS)
-def test_independent_figures(place):
+def test_accelerations_agree_with_independent_computations(place):
     rtol = 1e-12
     name, letters = LETTERS[place]
     for state in STATES[place]:
@@ -401,7 +401,7 @@ def test_two_sets_of_speeds_give_the_same_accelerations_of_the_angles():
     np.testing.assert_allclose([v_dot / d, omega2_dot], [phi_ddot, theta_ddot], rtol=1e-13)
 
 
-def test_euler_parameters_turn_as_printed():
+def test_rates_of_euler_parameters_agree_with_the_printed_ones():
     # Example 2 and Exercise 5.6: {eps_dot} = 1/2 [E']^T {omega1, omega2, omega3, 0}
     e1, e2, e3, e4 = q = np.array(catalog.CATALOG["SpinningTop"].q)
     u = np.array([0.8, -0.6, 4.0])
@@ -410,7 +410,7 @@ def test_euler_parameters_turn_as_printed():
     np.testing.assert_allclose(q_dot, 0.5 * E @ [*u, 0.0], rtol=1e-14)
 
 
-def test_angles_turn_as_printed():
+def test_rates_of_angles_agree_with_the_printed_ones():
     # Example 6, note 3
     q, u = np.array(catalog.CATALOG["SpatialDoublePendulum"].q), np.array([0.7, -0.4, 0.5, -0.6, 0.3, 0.9])
     q_dot = np.array(KaneEquations(catalog.SpatialDoublePendulum(), 0.0, q, u).q_dot)
@@ -433,7 +433,7 @@ def test_angles_turn_as_printed():
         ("Bracket", [0.3, np.pi / 2, 0.1]),
     ],
 )
-def test_events_vanish_and_change_sign_where_the_angles_lock(name, q):
+def test_events_cross_zero_at_gimbal_lock(name, q):
     system = getattr(catalog, name)()
 
     def events(q):

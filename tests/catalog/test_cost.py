@@ -25,7 +25,7 @@ from jaxkane.catalog import CATALOG
     "ColumnFrameAndDisk",
 )
 @pytest.mark.parametrize("name", CATALOG)
-def test_the_programs_do_not_grow(name):
+def test_operation_counts_do_not_increase(name):
     entry = CATALOG[name]
     system = entry.example()
     args = (

@@ -65,7 +65,7 @@ QUICK = {("RodOnPin", f) for f in ("equations", "forces", "kinematics")} | {("Ba
         for f in FUNCTIONS
     ],
 )
-def test_three_modes_against_differences(name, f):
+def test_derivatives_in_three_modes_agree_with_differences(name, f):
     """Along one direction of parameters, state and inputs, of one weighted sum of all that a function gives."""
     rtol = 1e-6
     system, q, u = SYSTEMS[name]()

@@ -17,7 +17,7 @@ METHOD = {"jvp", "vjp", "grad", "jacfwd", "jacrev", "linearize", "solve", "inv"}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_a_description_uses_the_rooms_below_and_derives_nothing(path):
+def test_catalogue_systems_use_lower_layers_only_and_no_derivatives(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.level == 2:
             names = {name.name for name in node.names}
@@ -48,7 +48,7 @@ def test_every_system_is_exported_and_listed():
     ]
 
 
-def test_an_entry_is_registered_in_the_books_order(monkeypatch):
+def test_entries_are_registered_in_the_order_of_the_book(monkeypatch):
     found = {}
     monkeypatch.setattr(_entry, "CATALOG", found)
     later = _entry.entry("Exercise 5.1", "an example", q=(0.0,), u=(0.0,), operations=1)(catalog.BarWithPiston)
@@ -60,7 +60,7 @@ def test_an_entry_is_registered_in_the_books_order(monkeypatch):
 
 
 @pytest.mark.parametrize("name", catalog.CATALOG)
-def test_every_system_says_where_it_stands_in_the_book(name):
+def test_every_docstring_contains_the_reference_to_the_book(name):
     assert catalog.CATALOG[name].book in getattr(catalog, name).__doc__
 
 

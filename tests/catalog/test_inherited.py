@@ -42,7 +42,7 @@ def numbers(vectors):
 
 
 @pytest.mark.parametrize("name", CATALOG)
-def test_every_entry_can_be_inherited_from(name):
+def test_every_entry_can_be_extended_by_inheritance(name):
     """The parts that were there are those of the entry itself, at the same coordinates and speeds: read by name."""
     entry, rng = CATALOG[name], np.random.default_rng(0)
     system = entry.example()
@@ -82,7 +82,7 @@ def test_every_entry_can_be_inherited_from(name):
 
 
 @pytest.mark.slow
-def test_a_passenger_changes_nothing_else():
+def test_an_independent_added_body_does_not_change_the_other_accelerations():
     """The same through the method, of an entry with dependent speeds, and one with auxiliary ones."""
     for name in ("WhippleBicycle", "BarWithPiston"):
         entry = CATALOG[name]
@@ -128,7 +128,7 @@ def merged(loaded):
 
 
 @pytest.mark.slow
-def test_a_basket_is_part_of_the_front_assembly():
+def test_a_basket_adds_its_inertia_to_the_front_assembly():
     q, u = (jnp.array(x) for x in (CATALOG["WhippleBicycle"].q, CATALOG["WhippleBicycle"].u))
     loaded = Loaded.benchmark()
     assert isinstance(loaded, Loaded)
@@ -188,7 +188,7 @@ def not_leaning(leaning):
 
 
 @pytest.mark.slow
-def test_a_rider_who_does_not_lean_is_part_of_the_frame(leaning):
+def test_a_non_leaning_rider_adds_his_inertia_to_the_frame(leaning):
     """2 T of the four speeds at zero lean: its block of the bicycle's three is that of frame and torso in one; the
     torso alone has m h^2 about its hinge."""
     m, h = 40.0, 0.4
@@ -200,7 +200,7 @@ def test_a_rider_who_does_not_lean_is_part_of_the_frame(leaning):
 
 
 @pytest.mark.slow
-def test_stability_of_a_bicycle_with_more_states(leaning):
+def test_eigenvalues_of_a_bicycle_with_an_additional_rider_coordinate(leaning):
     """All that moves is in the model; a stiff rider has the modes of one who is part of the frame, and another."""
     stiff = dataclasses.replace(leaning, stiffness=1e8)
     found = jk.stability.eigenvalues(stiff, [4.0])
@@ -218,7 +218,7 @@ def test_stability_of_a_bicycle_with_more_states(leaning):
 # What is added to a motion.
 
 
-def test_a_motion_is_extended_by_parts_of_other_names():
+def test_a_motion_can_be_extended_by_parts_with_new_names():
     N, O = jk.inertial()
     A = N.rotate(3, 0.1, 0.2, "A")
     one = jk.Body(1.0, 0.0, O.fixed(1.0 * A.x), name="one")
@@ -268,12 +268,12 @@ def test_a_mechanism_of_joints_can_be_inherited_from(copied):
     assert float(found[0]) == pytest.approx(-(40.0 + 0.7) / 3.5, rel=1e-10)
 
 
-def test_a_parameter_of_a_mechanism_that_has_no_default_is_missing():
+def test_a_mechanism_parameter_without_default_is_required():
     with pytest.raises(TypeError, match=r"Mechanism: the parameter gravity.y is missing and has no default"):
         type(ARM)()
 
 
-def test_a_mechanism_of_joints_keeps_its_own_when_it_is_extended():
+def test_extending_the_motion_of_a_mechanism_preserves_its_type_and_joints():
     arm = jk.joints.mechanism([jk.joints.Link("a", joints=jk.joints.hinge("q"), mass=1.0, center=(1, 0, 0))])
     motion = arm.motion(0.0, [0.3], [0.1])
     more = motion.extended([jk.Body(1.0, 0.0, motion["a"].center, name="two")])

@@ -84,7 +84,7 @@ def assert_close(a, b, rtol, scale=None):
     np.testing.assert_allclose(a, b, rtol=0, atol=max(rtol * float(scale), 1e-300))
 
 
-def test_the_state_of_an_entry_is_consistent(example):
+def test_the_example_state_satisfies_the_configuration_constraints(example):
     system, q = example.system, KaneEquations(*example.at)
     assert len(example.entry.q) == len(system.coordinates)
     assert len(example.entry.u) == len(system.speeds)
@@ -96,14 +96,14 @@ CONSTRAINED = [k for k, entry in CATALOG.items() if len(entry.example().configur
 DEPENDENT = [k for k, entry in CATALOG.items() if entry.example().dependent_speeds]
 
 
-def test_some_entries_have_constraints():
+def test_the_entries_include_constrained_systems():
     assert {"RigidBody", "AircraftEulerParameters", "SpinningTop", "WhippleBicycle"} <= set(CONSTRAINED)
     assert "WhippleBicycle" in DEPENDENT
 
 
 @pytest.mark.slow_cases("WhippleBicycle", "AircraftEulerParameters")
 @pytest.mark.parametrize("name", CONSTRAINED)
-def test_rates_keep_the_configuration_constraints(name):
+def test_coordinate_rates_satisfy_the_configuration_constraints(name):
     example = _example(name)
     now = KaneEquations(*example.at)
     _, h_dot = example.along_motion(lambda t, q, u: jnp.stack(now.configuration(t, tuple(q))))
@@ -112,7 +112,7 @@ def test_rates_keep_the_configuration_constraints(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DEPENDENT)
-def test_dependent_speeds_keep_the_velocity_constraints_and_change_as_their_accelerations_say(name):
+def test_dependent_speeds_satisfy_the_constraints_and_match_their_accelerations(name):
     example = _example(name)
     now = KaneEquations(*example.at)
     assert_close(jnp.stack(now.residuals(now.t, now.q, now.u_all)), 0.0, 1e-13, scale=np.abs(now.u_all).max())
@@ -128,7 +128,7 @@ def test_mass_matrix_is_symmetric_and_positive_definite(example):
 
 
 @pytest.mark.slow
-def test_mass_matrix_is_that_of_the_kinetic_energy(example):
+def test_mass_matrix_is_the_hessian_of_the_kinetic_energy(example):
     # T is a quadratic form of the speeds, drift apart, and M its matrix: d2T/du2 = M
     M = jk.mass_matrix(*example.at)
     system, t, q, u = example.at
@@ -136,7 +136,7 @@ def test_mass_matrix_is_that_of_the_kinetic_energy(example):
 
 
 @pytest.mark.slow_cases(all_but=["SpinningTop"])
-def test_forces_balance_at_the_accelerations(example):
+def test_generalized_forces_balance_at_the_accelerations(example):
     Fr = jk.generalized_active_forces(*example.at, example.inputs)
     Fr_star = jk.generalized_inertia_forces(*example.at, example.inputs, u_dot=example.u_dot)
     M, f = jk.equations_of_motion(*example.at, example.inputs)
@@ -149,7 +149,7 @@ def test_forces_balance_at_the_accelerations(example):
     assert_close(Fr, np.einsum("bvxn,bvx->n", partials, momentum_rates), 1e-11, scale)
 
 
-def test_partial_velocities_and_drift_give_the_velocities(example):
+def test_velocities_are_the_sum_of_partial_velocities_and_drift(example):
     # v = V u + v_t,  omega = W u + omega_t
     V, W = map(np.asarray, jk.partial_velocities(*example.at))
     _, t, q, u = example.at
@@ -173,7 +173,7 @@ def test_power_of_the_loads_is_the_rate_of_kinetic_energy(example):
     assert_close(T_dot, np.sum(forces * velocities) + prescribed, 1e-12, scale)
 
 
-def test_conservative_says_whether_energy_is_kept(example):
+def test_the_conservative_flag_agrees_with_the_power_of_the_loads(example):
     # The power of conservative loads changes its sign with the speeds; a damper's does not.
     u, none = example.u, {}
     odd = abs(example.power(u, none) + example.power(-u, none)) <= 1e-12 * abs(example.power(u, none))
@@ -181,7 +181,7 @@ def test_conservative_says_whether_energy_is_kept(example):
     assert example.entry.conservative == bool(odd and scleronomic)
 
 
-def test_frames_turn_as_their_angular_velocities_say(example):
+def test_derivatives_of_orientations_agree_with_angular_velocities(example):
     # dR/dt R^T = [omega x], R from the frame's components to those in N
     def frames(motion):
         return [body.frame for body in motion.bodies] + list(motion.frames.values())
@@ -198,7 +198,7 @@ def test_frames_turn_as_their_angular_velocities_say(example):
         assert_close(A_dot @ A.T, np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), 1e-13, 1 + abs(x + y + z))
 
 
-def test_mass_centres_move_as_their_velocities_say(example):
+def test_derivatives_of_mass_centre_positions_agree_with_velocities(example):
     # Of the mass centres only: a contact point may be named, whose velocity is that of the wheel's matter.
     def positions(t, q, u):
         motion = example.motion(t, q, u)
@@ -236,7 +236,7 @@ def test_derivatives_equal_central_differences(example):
     assert_close(directions @ reverse, forward @ weights, 1e-11)
 
 
-def test_jit_and_vmap_change_nothing(example):
+def test_results_are_the_same_under_jit_and_vmap(example):
     def f(u):
         return jk.accelerations(example.system, T, example.q, u, example.inputs)
 

@@ -11,7 +11,7 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 
 @pytest.mark.slow
-def test_a_block_rocks_as_in_housners_article():
+def test_a_rocking_block_agrees_with_housners_article():
     """From rest at 0.25 rad. The ratio of the rates at a landing is 1 - 3/2 sin^2 alpha = 0.85."""
     times = [0.6402887800202485, 1.338581180728541, 1.8563203472495828]
     start = jk.assemble(RockingBlock(), {"angle": 0.25}, touching=("left",))
@@ -28,7 +28,7 @@ def test_a_block_rocks_as_in_housners_article():
 
 
 @pytest.mark.slow
-def test_the_block_on_a_belt():
+def test_a_block_on_a_belt_sticks_and_slips_at_the_times_of_the_closed_form():
     """Closed forms of the times at which the block sticks and slips, from rest at x = 0."""
     times = [0.205758423033744, 2.101402346772704, 4.2602012771151685, 5.7602012771151685, 7.919000207457633]
     times += [9.419000207457632, 11.577799137800097, 13.077799137800097, 15.23659806814256, 16.736598068142563]
@@ -43,7 +43,7 @@ def test_the_block_on_a_belt():
 
 
 @pytest.mark.slow
-def test_a_motor_drives_a_load_through_play():
+def test_a_motor_drives_a_load_through_backlash():
     """With the torque A cos(w t) and e = 0. Momentum is conserved: the motor reaches the load with the speed
     A sin(w t) / w / J_m and continues with A sin(w t) / w / (J_m + J_l). It lifts off when the torque changes its sign.
     """
@@ -112,7 +112,7 @@ def test_a_wheel_rolls_over_the_edge():
 
 
 @pytest.mark.slow
-def test_a_woodpecker_hops_down_its_pole():
+def test_the_woodpecker_toy_has_the_published_period():
     """The period of Leine et al. (2003) is 0.146 s. The sleeve jams in each period, so one multiplier is not zero."""
     jammed = jk.assemble(Woodpecker(), {"bird": -0.2788}, {"bird_rate": -7.4583, "climb": -0.3411}, touching=("lower",))
     ride = jk.simulate(Woodpecker(), jammed, jnp.linspace(0.0, 0.6, 601), rtol=1e-10, atol=1e-12)

@@ -40,7 +40,7 @@ def test_energy_balance_of_ten_seconds(name):
 
 
 @pytest.mark.slow
-def test_work_that_the_times_do_not_resolve_is_not_blamed_on_the_motion():
+def test_unresolved_work_between_samples_does_not_fail_the_audit():
     # Exercise 5.1 comes to rest within a second: 100 times a second are too few for the damper's work.
     audit = jk.audit(*run("BarWithPiston", rtol=1e-10, atol=1e-10))
     assert audit.energy_balance > RTOL
@@ -51,14 +51,14 @@ def test_work_that_the_times_do_not_resolve_is_not_blamed_on_the_motion():
 
 
 @pytest.mark.slow
-def test_inputs_do_work():
+def test_the_energy_balance_includes_the_work_of_inputs():
     audit = jk.audit(*run("DoublePendulum", 2.0, 401, {"shoulder_torque": lambda t, s: jnp.sin(t) - s["theta1_dot"]}))
     assert np.abs(audit.work).max() > 0.1
     assert audit.energy_balance < 1e-7
 
 
 @pytest.mark.slow
-def test_a_free_body_keeps_its_momenta():
+def test_the_momenta_of_a_free_body_are_conserved():
     audit = jk.audit(*run("RigidBody", 2.0, 21))
     text = str(audit)
     assert text.count("conserved\n") == 2
@@ -66,14 +66,14 @@ def test_a_free_body_keeps_its_momenta():
     np.testing.assert_allclose(audit.angular_momentum, audit.angular_momentum[:1].repeat(21, 0), atol=1e-6)
 
 
-def test_a_coarse_run_is_found_out():
+def test_an_inaccurate_simulation_fails_the_audit():
     audit = jk.audit(*run("DoublePendulum", 2.0, 11, rtol=1e-2, atol=1e-2))
     assert not audit.ok
     assert "bad" in str(audit)
 
 
 @pytest.mark.slow
-def test_conditioning_of_the_bicycle():
+def test_the_audit_reports_the_conditioning_of_the_bicycle():
     system, ride = run("WhippleBicycle", 1.0, 11)
     audit = jk.audit(system, ride)
     M = jk.mass_matrix(system, 0.0, ride.q[0], ride.u[0])
@@ -85,7 +85,7 @@ def test_conditioning_of_the_bicycle():
 
 
 @pytest.mark.slow
-def test_a_run_that_ended_early_is_audited_up_to_there():
+def test_a_simulation_that_ended_early_is_audited_up_to_its_end():
     ts = jnp.linspace(0.0, 2.0, 11)
     audit = jk.audit(Bead(), jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), ts))
     np.testing.assert_array_equal(audit.t, ts[np.cos(ts) > 0.3])  # until y = 0.3 on the circle of 1 m
@@ -94,7 +94,7 @@ def test_a_run_that_ended_early_is_audited_up_to_there():
 
 
 @pytest.mark.parametrize("place", [0, 3, -1])
-def test_coordinates_that_are_not_finite_between_are_no_audit(place):
+def test_non_finite_samples_within_the_trajectory_raise(place):
     ride = jk.simulate(Bead(), jk.State([0.0, 1.0], [0.1]), np.linspace(0.0, 1.0, 6))
     for name in ("q", "u"):
         spoilt = dataclasses.replace(ride, **{name: getattr(ride, name).at[place, 0].set(jnp.nan)})
@@ -123,7 +123,7 @@ TORQUE = jk.Samples(KNOTS, np.random.default_rng(5).normal(size=21), zero_order_
     ],
     ids=["held", "linear", "between the times", "in a function"],
 )
-def test_the_work_of_inputs_with_kinks_and_jumps(torque):
+def test_the_work_of_discontinuous_inputs_is_integrated_accurately(torque):
     rtol = 2e-7
     audit = jk.audit(*run("DoublePendulum", 2.0, 201, {"shoulder_torque": torque}, rtol=1e-11, atol=1e-11))
     assert audit.ok
@@ -133,7 +133,7 @@ def test_the_work_of_inputs_with_kinks_and_jumps(torque):
 
 
 @pytest.mark.slow
-def test_jumps_between_the_times_are_not_blamed_on_the_motion():
+def test_input_jumps_between_samples_do_not_fail_the_audit():
     torque = {"shoulder_torque": jk.Samples(KNOTS, TORQUE.values, zero_order_hold=True)}
     audit = jk.audit(*run("DoublePendulum", 2.0, 6, torque, rtol=1e-11, atol=1e-11))
     assert audit.ok
@@ -142,7 +142,7 @@ def test_jumps_between_the_times_are_not_blamed_on_the_motion():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("times", [21, 2])
-def test_a_jump_that_nobody_announces_is_not_blamed_on_the_motion(times):
+def test_an_undeclared_input_jump_does_not_fail_the_audit(times):
     """A function may jump where it likes: two orders of quadrature agree about that, half of the times does not."""
     system, start = Particle(gravity=0.1, ends="none"), jk.State(np.ones(1), np.zeros(1))
     drive = {"drive": lambda t, state: jnp.where(t > 1.03, 1.0, -1.0) * (1.0 - state["h"])}
@@ -151,7 +151,7 @@ def test_a_jump_that_nobody_announces_is_not_blamed_on_the_motion(times):
     assert 10 * audit.work_error > np.abs(audit.energy_error).max() > 1e-4
 
 
-def test_quadrature_of_pieces_is_exact_for_cubics():
+def test_piecewise_quadrature_is_exact_for_cubics():
     """Between jumps, some at the times, some beside them: cubics of random coefficients, continued by zero."""
     rtol, rng = 1e-11, np.random.default_rng(3)
     t, jumps = np.linspace(0.0, 2.0, 21), np.array([0.3, 0.55, 0.8, 0.9, 1.42, 2.0])
@@ -186,7 +186,7 @@ class Oscillator(jk.System):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("times", [2, 5, 33])
-def test_work_between_few_samples_is_not_known(times):
+def test_work_between_too_few_samples_has_a_large_reported_error(times):
     """With 33 samples in 10 s, a sample a period, all rules of quadrature agree to 4e-8 and are wrong."""
     start = jk.State([0.1], [0.0])
     audit = jk.audit(
@@ -197,7 +197,7 @@ def test_work_between_few_samples_is_not_known(times):
 
 
 @pytest.mark.slow
-def test_a_coarse_run_with_a_damper_is_found_out():
+def test_an_inaccurate_simulation_with_a_damper_fails_the_audit():
     ride = jk.simulate(Oscillator(), jk.State([0.1], [0.0]), np.linspace(0.0, 1.0, 97), rtol=1e-2, atol=1e-2)
     audit = jk.audit(Oscillator(), ride)
     assert audit.energy_balance > 1e-3
@@ -226,7 +226,7 @@ class Rod(jk.System):
 
 
 @pytest.mark.slow
-def test_a_change_of_units_changes_no_verdict():
+def test_verdicts_do_not_depend_on_the_units():
     """Lengths of 1e-6 to 1e6 m and times of 1e-12 s; a loop that is open by one per cent is found in all units."""
     tables = []
     for length, time in ((1.0, 1.0), (1e6, 1.0), (1e-6, 1e3), (1.0, 1e-12)):
@@ -266,7 +266,7 @@ class Satellite(jk.System):
 
 
 @pytest.mark.slow
-def test_metres_beside_radians_are_no_bad_condition():
+def test_mixed_units_do_not_cause_a_bad_condition_number():
     rate = np.sqrt(3.986e14 / 7e6**3)
     ride = jk.simulate(Satellite(), jk.State([7e6, 0.0], [0.0, rate]), np.linspace(0.0, 0.1, 11) / rate)
     audit = jk.audit(Satellite(), ride)
@@ -275,7 +275,7 @@ def test_metres_beside_radians_are_no_bad_condition():
 
 
 @pytest.mark.slow
-def test_reflected_inertias_have_no_momentum():
+def test_reflected_inertias_do_not_contribute_to_the_momentum():
     """A free chain with geared motors conserves the angular momentum of its links."""
     bar = {"mass": 2.0, "center": (0.0, 0.0, -0.2), "inertia": (0.03, 0.03, 0.002)}
     chain = [

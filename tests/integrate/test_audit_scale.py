@@ -63,7 +63,7 @@ def operations(f, system, *more):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("held", [False, True])
-def test_the_audit_costs_what_the_accelerations_cost(held):
+def test_the_audit_takes_no_more_operations_than_the_accelerations(held):
     """It is one plain program, so that nothing is computed twice; and no longer than a right-hand side."""
     counts = {}
     for n in (4, 6, 8):
@@ -76,7 +76,7 @@ def test_the_audit_costs_what_the_accelerations_cost(held):
 
 
 @pytest.mark.slow
-def test_long_and_short_chains_are_audited_alike(monkeypatch):
+def test_the_audit_of_scalar_and_array_programs_is_the_same(monkeypatch):
     """The accelerations in one program or by columns and LAPACK: the same table, forces and multipliers."""
     system = TiltedChain(n=3, held=True)
     q, u = jnp.array([0.3, -0.2, 0.5]), jnp.array([1.0, -0.5])
@@ -113,7 +113,7 @@ class Rod(jk.System):
 
 
 @pytest.mark.slow
-def test_a_load_on_a_frame_that_loads_made_is_felt_and_its_work_is_counted():
+def test_loads_on_frames_created_in_loads_do_work():
     """0.2 N m on a rod of 0.1 kg m^2 about its end, 1 kg at 0.5 m: 0.2 / 0.35 rad/s^2."""
     start, ts = jk.State(jnp.zeros(1), jnp.array([2.0])), jnp.linspace(0.0, 0.1, 6)
     for anew in (False, True):
@@ -141,7 +141,7 @@ class Geared(jk.System):
 
 
 @pytest.mark.slow
-def test_one_residual_is_conditioned_by_the_speeds_beside_it():
+def test_the_condition_of_a_single_residual_includes_the_other_speeds():
     """C_dep alone is (1 x 1) and has the condition number 1, whatever it is."""
     ride = jk.simulate(Geared(), jk.State(jnp.zeros(2), jnp.array([1e-9])), jnp.linspace(0.0, 0.1, 6))
     audit = jk.audit(Geared(), ride)

@@ -32,7 +32,7 @@ def state(dtype):
 @pytest.mark.parametrize("t0", STARTS)
 @pytest.mark.parametrize("rate", [100.0, pytest.param(1e3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("hold", [True, False])
-def test_no_time_is_lost_at_samples(dtype, t0, rate, hold):
+def test_elapsed_time_is_exact_at_samples(dtype, t0, rate, hold):
     """A free particle at 1 m/s: its place is the time."""
     n = 1 + int(4 * rate)
     ts = t0 + np.arange(n) / rate
@@ -64,7 +64,7 @@ def place_of_the_last(t0, dtype, hold, options):
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"step": 0.05}], ids=["adaptive", "fixed"])
 @pytest.mark.parametrize("hold", [True, False])
-def test_derivatives_do_not_depend_on_the_start(options, hold):
+def test_derivatives_do_not_depend_on_the_start_time(options, hold):
     rtol = 5e-6  # a POSIX time has a resolution of 2.4e-7 s
     (x, slope), *others = (place_of_the_last(t0, jnp.float64, hold, options) for t0 in (0.0, 1e6, 1.7e9))
     for x1, slope1 in others:
@@ -128,7 +128,7 @@ def thrown(t0, duration, v, **parameters):
 
 
 @pytest.mark.parametrize("t0", [0.0, 3e6, 1e7, 1.7e9])
-def test_events_at_any_clock(t0):
+def test_event_times_do_not_depend_on_the_start_time(t0):
     back = thrown(t0, 10.0, 1.5)
     assert back.reason == "back"
     assert float(back.t_end) - t0 == pytest.approx(3.0, abs=1e-10 + 4e-16 * t0)
@@ -148,7 +148,7 @@ def test_a_short_flight_in_a_long_simulation(t0, flight):
 
 
 @pytest.mark.slow
-def test_third_derivatives_of_the_end_are_nan():
+def test_third_derivatives_of_the_end_time_are_nan():
     """A fall from h takes sqrt(2 h); its third derivative at h = 0.5 is 3, and two are exact."""
 
     def end(h):
@@ -181,7 +181,7 @@ def test_the_first_of_several_fast_crossings_ends_the_simulation():
     assert free.stats["steps"] >= 40
 
 
-def test_times_that_the_type_cannot_resolve_are_refused_where_code_reads_them():
+def test_times_that_float32_cannot_resolve_are_rejected_if_inputs_depend_on_time():
     ts = 1.7e9 + np.arange(3.0)
     with pytest.raises(ValueError, match="float32 cannot resolve, and push may depend on the time"):
         jk.simulate(Particle(), state(jnp.float32), ts, {"push": lambda t, s: jnp.sin(t)})
@@ -210,7 +210,7 @@ class Switched(Particle):
 @pytest.mark.parametrize(
     ("sampled", "options"), [(False, {}), (False, {"step": 0.05}), (True, {})], ids=["given", "fixed", "samples"]
 )
-def test_discontinuities_of_the_system_itself(sampled, options):
+def test_declared_discontinuities_of_the_system_end_steps(sampled, options):
     """v is 1 + 0.5 - 1.5. A step that reads the wrong side of the jump is off by 0.46."""
     given = {} if sampled else {"discontinuities": [0.5]}
     ride = jk.simulate(Switched(sampled=sampled), jk.State([0.0], [1.0]), [0.0, 1.0], **given, **options)
@@ -231,6 +231,6 @@ class Clock(Particle):
 @pytest.mark.parametrize(
     ("system", "name"), [(Late(jnp.float32(1.0), jnp.float32(1e6)), r"Late\.events"), (Clock(), "Clock")]
 )
-def test_events_and_outputs_that_use_such_times_are_refused(system, name):
+def test_times_that_float32_cannot_resolve_are_rejected_with_events_and_outputs(system, name):
     with pytest.raises(ValueError, match=f"float32 cannot resolve, and {name} may depend on the time"):
         jk.simulate(system, state(jnp.float32), 1e6 + np.array([0.0, 0.5, 1.0]))

@@ -191,7 +191,7 @@ def test_a_ball_with_backspin_slides_and_then_rolls(kind):
     np.testing.assert_allclose(found, [by_mu, by_v, by_w], atol=slope_atol)
 
 
-def test_infinitely_many_bounces_end_with_a_derivative():
+def test_infinitely_many_bounces_end_at_a_differentiable_time():
     # A particle with e = 0.5, h = 1, vx = 2, mu = 0.1: the closed form of the geometric series.
     atol, slope_atol = 1e-10, 1e-8
     values = {"restitution": 0.5, "friction": 0.1, "gravity": 9.81, "h": 1.0, "vx": 2.0}
@@ -212,7 +212,7 @@ def test_infinitely_many_bounces_end_with_a_derivative():
     np.testing.assert_array_equal(ride.contacts["table"], np.repeat([OPEN, SLIDES, STICKS], [10, 4, 7]))
 
 
-def test_bounces_are_relative_to_a_moving_surface():
+def test_restitution_is_relative_to_a_moving_surface():
     # A ball falls on a table that rises: v+ - s' = -e (v- - s') and m (v+ - v-) = L at the time of the impact.
     rtol = 1e-10
     ride, slopes = ride_of(np.linspace(0, 0.4, 21), restitution=0.6, shake=0.02, h=0.3)
@@ -226,7 +226,7 @@ def test_bounces_are_relative_to_a_moving_surface():
     np.testing.assert_allclose(slopes["h"]["t"][0], 1 / (rate - before), rtol=rtol)
 
 
-def test_a_particle_lands_on_a_belt_and_is_carried():
+def test_a_particle_lands_on_a_belt_and_sticks():
     # mu = 0.1, drop of 0.3 m, e = 0: the impulse mu m sqrt(2 g h) and then the friction mu m g accelerate it.
     atol = 1e-10
     ride, _ = ride_of(np.linspace(0, 2, 21), friction=0.1, belt=1.43, h=0.3)
@@ -240,7 +240,7 @@ def test_a_particle_lands_on_a_belt_and_is_carried():
     np.testing.assert_array_equal(ride.contacts["table"], np.repeat([OPEN, SLIDES, STICKS], [3, 12, 6]))
 
 
-def test_a_table_that_falls_faster_than_its_load():
+def test_a_contact_opens_if_the_table_falls_faster_than_gravity():
     # The force vanishes when the acceleration of the table is -g: sin(w t) = g / (A w^2).
     atol = 1e-10
     ride, slopes = ride_of(np.linspace(0, 0.1, 21), shake=0.05, vy=0.05 * SHAKE, friction=0.3)
@@ -279,7 +279,7 @@ def test_a_load_stays_on_a_shaking_table():
     np.testing.assert_allclose([ride["x"], ride["angle"]], 0.0, atol=atol)
 
 
-def test_slip_that_stops_and_reverses():
+def test_slip_stops_and_reverses():
     """A force that changes at given times. Static friction 5 N, kinetic friction 3 N; then both 3 N."""
     atol = 1e-10
     ts = np.linspace(0, 4, 21)
@@ -305,14 +305,14 @@ def test_slip_that_stops_and_reverses():
         np.testing.assert_allclose(slopes["static"]["end"], 0.0, atol=1e-9)
 
 
-def test_a_slip_that_stops_below_the_static_friction():
+def test_slip_stops_and_sticks_below_the_static_friction():
     ride, _ = ride_of(np.linspace(0, 2, 21), push=(-4.0,) * 4, friction=0.3, static=0.5, vx=2.0)
     np.testing.assert_allclose(jumps_of(ride), [2.0 / 7.0], atol=1e-10)
     np.testing.assert_allclose(end_of(ride)[[0, 3]], [2.0 / 7.0, 0.0], atol=1e-10)
     np.testing.assert_allclose(ride["table.friction"][-1], 4.0, rtol=1e-12)
 
 
-def test_an_input_is_discontinuous_at_the_instant_of_a_jump():
+def test_an_input_discontinuity_at_the_time_of_an_impact():
     """A force begins when a particle strikes the table, with friction; and one that ends the sticking."""
     atol = 1e-10
     lands = np.sqrt(0.2)
@@ -326,7 +326,7 @@ def test_an_input_is_discontinuous_at_the_instant_of_a_jump():
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_the_rod_of_painleve(direction):
+def test_painleve_paradox_of_a_sliding_rod(direction):
     """A rod at 0.6 rad slides on its end. For mu = 3 the laws of contact have no solution in one direction.
 
     G_N + mu G_NT = 1/m + l sin(a) (l sin(a) - mu l cos(a)) / I < 0.
@@ -340,7 +340,7 @@ def test_the_rod_of_painleve(direction):
     assert int(smooth.status) == jk.Status.COMPLETED
 
 
-def test_both_zeros_of_a_gap_in_one_step():
+def test_two_zero_crossings_of_a_gap_in_one_step():
     """A particle leaves the table with 1e-7 m/s and lands after 2e-8 s."""
     ride, _ = ride_of(np.linspace(0, 2, 21), restitution=0.5, friction=0.1, vy=1e-7)
     np.testing.assert_allclose(jumps_of(ride)[:2], 2e-8 * np.array([1.0, 1.5]), rtol=1e-6)
@@ -364,7 +364,7 @@ def test_grazing(least):
         assert np.isfinite(slopes["h"]["end"][1])
 
 
-def test_a_sample_at_the_time_of_an_impact():
+def test_a_sample_at_the_time_of_an_impact_has_the_value_after_the_impact():
     """It has the value after the impact, and no derivative by the height, on which this time depends."""
     ts = np.linspace(0, 1, 21)
     ride, slopes = ride_of(ts, restitution=0.6, h=10.0 / 8)
@@ -381,7 +381,7 @@ def test_last_samples_close_to_an_impact():
         assert (float(ride["vy"][-1]) > 0) == (int(ride.jumps.count) == 1)
 
 
-def test_micrometres_and_tonnes():
+def test_results_do_not_depend_on_the_units():
     """Lengths in units of 1e-6 and masses in units of 1e3: the same times."""
     first, second = (
         ride_of(np.linspace(0, 2, 21), h=x, gravity=10.0 * x, vx=x, mass=m, inertia=m, restitution=0.7, friction=0.1)[0]
@@ -393,7 +393,7 @@ def test_micrometres_and_tonnes():
     np.testing.assert_array_equal(first.contacts["table"], second.contacts["table"])
 
 
-def test_a_posix_clock():
+def test_results_do_not_depend_on_the_start_time():
     ts = np.linspace(0, 2, 21)
     ball = {"restitution": 0.6, "friction": 0.1, "radius": 0.1, "inertia": 0.004, "h": 1.0, "w": 20.0}
     ride, _ = ride_of(ts, **ball)
@@ -482,7 +482,7 @@ ROUNDED = {
 
 
 @pytest.mark.parametrize("kind", ROUNDED)
-def test_a_contact_that_closes_at_the_start(kind):
+def test_a_contact_that_closes_at_the_start_has_an_impact(kind):
     """Its impact is the first jump, also if rounding errors make its gap 1e-17 instead of 0."""
     values = ROUNDED[kind]
     if kind != "a ball":
@@ -494,13 +494,13 @@ def test_a_contact_that_closes_at_the_start(kind):
     assert float(ride.jumps.impulses[0, 0]) > 0
 
 
-def test_derivatives_after_a_start_that_closes():
+def test_derivatives_after_an_impact_at_the_start():
     """By the restitution, 0.1 s after the impact of a ball whose gap is a rounding error: v = e, h = e t."""
     _, slopes = ride_of(np.linspace(0, 0.1, 21), **ROUNDED["a ball"])
     np.testing.assert_allclose(slopes["restitution"]["end"], [0, 0.1, 0, 0, 1, 0], atol=1e-9)
 
 
-def test_the_derivative_of_the_time_of_a_rest():
+def test_the_derivative_of_the_time_of_coming_to_rest():
     """Of a rod on a shaking table, whose acceleration is not constant. By differences."""
     values = {"restitution": 0.3, "friction": 0.9, "radius": 0.05, "length": 0.5, "inertia": 1 / 12, "vx": 1.0}
     values |= {"angle": 0.41535293854473077, "h": 0.508486981117146, "shake": 0.005}

@@ -44,7 +44,7 @@ def test_each_member_of_a_batch_bounces_at_its_own_times():
 
 
 @pytest.mark.slow
-def test_more_jumps_than_allowed():
+def test_exceeding_max_jumps_ends_the_simulation():
     ride = drop(0.05, 0.985, 0.0, max_jumps=16)
     assert ride.reason == "max jumps"
     assert int(ride.jumps.count) == 16
@@ -99,7 +99,7 @@ def test_gradients_of_a_sweep():
     ],
     ids=["fixed steps", "implicit", "Dopri8"],
 )
-def test_other_methods(options, atol):
+def test_results_agree_for_other_solvers_and_options(options, atol):
     ride = drop(**options)
     assert ride.ok
     np.testing.assert_allclose(ride.jumps.t[:8], BOUNCES, atol=atol)
@@ -123,7 +123,7 @@ def test_float32():
 
 
 @pytest.mark.slow
-def test_a_simulation_that_continues_with_contact_states():
+def test_a_simulation_resumes_with_the_contact_states():
     """From the state at the end of another one. The contacts of a ball at rest remain closed."""
     first = drop(0.2, 0.5, 0.0)
     again = jk.simulate(BouncingBall(drag=0.0, restitution=0.5), first.state(-1), TS, **TIGHT)
@@ -207,7 +207,7 @@ def test_an_event_and_a_contact_need_different_names():
         jk.simulate(Both(), jk.State({"height": 1.0}, {}), TS)
 
 
-def test_what_does_not_contain_contacts_says_so(tmp_path):
+def test_functions_without_contact_support_raise(tmp_path):
     with pytest.raises(ValueError, match="contact"):
         jk.estimate.Filter(BouncingBall(), {"height": 0.01})
     with pytest.raises(ValueError, match="contact"):

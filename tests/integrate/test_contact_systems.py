@@ -31,7 +31,7 @@ def tilted(angle, width=0.4, height=1.2, **speeds):
 
 
 @pytest.mark.slow
-def test_a_rocking_block_changes_its_corner():
+def test_a_rocking_block_agrees_with_the_closed_form():
     # Quadrature; the energy ratio of an impact is r^2 with r = 1 - 3/2 sin^2(alpha).
     atol = 1e-10
     ride = jk.simulate(RockingBlock(friction=2.0), tilted(0.25), jnp.linspace(0, 2.2, 21), **TIGHT)
@@ -172,7 +172,7 @@ class BallsInARow(jk.System):
 
 
 @pytest.mark.slow
-def test_balls_strike_one_after_another_or_at_once():
+def test_sequential_and_simultaneous_impacts_of_balls():
     atol = 1e-12
     start = jk.State({"b": 1.0, "c": 2.0, "d": 3 + 1 / 7, "e": 4.0}, {"a_dot": 1.0})
     ride = jk.simulate(BallsInARow(), start, jnp.linspace(0, 5, 21), **TIGHT)
@@ -257,7 +257,7 @@ class Driven(Particle):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("tolerance", "atol"), [(1e-6, 1e-6), (1e-10, 1e-9)])
-def test_a_slip_begins_without_an_acceleration(tolerance, atol):
+def test_slip_begins_with_zero_acceleration(tolerance, atol):
     """Static equals kinetic friction. In polar coordinates of the slip, by SciPy's Radau with 1e-11.
 
     s' = f cos(5 t - theta) - mu g,  theta' = f sin(5 t - theta) / s,  from s = 5/2 (t - 0.1)^2
@@ -401,7 +401,7 @@ class StruckSliderCrank(SliderCrank):
 
 
 @pytest.mark.slow
-def test_a_struck_slider_crank_stays_closed():
+def test_an_impact_preserves_the_loop_closure_of_a_slider_crank():
     # The wall is where the slider is for a crank angle of 0.9 rad. Without loads, the kinetic energy is constant.
     atol = 1e-9
     rod = -np.arcsin(0.15 * np.sin(0.9) / 0.4)

@@ -26,7 +26,7 @@ def ride(ts, values, **options):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
-def test_a_second_of_dense_samples(n):
+def test_a_smooth_signal_and_a_peak_with_dense_samples(n):
     """The samples of a smooth signal; and the same with a peak of one sample: a push of `height` dt [N s]."""
     atol, ts = 1e-8, np.linspace(0.0, 1.0, n)
     smooth = ride(ts, wave(ts))
@@ -40,7 +40,7 @@ def test_a_second_of_dense_samples(n):
 
 
 @pytest.mark.slow
-def test_steps_end_beside_a_peak_wherever_it_stands():
+def test_steps_end_next_to_a_peak_at_any_position():
     rtol, n = 1e-8, 10_000
     ts = np.linspace(0.0, 1.0, n)
     needed = jax.jit(jax.vmap(_needed_knots, (None, 0, None)))
@@ -56,7 +56,7 @@ def test_steps_end_beside_a_peak_wherever_it_stands():
 
 
 @pytest.mark.parametrize("signal", ["noise", "coarse", "uneven"])
-def test_steps_pass_over_no_signal_that_is_not_smooth(signal):
+def test_steps_end_at_the_samples_of_non_smooth_signals(signal):
     """A remainder of a thousand times the tolerance; a kink; a gap in which the line is no wave."""
     rtol, n, rng = 1e-8, 10_000, np.random.default_rng(0)
     ts = np.linspace(0.0, 1.0, n)
@@ -72,7 +72,7 @@ def test_steps_pass_over_no_signal_that_is_not_smooth(signal):
 
 
 @pytest.mark.slow
-def test_all_samples_end_steps_where_a_derivative_by_them_is_asked_for():
+def test_steps_end_at_all_samples_if_these_are_differentiated():
     ts = jnp.linspace(0.0, 1.0, 3000)
     signal = lambda x: (ts + x[0], (1 + x[1]) * jnp.sin(ts)[None], 1e-6 + x[2])  # noqa: E731
     times = jax.jit(lambda x: _needed_times(*signal(x)))
@@ -85,7 +85,7 @@ def test_all_samples_end_steps_where_a_derivative_by_them_is_asked_for():
 
 
 @pytest.mark.slow
-def test_steps_end_where_a_derivative_by_samples_is_asked_for():
+def test_derivatives_by_delay_and_scale_of_samples_agree_with_the_closed_form():
     """By a delay and by a factor of all values, against those of the motion in closed form."""
     atol, n = 1e-7, 9001
     ts = np.linspace(-1.0, 2.0, n)
@@ -116,7 +116,7 @@ def test_each_jump_of_a_zero_order_hold_ends_a_step():
 
 
 @pytest.mark.slow
-def test_a_few_entries_of_long_samples_are_those_that_numpy_finds():
+def test_interpolation_of_long_samples_agrees_with_numpy():
     # From 32768 samples on a CPU, bisection and reading go entry by entry.
     rng = np.random.default_rng(0)
     ts = np.cumsum(rng.uniform(0.5, 1.5, 40_000))

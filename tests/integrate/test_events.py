@@ -75,7 +75,7 @@ def test_a_dropped_particle(options):
 
 
 @pytest.mark.slow
-def test_second_derivatives_of_the_end():
+def test_second_derivatives_of_the_end_time():
     """By the velocity at the start, against the formula."""
     h, g = jnp.array(1.0), jnp.array(9.81)
 
@@ -110,7 +110,7 @@ class Pendulum(jk.System):
 @pytest.mark.parametrize(
     ("way", "quarters"), [(-1, 1), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((0, 1), (1, 3)))]
 )
-def test_a_pendulum_through_the_vertical(way, quarters):
+def test_a_pendulum_crosses_the_vertical_after_a_quarter_period(way, quarters):
     """A quarter of the period is sqrt(l / g) K(sin(a / 2)); its derivative by the length, that over 2 l."""
 
     def t_end(length):
@@ -144,7 +144,7 @@ def test_second_derivatives_along_several_directions():
 
 
 @pytest.mark.slow
-def test_a_start_on_zero():
+def test_an_event_that_is_zero_at_the_start():
     """Thrown up from the ground it comes back; resting on it, or thrown down, it has passed it at once."""
     ride = dropped(0.0, 3.0)
     assert ride.reason == "ground"
@@ -163,7 +163,7 @@ def test_a_start_on_zero():
 @pytest.mark.parametrize(
     ("ends", "options"), [("ground", {}), ("either", {"step": 0.5})], ids=["falling-adaptive", "either-fixed"]
 )
-def test_down_and_up_again_within_a_step(ends, options):
+def test_two_crossings_within_a_step(ends, options):
     """Both ends of the first step are above: h = 0.08 - t + 5.19 t^2 / 2 is zero at 0.0987 and 0.29 s."""
     start = jk.State(jnp.array([0.08]), jnp.array([-1.0]))
     ride = jk.simulate(Particle(ends=ends), start, TS, {"drive": 15.0}, **options)
@@ -172,7 +172,7 @@ def test_down_and_up_again_within_a_step(ends, options):
 
 
 @pytest.mark.slow
-def test_the_earlier_of_several_events_in_one_step():
+def test_the_earliest_of_several_events_in_one_step_is_located():
     ride = dropped(1.0, 1.0, Particle(ends="roof"), step=2.0)
     assert ride.reason == "c top"
     np.testing.assert_allclose(ride.t_end, 1.0 / 9.81, atol=1e-9)
@@ -200,7 +200,7 @@ class Suction(Particle):
 
 
 @pytest.mark.slow
-def test_trial_steps_that_are_not_finite():
+def test_non_finite_trial_steps_are_rejected_without_nan_in_derivatives():
     """Steps that ended under the ground are thrown away, and leave no NaN in a derivative in either mode."""
 
     def read(v, adjoint):
@@ -227,7 +227,7 @@ TOP = jnp.array([0.0, 1.0])
 
 
 @pytest.mark.slow
-def test_what_follows_from_a_motion_that_ends_early():
+def test_outputs_after_an_early_end_are_nan():
     """Dependent speeds, a controller's input and projected coordinates, where they were reached; NaN where not."""
 
     def read(x, adjoint):
@@ -249,7 +249,7 @@ def test_what_follows_from_a_motion_that_ends_early():
 
 
 @pytest.mark.slow
-def test_speeds_that_become_singular():
+def test_singular_dependent_speeds_end_the_simulation():
     """The bead's horizontal speed vanishes at a quarter of a turn: the motion ends before."""
     ride = jk.simulate(Bead(ends=False), jk.State(TOP, jnp.ones(1)), TS)
     assert ride.status == jk.Status.SINGULAR_SPEEDS
@@ -260,7 +260,7 @@ def test_speeds_that_become_singular():
 
 
 @pytest.mark.slow
-def test_other_ends_have_no_derivative():
+def test_other_end_times_have_nan_derivatives():
     """`max_steps` is no smooth end: its time has a derivative that is NaN, and so has what was not reached."""
 
     def few(v, adjoint):
@@ -278,7 +278,7 @@ def test_other_ends_have_no_derivative():
 @pytest.mark.parametrize(
     ("ends", "height", "options"), [("root", 0.21, {"step": 0.07}), ("lost", 0.2, {})], ids=["fixed", "adaptive"]
 )
-def test_an_event_that_is_no_number(ends, height, options):
+def test_an_event_function_that_becomes_nan(ends, height, options):
     """It is found beside where it is none; if it becomes none before it vanishes, nobody can say what follows."""
     ride = dropped(1.0, 0.0, Particle(ends=ends), **options)
     assert ride.reason == {"root": "low", "lost": "step too small"}[ends]
@@ -288,13 +288,13 @@ def test_an_event_that_is_no_number(ends, height, options):
     assert np.isnan(ride.q[~reached]).all()
 
 
-def test_a_start_where_an_event_is_no_number():
+def test_an_event_that_is_not_finite_at_the_start_raises():
     with pytest.raises(ValueError, match="accelerations, rates or events are not finite near the initial state"):
         dropped(0.1, 0.0, Particle(ends="lost"))
 
 
 @pytest.mark.slow
-def test_the_end_in_single_precision():
+def test_an_event_in_single_precision():
     particle, ts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (Particle(), TS))
     start = jk.State(jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32))
     ride = jk.simulate(particle, start, ts)
@@ -305,7 +305,7 @@ def test_the_end_in_single_precision():
 
 
 @pytest.mark.slow
-def test_the_end_by_an_implicit_solver():
+def test_an_event_with_an_implicit_solver():
     """The bead passes y = 0.3 where cos(t) does; Kvaerno's method solves for the stages of every step."""
     ride = jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), TS, solver=diffrax.Kvaerno5())
     assert ride.reason == "low"
@@ -324,7 +324,7 @@ def test_the_end_by_an_implicit_solver():
     ],
     ids=["Tsit5", "fixed", "Heun", "HalfSolver", "Kvaerno5"],
 )
-def test_derivatives_of_the_end_by_every_solver(kernels, options):
+def test_derivatives_of_the_end_time_with_every_solver(kernels, options):
     """After some steps, and before any step: the rates there are those that the steps leave, or evaluated once more."""
 
     def end(x):
@@ -359,14 +359,14 @@ def test_xla_compiles_the_accelerations_once(platform, by_xla):
 
 
 @pytest.mark.slow
-def test_the_end_of_a_stabilized_motion():
+def test_an_event_of_a_stabilized_simulation():
     ride = jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), TS, stabilize=10.0)
     assert ride.reason == "low"
     np.testing.assert_allclose(ride.t_end, np.arccos(0.3), atol=1e-6)
     np.testing.assert_allclose(ride.end.q, [np.sqrt(0.91), 0.3], atol=1e-6)
 
 
-def test_an_event_that_reads_no_speed_costs_no_accelerations():
+def test_an_event_without_speeds_does_not_evaluate_accelerations():
     """A ride without events does as much as ever; one with them looks at coordinates and their rates alone."""
     from jaxkane._integrate.events import events_of
 
@@ -398,7 +398,7 @@ def test_the_first_crossing_of_cubics():
 
 
 @pytest.mark.slow
-def test_only_what_is_zero_at_the_start_passes_it_there():
+def test_only_functions_that_are_zero_at_the_start_cross_zero_there():
     """Values and slopes of any size make double roots, beside which rounding errors send Newton's method anywhere."""
     rng = np.random.default_rng(0)
     ends = rng.normal(size=(4, 20_000)) * 10.0 ** rng.uniform(-120, 120, size=(4, 20_000))
@@ -411,7 +411,7 @@ def test_only_what_is_zero_at_the_start_passes_it_there():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_derivatives_by_times_of_samples(mode):
+def test_derivatives_by_sample_times_agree_with_differences(mode):
     """Two signals, one of whose kinks stand at one time; the times of the ride itself; against central differences."""
     kinks = jnp.array([0.1, 0.35, 0.8, 1.1, 1.7])
     others, values = jnp.array([0.05, 0.35, 0.6, 1.2, 1.9]), jnp.array([1.0, -2.0, 3.0, -1.0, 2.0])
@@ -455,7 +455,7 @@ class Both(eqx.Module):
         ({"step": 0.1, "atol": 1e-6}, "Pass either `step`"),
     ],
 )
-def test_options_that_contradict_themselves(options, message):
+def test_contradictory_options_raise(options, message):
     with pytest.raises(ValueError, match=message):
         dropped(1.0, **options)
 
@@ -481,7 +481,7 @@ def test_options_that_contradict_themselves(options, message):
         ({"progress": 1}, "`progress` must be True or False, got 1"),
     ],
 )
-def test_options_of_another_type(options, message):
+def test_options_of_the_wrong_type_raise(options, message):
     with pytest.raises(TypeError, match=message):
         dropped(1.0, **options)
 
@@ -503,7 +503,7 @@ def by_numpy(t, state):
         (lambda t, s: {"drive": branching(t, s)}, "The function of the inputs"),
     ],
 )
-def test_inputs_that_ask_for_values_of_what_is_traced(inputs, label):
+def test_inputs_that_need_concrete_values_raise(inputs, label):
     with pytest.raises(
         TypeError, match=rf"{label} uses a traced value .*jnp.polyval .* jnp.where\(a > b, x, y\) for `if`"
     ):
@@ -515,7 +515,7 @@ class Deciding(Particle):
         return {"low": q["h"] if q["h"] > 0.1 else 1.0}
 
 
-def test_an_event_that_asks_for_the_value_of_what_is_traced():
+def test_an_event_that_needs_a_concrete_value_raises():
     with pytest.raises(TypeError, match=r"Deciding.events uses a traced value .* jnp.where\(a > b, x, y\) for `if`"):
         dropped(1.0, system=Deciding())
 
@@ -528,7 +528,7 @@ def test_an_event_that_asks_for_the_value_of_what_is_traced():
         (lambda q: [q["h"]], "events must return a dict of quantities by name"),
     ],
 )
-def test_events_that_are_no_quantities_by_name(events, message):
+def test_events_that_are_not_named_scalars_raise(events, message):
     class Watching(Particle):
         def events(self, t, q, u):
             return events(q)
@@ -537,7 +537,7 @@ def test_events_that_are_no_quantities_by_name(events, message):
         dropped(1.0, system=Watching())
 
 
-def test_an_event_is_not_called_as_another_end():
+def test_an_event_named_like_a_status_raises():
     class Confusing(Particle):
         def events(self, t, q, u):
             return {"max_steps": q[0] - 0.5}
@@ -546,7 +546,7 @@ def test_an_event_is_not_called_as_another_end():
         dropped(1.0, system=Confusing())
 
 
-def test_samples_that_are_none():
+def test_invalid_samples_raise():
     times = np.array([0.0, 1.0, 2.0])
     for ts, values, error in (
         (times[::-1], times, ValueError),
@@ -566,7 +566,7 @@ def test_samples_that_are_none():
 
 
 @pytest.mark.slow
-def test_times_that_tracing_hides_are_invalid():
+def test_invalid_times_under_jit_give_status_invalid():
     start = jk.State(jnp.ones(1), jnp.ones(1))
     hidden = jax.jit(lambda ts: jk.simulate(Particle(), start, ts))
     for ts in (TS.at[3].set(jnp.nan), TS[::-1]):
@@ -597,7 +597,7 @@ _number = lambda low, high: st.floats(low, high, allow_nan=False)  # noqa: E731
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(_number(0.5, 1.5), _number(-1.0, 2.0), _number(5.0, 15.0))
-def test_members_of_a_batch_end_at_their_own_times(mode, h, v, g):
+def test_batch_members_end_at_their_own_times_with_correct_derivatives(mode, h, v, g):
     """Two end early, one completes, and the start of one is no number. Derivatives by what is theirs and by what all
     share (g, in the first column) are those of the formula, and NaN where what is missing is read."""
     rtol = 1e-6
@@ -619,7 +619,7 @@ def test_members_of_a_batch_end_at_their_own_times(mode, h, v, g):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("adjoint", "derivative"), [("forward", jax.jacfwd), ("reverse", jax.jacrev)])
-def test_an_event_after_a_jump_that_is_differentiated(adjoint, derivative):
+def test_derivatives_of_an_event_after_an_input_jump(adjoint, derivative):
     """A force of 1 N from 0.5 s + delay on. The step that begins there is rejected and repeated."""
 
     class Pushed(Particle):

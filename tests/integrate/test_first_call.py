@@ -52,7 +52,7 @@ def first_trajectory(system):
 
 
 @pytest.mark.slow
-def test_a_description_is_read_three_times_at_most():
+def test_system_methods_are_called_at_most_three_times():
     """Once for its check and once for all that the method asks; and the check of its constraints."""
     count = itertools.count()  # whose next number Python finds without changing what the class reads
 
@@ -70,7 +70,7 @@ def test_a_description_is_read_three_times_at_most():
     assert next(count) <= n + 2
 
 
-def test_assembling_compiles_nothing():
+def test_assemble_compiles_nothing():
     """What is asked a few times, by the check and by Newton's method, is answered by NumPy."""
 
     class Another(Bead):
@@ -84,7 +84,7 @@ def test_assembling_compiles_nothing():
 
 
 @pytest.mark.slow
-def test_a_first_trajectory_compiles_one_program_and_few_of_the_solver():
+def test_the_first_simulation_compiles_few_programs():
     """diffrax compares its own result codes before it is compiled."""
 
     class Another(Bead):
@@ -97,14 +97,14 @@ def test_a_first_trajectory_compiles_one_program_and_few_of_the_solver():
 
 
 @pytest.mark.slow
-def test_a_motion_that_nobody_differentiates_has_the_same_numbers():
+def test_a_simulation_without_differentiation_gives_the_same_numbers():
     ride, other = first_trajectory(Bead()), jax.jit(lambda x: first_trajectory(Bead(radius=x)))(0.5)
     for x, y in zip(jax.tree.leaves(ride), jax.tree.leaves(other), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-13)
     assert ride.adjoint == other.adjoint == "RecursiveCheckpointAdjoint"
 
 
-def test_it_is_known_whether_anything_is_traced():
+def test_tracing_of_arguments_is_detected():
     seen = []
 
     def f(x):
@@ -130,7 +130,7 @@ def equations(jaxpr):
 
 
 @pytest.mark.slow
-def test_the_program_of_a_motion_without_events_is_small():
+def test_the_program_of_a_simulation_without_events_is_small():
     """Measured, with ten per cent to spare for other releases of diffrax, whose loop most of it is."""
     system = jk.catalog.DoublePendulum(mass=1.0, length=1.0)
     state = jk.State(jnp.array([1.0, -0.5]), jnp.array([0.0, 0.3]))
@@ -160,7 +160,7 @@ def test_samples_are_looked_up_once_in_a_step():
     assert "bool[7,11]" not in str(program)
 
 
-def test_a_record_gives_what_was_asked_for_and_keeps_exact_values():
+def test_a_replay_returns_the_requested_outputs_and_keeps_exact_values():
     scale, a, t = jnp.array(2.0), jnp.array(0.7), jnp.array(-1.3)
     product = _two.replay("product", scale, ((a, 0.0), t), {})
     assert product == [0.0, 3.0] and all(type(x) is float for x in product)  # noqa: PT018
@@ -171,7 +171,7 @@ def test_a_record_gives_what_was_asked_for_and_keeps_exact_values():
 
 
 @pytest.mark.parametrize("derivative", [jax.jvp, jax.linearize])
-def test_a_record_has_the_derivatives_of_its_function(derivative):
+def test_a_replay_has_the_derivatives_of_its_function(derivative):
     f = lambda a, t: _two.replay("sum", jnp.array(2.0), ((a, 0.5), t), {})[0]  # noqa: E731
     at, along = (jnp.array(0.7), jnp.array(-1.3)), (jnp.array(1.0), jnp.array(3.0))
     found = jax.jvp(f, at, along)[1] if derivative is jax.jvp else jax.linearize(f, *at)[1](*along)
@@ -181,7 +181,7 @@ def test_a_record_has_the_derivatives_of_its_function(derivative):
     np.testing.assert_allclose(batch, np.arange(3.0) + 0.5, rtol=1e-15)
 
 
-def test_a_memory_holds_what_no_direction_changes():
+def test_values_independent_of_the_changed_arguments_are_cached():
     scale, t, memory = jnp.array(2.0), jnp.array(-1.3), {}
     _two.replay("sum", scale, ((jnp.array(0.7), 0.5), t), memory)
     n = len(memory)
@@ -189,7 +189,7 @@ def test_a_memory_holds_what_no_direction_changes():
     assert n < len(memory) < 2 * n
 
 
-def test_what_reads_a_trace_that_is_under_way_is_not_recorded():
+def test_functions_that_capture_a_tracer_are_not_recorded():
     @jax.jit
     def f(x):
         g = ScalarFunction(lambda scale, y: {"all": scale * y[0] * x})

@@ -138,7 +138,7 @@ def test_second_derivatives_through_a_jump():
     [{"step": 0.01}, {"solver": diffrax.Heun(), "rtol": 1e-7, "atol": 1e-7}],
     ids=["fixed steps", "without rates at ends"],
 )
-def test_other_methods(options):
+def test_results_agree_for_other_solvers_and_options(options):
     options = {**({"rtol": None, "atol": None} if "step" in options else {}), **options}
     ride = drop(P, **options)
     assert int(ride.jumps.count) == 3
@@ -172,7 +172,7 @@ def test_each_member_of_a_batch_jumps_at_its_own_times():
 
 @pytest.mark.parametrize("t0", [0.0, 1.7e9])
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_any_clock_and_any_scale_of_time(t0, scale):
+def test_results_do_not_depend_on_start_time_and_time_scale(t0, scale):
     """With g / scale^2 the motion is the same at times that are scaled."""
     p = P.at[1].divide(scale**2)
     with_times = np.asarray(TS) * scale + t0 if t0 == 0 or scale == 1e6 else None
@@ -230,7 +230,7 @@ def test_a_sample_at_the_time_of_a_jump_has_the_value_after_it():
 
 
 @pytest.mark.slow
-def test_the_derivative_of_a_sample_at_a_jump():
+def test_a_sample_at_a_jump_has_no_derivative_by_the_time_of_the_jump():
     """It does not exist if the time of the jump depends on the parameter. At a jump with a fixed time it does."""
 
     def found(v, at_time):
@@ -247,7 +247,7 @@ def test_the_derivative_of_a_sample_at_a_jump():
 
 
 @pytest.mark.slow
-def test_the_derivative_of_an_end_at_a_jump():
+def test_an_end_at_a_jump_has_no_derivative_by_the_time_of_the_jump():
     """It does not exist either if the time of the jump depends on the parameter."""
 
     def end(v, at_time):
@@ -262,7 +262,7 @@ def test_the_derivative_of_an_end_at_a_jump():
 
 
 @pytest.mark.slow
-def test_simultaneous_events_follow_each_other_in_alphabetical_order():
+def test_simultaneous_events_are_processed_in_alphabetical_order():
     """Each reads the state that the previous one left, and counts only if it still leaves in its direction."""
 
     def events(t, q, u, x):
@@ -280,7 +280,7 @@ def test_simultaneous_events_follow_each_other_in_alphabetical_order():
 
 
 @pytest.mark.slow
-def test_two_events_almost_at_once():
+def test_two_almost_simultaneous_events():
     for gap in (1e-13, 1e-9):
 
         def events(t, q, u, x, gap=gap):
@@ -296,7 +296,7 @@ def test_two_events_almost_at_once():
 
 
 @pytest.mark.slow
-def test_a_condition():
+def test_an_event_has_no_effect_while_its_condition_is_not_positive():
     """Crossings while `when` is not positive have no effect, and do not hide later ones."""
 
     def events(t, q, u, x):
@@ -314,7 +314,7 @@ def test_a_condition():
 
 
 @pytest.mark.slow
-def test_stages_read_the_state_that_the_previous_one_left():
+def test_stages_of_a_jump_read_the_state_after_the_previous_stage():
     def swap(t, q, u, x):
         return {"mode": u["v"], "v": 0.5 * u["v"]}
 
@@ -324,7 +324,7 @@ def test_stages_read_the_state_that_the_previous_one_left():
 
 
 @pytest.mark.slow
-def test_a_start_on_zero_jumps_at_once_if_it_leaves_in_its_direction():
+def test_an_event_at_zero_at_the_start_jumps_if_it_crosses_in_its_direction():
     def events(t, q, u, x):
         return {"wall": jk.falling(q["x"], then={"v": -u["v"]})}
 
@@ -335,14 +335,14 @@ def test_a_start_on_zero_jumps_at_once_if_it_leaves_in_its_direction():
 
 
 @pytest.mark.slow
-def test_both_zeros_of_a_gap_in_one_step():
+def test_two_zero_crossings_of_a_gap_in_one_step():
     """A ball that leaves the floor with 1e-7 m/s lands after 2e-8 s."""
     ride = jk.simulate(Ball(0.5, 0.0), jk.State(jnp.zeros(1), jnp.array([1e-7])), TS, max_jumps=3)
     np.testing.assert_allclose(ride.jumps.t[:2], 2e-7 / 9.81 * np.array([1.0, 1.5]), rtol=1e-6)
     assert ride.reason == "max jumps"
 
 
-def test_a_jump_that_repeats_itself_has_a_status():
+def test_a_repeated_jump_has_a_status():
     ride = moving(lambda t, q, u, x: {"wall": jk.rising(q["x"] - 1.0, then={"v": 0.5 * u["v"]})})
     assert ride.reason == "repeated jump"
     assert "then" in repr(ride)
@@ -354,7 +354,7 @@ def test_a_jump_that_repeats_itself_has_a_status():
 
 
 @pytest.mark.slow
-def test_jumps_that_accumulate_have_a_status():
+def test_accumulating_jumps_have_a_status():
     ride = drop(P.at[3].set(0.3), max_jumps=20)
     assert ride.reason == "max jumps"
     assert int(ride.jumps.count) == 20
@@ -408,7 +408,7 @@ def test_a_compass_gait():
 
 
 @pytest.mark.slow
-def test_the_energy_balance_over_jumps():
+def test_the_energy_balance_includes_losses_in_jumps():
     """The audit counts what the impacts lose, and no work where a jump moves a mass centre."""
     p = P.at[2].set(0.0)
     ride = drop(p, jnp.linspace(0.0, 2.0, 201), max_jumps=5)
@@ -422,7 +422,7 @@ def test_the_energy_balance_over_jumps():
     assert jk.audit(RimlessWheel(), wheel).energy_balance < 1e-9
 
 
-def test_where_jumps_cannot_be_represented(tmp_path):
+def test_functions_that_cannot_represent_jumps_raise_or_warn(tmp_path):
     with pytest.raises(
         ValueError, match=r"events or contacts of Ball change its state: floor\. A Kalman filter cannot"
     ):
@@ -442,7 +442,7 @@ def test_a_sweep_over_parameters_with_different_numbers_of_jumps():
 
 
 @pytest.mark.slow
-def test_what_jumps_cannot_do():
+def test_invalid_jumps_raise():
     def then(new):
         return lambda t, q, u, x: {"kick": jk.rising(q["x"] - 1.0, then=new)}
 
@@ -488,7 +488,7 @@ def test_the_last_sample_shortly_after_a_jump():
 
 
 @pytest.mark.slow
-def test_an_event_that_its_jump_does_not_change_occurs_once_at_each_crossing():
+def test_an_event_unchanged_by_its_jump_occurs_once_per_crossing():
     """A switch at a time, and a counter of crossings."""
 
     def events(t, q, u, x):
@@ -510,7 +510,7 @@ class OverMovingFloor(Ball):
 
 
 @pytest.mark.slow
-def test_a_moving_floor_is_not_passed():
+def test_a_ball_does_not_penetrate_a_moving_floor():
     """Small dips through zero within long steps: the motion itself is a parabola, which does not limit them."""
     ts = jnp.linspace(0.0, 5.0, 1001)
     for h in (0.5446297531687792, 0.5278185456971314):
@@ -518,7 +518,7 @@ def test_a_moving_floor_is_not_passed():
         assert float(jnp.min(ride["h"] - 0.1 * jnp.sin(12 * ts))) > -1e-7
 
 
-def test_times_of_jumps_in_float32_on_a_posix_clock():
+def test_times_of_jumps_in_float32_with_posix_times():
     start = jk.State(jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32))
     system = jax.tree.map(lambda x: x.astype(jnp.float32), Ball(0.8, 0.1))
     ride = jk.simulate(system, start, 1.7e9 + np.asarray(TS, np.float64))

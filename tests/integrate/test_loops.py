@@ -37,7 +37,7 @@ def assert_same(fast, other):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_both_loops_take_the_same_steps(name, monkeypatch):
+def test_the_fast_loop_and_diffrax_take_the_same_steps(name, monkeypatch):
     entry = jk.catalog.CATALOG[name]
     system, state = entry.example(), jk.State(jnp.array(entry.q), jnp.array(entry.u))
     assert_same(*both_loops(monkeypatch, lambda: jk.simulate(system, state, jnp.linspace(0.0, 0.2, 3))))
@@ -58,13 +58,13 @@ SAMPLED = {"push": jk.Samples(np.linspace(0.0, 1.0, 5), np.array([1.0, -2.0, 0.5
     ],
     ids=["event", "hold", "fixed", "implicit", "max steps"],
 )
-def test_both_loops_with_all_that_ends_a_step(system, inputs, options, monkeypatch):
+def test_the_fast_loop_and_diffrax_agree_with_events_and_discontinuities(system, inputs, options, monkeypatch):
     state = jk.State([0.0], [0.4])
     assert_same(*both_loops(monkeypatch, lambda: jk.simulate(system, state, [0.0, 0.5, 1.0], inputs, **options)))
 
 
 @pytest.mark.slow
-def test_both_loops_with_batches_and_derivatives(monkeypatch):
+def test_the_fast_loop_and_diffrax_agree_in_batches_and_derivatives(monkeypatch):
     def ends(v):
         ride = jax.vmap(lambda v: jk.simulate(Thrown(), jk.State(jnp.zeros(1), v[None]), [0.0, 1.0, 2.0]))(v)
         return jnp.sum(ride.t_end), ride.t_end
@@ -98,12 +98,12 @@ def swing(**options):
     ],
     ids=["backsolve", "imex", "controller", "progress"],
 )
-def test_what_diffrax_supports(options):
+def test_diffrax_options_are_supported(options):
     np.testing.assert_allclose(swing(**options), swing(), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.slow
-def test_a_controller_still_ends_steps_at_events():
+def test_a_diffrax_controller_still_locates_events():
     control = diffrax.PIDController(rtol=1e-7, atol=1e-7, pcoeff=0.2, icoeff=0.5)
     ride = jk.simulate(Thrown(), jk.State([0.0], [1.5]), [0.0, 10.0], controller=control)
     assert ride.reason == "back"
@@ -111,7 +111,7 @@ def test_a_controller_still_ends_steps_at_events():
 
 
 @pytest.mark.slow
-def test_a_term_for_diffrax():
+def test_ode_term_can_be_passed_to_diffrax():
     system, state = jk.catalog.DoublePendulum(), jk.State(jnp.array([1.0, -0.5]), jnp.zeros(2))
     term, args = jk.ode_term(system, {"elbow_torque": lambda t, s: 0.3 * jnp.sin(t)})
     control = diffrax.PIDController(rtol=1e-9, atol=1e-9)

@@ -62,7 +62,7 @@ def swing(gravity, ts, **options):
 
 
 @pytest.mark.slow
-def test_links_pass_the_place_where_dependent_speeds_are_singular():
+def test_with_multipliers_passes_singular_dependent_speeds():
     ts = jnp.linspace(0.0, 2.0, 21)
     assert jk.simulate(Links(), jk.assemble(Links(), START, None), ts).reason == "singular speeds"
     ride = swing(9.81, ts)
@@ -80,7 +80,7 @@ def test_links_pass_the_place_where_dependent_speeds_are_singular():
 
 
 @pytest.mark.slow
-def test_links_for_half_a_minute():
+def test_energy_and_constraints_hold_for_thirty_seconds():
     ride = swing(9.81, jnp.linspace(0.0, 30.0, 601), stabilize=10.0)
     audit = jk.audit(jk.with_multipliers(Links()), ride)
     assert ride.ok
@@ -124,7 +124,7 @@ class Parallelogram(jk.System):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("excess", [0.0, 1e-8])
-def test_a_third_rocker_is_redundant(excess):
+def test_a_redundant_third_rocker_does_not_change_the_motion(excess):
     system = jk.with_multipliers(Parallelogram(excess))
     state = jk.assemble(system, [0.5, 0.4, 0.45, 0.02], None, free=("b", "c", "bar"))
     np.testing.assert_allclose(state.q, [0.5, 0.5, 0.5, 0.0], atol=1e-7)
@@ -136,7 +136,7 @@ def test_a_third_rocker_is_redundant(excess):
     np.testing.assert_allclose(ride["a"][-1], pendulum.y[0, -1], atol=1e-6 if excess else 1e-8)
 
 
-def test_what_multipliers_refuse():
+def test_with_multipliers_rejects_unsupported_uses():
     system = jk.with_multipliers(Links())
     assert jk.with_multipliers(system) is system
     with pytest.raises(TypeError, match="must be an instance of a System"):
@@ -148,7 +148,7 @@ def test_what_multipliers_refuse():
 
 
 @pytest.mark.slow
-def test_other_independent_speeds_keep_contacts_and_events_that_read_states():
+def test_other_independent_speeds_preserve_contacts_and_state_events():
     class Crank(Links):
         states = ("turns",)
 

@@ -57,7 +57,7 @@ def ride():
 
 
 @pytest.mark.slow
-def test_by_name_along_a_trajectory(ride):
+def test_functions_evaluated_along_a_trajectory_by_name(ride):
     n, r = int(np.isfinite(ride["x"]).sum()), 0.5
     assert 1 < n < 5  # it ended early
     x, spin, rate = (np.asarray(ride[name]) for name in ("x", "spin", "spin_rate"))
@@ -77,7 +77,7 @@ def test_by_name_along_a_trajectory(ride):
     np.testing.assert_allclose(rates["x_dot"], 0.15 / 0.45 + zero, rtol=1e-14)
 
 
-def test_a_trajectory_of_no_times_is_refused(ride):
+def test_an_empty_trajectory_is_rejected(ride):
     none = jax.tree.map(lambda x: x[:0] if np.shape(x)[:1] == TS.shape else x, ride)
     for f in (jk.positions, jk.constraint_forces):
         with pytest.raises(ValueError, match="Disc: the trajectory contains no times"):
@@ -85,7 +85,7 @@ def test_a_trajectory_of_no_times_is_refused(ride):
 
 
 @pytest.mark.slow
-def test_at_one_time_and_in_a_batch(ride):
+def test_functions_evaluated_at_one_time_and_for_a_batch(ride):
     where = jk.positions(Disc(), 0.0, {"x": 1.0}, {})["rim"]
     np.testing.assert_allclose(where, [1.5, 0.0, 0.0], atol=1e-15)
     two = jax.tree.map(lambda x: jnp.stack([x, x]), ride)
@@ -98,7 +98,7 @@ def test_at_one_time_and_in_a_batch(ride):
 
 
 @pytest.mark.slow
-def test_derivatives_along_a_trajectory_that_ended():
+def test_derivatives_along_a_trajectory_that_ended_early():
     def last(push, adjoint):  # the rim where it was last
         system = dataclasses.replace(Disc(), push=push)
         ride = jk.simulate(system, START, TS, adjoint=adjoint, step=0.1)
@@ -116,7 +116,7 @@ def test_derivatives_along_a_trajectory_that_ended():
 
 
 @pytest.mark.slow
-def test_forces_of_constraint_along_a_trajectory_that_ended():
+def test_constraint_forces_along_a_trajectory_that_ended_early():
     """The reverse derivative of what was reached sees nothing of what was not."""
     system = DoublePendulum()
     ride = jk.simulate(system, jk.State([0.3, 0.2], [0.0, 0.0]), TS)
@@ -132,7 +132,7 @@ def test_forces_of_constraint_along_a_trajectory_that_ended():
 
 
 @pytest.mark.slow
-def test_equations_without_a_solution_are_an_error_at_one_time():
+def test_singular_equations_raise_at_one_time():
     """Three hinges that lock: every function that solves for accelerations says so, and is NaN under a trace."""
     hinges = [hinge("x", (1.0, 0.0, 0.0)), hinge("y", (0.0, 1.0, 0.0)), hinge("z")]
     system = mechanism([Link("a", None, hinges, mass=1.0, inertia=(0.1, 0.1, 0.1))], name="Gimbals")
@@ -167,7 +167,7 @@ class Coupled(jk.System):
 
 
 @pytest.mark.slow
-def test_where_the_force_of_a_residual_is_read():
+def test_the_point_of_application_of_a_residual_force():
     forces = jk.constraint_forces(Coupled(), 0.0, {"y": 1.0}, {})  # 6 N move 3 kg: 2 kg of them by 4 N
     for name, force in {"A": -4.0, "B": 4.0, "twice": 0.0}.items():
         np.testing.assert_allclose(forces[name], [force, 0.0, 0.0], atol=1e-14)
@@ -193,13 +193,13 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-def test_the_motion_of_another_system_has_other_names(ride, kind):
+def test_the_trajectory_of_another_system_is_recognized_by_its_names(ride, kind):
     other = type("Other", (Disc,), OTHERS[kind])()
     with pytest.raises(ValueError, match=f"f: the trajectory belongs to another system. Its {kind}: "):
         refuse_other_system("f", other, ride)
 
 
-def test_motions_of_the_same_names_are_taken(ride):
+def test_trajectories_with_the_same_names_are_accepted(ride):
     refuse_other_system("f", Disc(radius=0.1), ride)
 
 
@@ -211,7 +211,7 @@ def test_every_public_function_refuses_the_motion_of_another_system(ride, name):
         f(other, ride)
 
 
-def test_no_public_function_of_a_trajectory_is_left_out():
+def test_every_public_function_of_a_trajectory_is_tested():
     rooms = [jk, *(importlib.import_module(f"jaxkane.{room}") for room in jk._ROOMS if room != "catalog")]
     functions = {
         f"{room.__name__}.{name}": f

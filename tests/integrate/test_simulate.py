@@ -46,7 +46,7 @@ def test_energy_and_front_contact_over_five_seconds():
 
 
 @pytest.mark.slow
-def test_steps_of_any_solver_agree():
+def test_fixed_and_adaptive_steps_agree():
     fine = jk.simulate(PENDULUM, START, TS, solver=diffrax.Dopri8(), rtol=1e-11, atol=1e-11)
     steps = jk.simulate(PENDULUM, START, TS, step=1e-3)
     np.testing.assert_allclose(steps.q, fine.q, atol=1e-9)
@@ -84,7 +84,7 @@ class Rider(eqx.Module):
 
 
 @pytest.mark.slow
-def test_a_rider_keeps_the_bicycle_up():
+def test_a_steering_controller_stabilizes_the_bicycle():
     """A rider who steers into the fall keeps the bicycle up at 2.5 m/s, where it falls by itself."""
     state = jk.assemble(BIKE, {"roll": 0.02}, {"rear_wheel_rate": -2.5 / 0.3})
     ts = jnp.linspace(0.0, 5.0, 51)
@@ -177,7 +177,7 @@ def bicycle_for_a_second():
 
 
 @pytest.mark.slow
-def test_how_bicycles_end(bicycle_for_a_second):
+def test_a_fall_and_singular_speeds_end_a_bicycle_simulation(bicycle_for_a_second):
     """A roll beyond 78 degrees is a fall. Steered to 1.6 rad it is just beside 91.77 degrees, where for the upright
     bicycle the dependent speeds are singular."""
     fell = bicycle_for_a_second(roll=1.2, roll_rate=2.0)
@@ -256,7 +256,7 @@ def test_every_adjoint_against_differences(adjoint, mode):
 
 
 @pytest.mark.slow
-def test_a_derivative_forward_of_what_was_compiled_before_says_what_to_do():
+def test_forward_mode_through_a_compiled_reverse_mode_raises_with_advice():
     def read(u):
         return jk.simulate(Pendulum(), jk.State(jnp.array([0.4]), u), TS[:3], step=0.05, max_steps=4)["angle"][-1]
 
@@ -280,7 +280,7 @@ def test_a_derivative_forward_of_what_was_compiled_before_says_what_to_do():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["reverse over reverse", "reverse of forward", "reverse over forward"])
-def test_derivatives_in_reverse_mode_that_do_not_exist_say_what_to_do(mode):
+def test_unsupported_reverse_mode_derivatives_raise_with_advice(mode):
     def read(rate, **options):
         state = jk.State(jnp.array([0.4]), jnp.stack([rate]))
         return jk.simulate(Pendulum(), state, TS[:3], step=0.05, max_steps=4, **options)["angle"][-1]
@@ -300,7 +300,7 @@ def test_a_state_that_is_not_finite_is_refused_by_name():
 
 
 @pytest.mark.slow
-def test_a_state_of_two_types_has_the_wider_one():
+def test_a_state_of_mixed_types_is_promoted():
     state = jk.State(jnp.array([0.4], jnp.float32), jnp.array([0.1]))
     assert jk.simulate(Pendulum(), state, TS[:3], step=0.05, max_steps=4).q.dtype == jnp.float64
 
@@ -333,7 +333,7 @@ def test_gradients_of_the_bicycle():
 
 
 @pytest.mark.slow
-def test_float32_and_what_follows_from_it():
+def test_float32_results():
     pendulum = jax.tree.map(lambda x: x.astype(jnp.float32), PENDULUM)
     start = jax.tree.map(lambda x: x.astype(jnp.float32), START)
     ride = jk.simulate(pendulum, start, np.linspace(0.0, 1.0, 11), {"elbow_torque": 0.0})
@@ -343,7 +343,7 @@ def test_float32_and_what_follows_from_it():
 
 
 @pytest.mark.slow
-def test_another_accuracy_compiles_nothing():
+def test_changing_the_accuracy_does_not_recompile():
     coarse, fine = (jk.simulate(PENDULUM, START, TS, step=x) for x in (0.1, 0.05))
     programs = len(solve.programs)
     finer = jk.simulate(PENDULUM, START, TS, step=0.025)
@@ -366,7 +366,7 @@ def test_under_jit_and_vmap():
 
 
 @pytest.mark.slow
-def test_going_on_from_where_a_ride_ended():
+def test_a_simulation_can_be_resumed_from_its_end():
     whole = jk.simulate(PENDULUM, START, TS, rtol=1e-11, atol=1e-11)
     first = jk.simulate(PENDULUM, START, TS[:6], rtol=1e-11, atol=1e-11)
     second = jk.simulate(PENDULUM, first.state(), TS[5:], rtol=1e-11, atol=1e-11)
@@ -374,7 +374,7 @@ def test_going_on_from_where_a_ride_ended():
 
 
 @pytest.mark.slow
-def test_times_and_samples_that_cannot_be_are_told_under_a_trace():
+def test_invalid_times_and_samples_give_status_invalid_under_jit():
     """Where no check sees the numbers."""
     kinds = (False, True)
 
@@ -405,7 +405,7 @@ def test_times_and_samples_that_cannot_be_are_told_under_a_trace():
     np.testing.assert_array_equal(np.array(of_values)[:, -1], jk.Status.COMPLETED)
 
 
-def test_progress_is_shown_on_request_only(capfd):
+def test_progress_is_printed_on_request_only(capfd):
     jk.simulate(PENDULUM, START, TS)
     assert capfd.readouterr() == ("", "")
     jax.block_until_ready(jk.simulate(PENDULUM, START, TS, progress=True))
@@ -442,7 +442,7 @@ def test_progress_is_shown_on_request_only(capfd):
         ),
     ],
 )
-def test_what_is_refused(arguments, error, message):
+def test_invalid_arguments_raise(arguments, error, message):
     with pytest.raises(error, match=message):
         jk.simulate(*arguments)
 
@@ -469,7 +469,7 @@ class Pendulum(jk.System):
 
 
 @pytest.mark.slow
-def test_a_step_that_ends_beside_a_sample():
+def test_a_step_that_ends_a_rounding_error_before_a_sample():
     """Steps of 2.5 ms by chance end a rounding error before samples; what is left was once too short a step."""
     pendulum = Pendulum()
     ts, start = jnp.linspace(0.0, 2.5, 51), jk.State(jnp.array([0.1]), jnp.zeros(1))
@@ -486,7 +486,7 @@ def test_a_step_that_ends_beside_a_sample():
 
 
 @pytest.mark.slow
-def test_a_motion_that_ends_at_a_sample_with_others_behind_it():
+def test_a_simulation_that_ends_at_an_inner_input_sample():
     """The last step ended a rounding error before that sample, which then was never reached: NaN, and "completed"."""
     ts, start = jnp.linspace(0.0, 2.5, 51), jk.State(jnp.array([0.1]), jnp.zeros(1))
     torque = {"torque": jk.Samples(ts, 3.0 * jnp.sin(2.0 * ts))}

@@ -67,7 +67,7 @@ def ride(cart):
 
 
 @pytest.mark.slow
-def test_the_exact_motion_of_a_linear_system(cart, ride):
+def test_states_of_a_linear_system_agree_with_the_exact_solution(cart, ride):
     A, B = matrices(cart)
     augmented = np.block([[A, 5.0 * B], [np.zeros((1, 5))]])
     exact = np.array([(expm(augmented * t) @ [0.2, -0.1, 3.0, 0.0, 1.0])[:4] for t in ts])
@@ -84,7 +84,7 @@ def test_the_exact_motion_of_a_linear_system(cart, ride):
 
 
 @pytest.mark.slow
-def test_what_is_asked_at_one_time(cart, ride):
+def test_accelerations_state_rates_and_outputs_at_one_time(cart, ride):
     at = (0.3, [0.1], [0.5], {"force": 2.0, "command": 1.0, "filtered": 0.4})
     assert float(jk.accelerations(cart, *at)[0]) == pytest.approx((2.0 - 3.0) / 2.0)
     rates = jk.state_rates(cart, *at)
@@ -121,7 +121,7 @@ def test_derivatives_in_both_modes_and_in_batches(cart):
 
 
 @pytest.mark.slow
-def test_a_batch_by_sweep(cart):
+def test_a_sweep_over_parameters_and_initial_states(cart):
     rides = sweep(cart, START, ts, {"command": 5.0}, table={"lag": [0.1, 0.2], "force": [3.0, 1.0]})
     assert rides["acceleration"].shape == (2, 21)
     assert rides.x.shape == (2, 21, 2)
@@ -156,14 +156,14 @@ def test_a_controller_reads_a_state(cart):
 
 
 @pytest.mark.slow
-def test_the_audit_knows_their_power(cart):
+def test_the_audit_includes_the_power_of_states(cart):
     ride = jk.simulate(cart, START, np.linspace(0.0, 1.0, 201), {"command": 5.0})
     kept = jk.audit(cart, ride)
     assert np.abs(kept.energy_error).max() < 1e-6 * np.abs(kept.work).max()
 
 
 @pytest.mark.slow
-def test_a_lag_and_the_start_of_a_state_are_identified(cart):
+def test_a_lag_and_the_initial_value_of_a_state_are_identified(cart):
     rng = np.random.default_rng(0)
     true = jk.simulate(Cart(lag=0.13, gain=1.2), START, ts, {"command": 5.0})
     names = ("place", "acceleration")
@@ -209,7 +209,7 @@ class Falling(jk.System):
 
 
 @pytest.mark.slow
-def test_an_event_ends_the_states_too():
+def test_an_event_ends_the_integration_of_states():
     def end(height):
         ride = jk.simulate(Falling(), jk.State([height], [0.0], [0.0]), ts)
         return ride.t_end, ride.end.x[0], ride.x[-1, 0]
@@ -223,7 +223,7 @@ def test_an_event_ends_the_states_too():
 
 
 @pytest.mark.slow
-def test_starts_of_all_kinds(cart):
+def test_initial_values_of_states_in_every_form(cart):
     assert jk.assemble(cart, {"place": 0.1}, x={"force": 2.0}).x.tolist() == [2.0, 0.0]
     assert jk.assemble(cart, {"place": 0.1}).x.tolist() == [0.0, 0.0]
     plain = jk.simulate(cart, jk.State([0.1], [0.0]), ts[:2])
@@ -248,7 +248,7 @@ def test_starts_of_all_kinds(cart):
         jk.simulate(cart, jk.State([0.0], [0.0], [np.nan, 0.0]), ts)
 
 
-def test_what_is_exported_takes_the_states_behind_the_inputs(cart):
+def test_exported_functions_take_states_after_the_inputs(cart):
     written = {}
     exec(str(jk.export.numpy(cart)), written)
     at = (0.3, [0.1], [0.5])
@@ -288,7 +288,7 @@ def variant(**members):
         ({"states": ("force", "place")}, "'place' appears in `coordinates` and in `states`"),
     ],
 )
-def test_what_is_wrong_is_named(members, message):
+def test_invalid_states_raise_by_name(members, message):
     with pytest.raises((ValueError, TypeError, KeyError, NotImplementedError), match=message):
         jk.simulate(variant(**members), jk.State([0.0], [0.0]), ts)
 
@@ -303,7 +303,7 @@ class Plain(jk.System):
 
 
 @pytest.mark.parametrize("joined", [lambda base, rate: (*base, rate), lambda base, rate: {**base, "wear": rate}])
-def test_a_base_without_states_gives_none(joined):
+def test_states_can_be_added_to_a_base_without_states(joined):
     rate = 0.5
 
     class Worn(Plain):

@@ -17,7 +17,7 @@ from jaxkane._scalarjit.backends import native
 from jaxkane._scalarjit.scalar_function import ScalarFunction
 
 
-def test_a_solver_without_an_estimate_of_its_error_asks_for_a_step():
+def test_a_solver_without_error_estimate_requires_a_fixed_step():
     system, state = pendulum()
     with pytest.raises(ValueError, match="step=1e-3"):
         jk.simulate(system, state, jnp.linspace(0.0, 0.5, 3), solver=diffrax.Euler())
@@ -27,7 +27,7 @@ def test_a_solver_without_an_estimate_of_its_error_asks_for_a_step():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [diffrax.Heun(), pytest.param(diffrax.Kvaerno3(), marks=pytest.mark.slow)])
-def test_half_steps_have_the_tolerances_and_the_derivatives_of_the_method(method):
+def test_half_solver_meets_tolerances_and_has_correct_derivatives(method):
     _, state = pendulum()
 
     def last(length, **options):
@@ -43,7 +43,7 @@ def test_half_steps_have_the_tolerances_and_the_derivatives_of_the_method(method
 
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), diffrax.ImplicitEuler()])
-def test_implicit_steps_of_one_length(solver):
+def test_implicit_solvers_with_fixed_steps_have_their_order(solver):
     system, state = pendulum()
     ts = jnp.linspace(0.0, 0.4, 3)
     order = 1 if isinstance(solver, diffrax.ImplicitEuler) else 5
@@ -90,7 +90,7 @@ def controller(duration, step=None, first=0.01, tolerance=1e-7, discontinuities=
         pytest.param(diffrax.Bosh3(), "both", None, marks=pytest.mark.slow),
     ],
 )
-def test_the_steps_are_those_of_diffrax(solver, adjoint, step):
+def test_steps_and_derivatives_agree_with_diffrax(solver, adjoint, step):
     """Its `diffeqsolve` takes as many steps, to the same numbers and derivatives."""
     ts, first, kind = jnp.linspace(0.0, 1.8, 7), 0.01, ADJOINTS[adjoint]()
     tolerance = 1e-4 if isinstance(solver, diffrax.HalfSolver) else 1e-7
@@ -151,7 +151,7 @@ AT_REST = jk.State([1.0], [0.0])
 
 @pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
-def test_a_fixed_step_to_what_is_no_number_ends_the_motion(adjoint):
+def test_a_fixed_step_to_a_non_finite_state_ends_the_simulation(adjoint):
     """As one with tolerances: with a reason, and derivatives that are NaN where there is no motion."""
 
     def ride(stiffness, mass=1.0):
@@ -174,7 +174,7 @@ def test_a_fixed_step_to_what_is_no_number_ends_the_motion(adjoint):
 
 
 @pytest.mark.slow
-def test_as_many_steps_as_are_allowed():
+def test_max_steps_limits_the_number_of_steps():
     system, state = pendulum()
     ride = lambda most: jk.simulate(system, state, [0.0, 0.5], max_steps=most)  # noqa: E731
     n = int(ride(1000).stats["steps"])
@@ -192,7 +192,7 @@ class Growth(Oscillator):
 
 
 @pytest.mark.slow
-def test_an_implicit_step_without_a_solution_ends_the_motion():
+def test_an_implicit_step_without_a_solution_ends_the_simulation():
     """Of y = y0 + h (y^2 + 1), for h = 1."""
     state = jk.State([1.0], [0.0], [0.0])
     with pytest.raises(ValueError, match=r"cannot take a first step: .* or an implicit step has no solution"):
@@ -217,7 +217,7 @@ def _of_the_first(x, y):
 
 
 @pytest.mark.slow
-def test_what_a_program_does_not_read_is_not_computed_for_it(native):
+def test_unused_arguments_of_a_program_are_not_computed(native):
     def f(x):
         return _of_the_first(x, jnp.exp(x))
 
@@ -237,7 +237,7 @@ def _doubled_if_positive(x):
 
 
 @pytest.mark.slow
-def test_a_program_that_also_tells_what_is_true_has_derivatives(kernels):
+def test_a_program_with_boolean_results_is_differentiable(kernels):
     value = lambda x: _doubled_if_positive(x)[0]  # noqa: E731
     for x, slope in ((0.7, 2.0), (-0.7, 1.0)):
         assert jax.jit(jax.grad(value))(x) == slope
@@ -249,7 +249,7 @@ def test_a_program_that_also_tells_what_is_true_has_derivatives(kernels):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("jacobian", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
-def test_the_last_time_and_the_first_have_derivatives(jacobian):
+def test_results_are_differentiable_by_the_first_and_last_time(jacobian):
     system, state = pendulum()
 
     def end(times):
@@ -263,7 +263,7 @@ def test_the_last_time_and_the_first_have_derivatives(jacobian):
 
 
 @pytest.mark.slow
-def test_a_step_ends_at_a_discontinuity_or_leaves_half_of_the_way_to_it():
+def test_a_step_ends_at_a_discontinuity_or_halfway_to_it():
     stops = Discontinuities(jnp.array([0.5, 1.0]), jumps=False, restart=False)
     for length in (0.1, 0.3, 0.5 - 1e-9, 0.5, 0.7, 1.2):
         control = controller(2.0, first=length, discontinuities=stops)
@@ -273,7 +273,7 @@ def test_a_step_ends_at_a_discontinuity_or_leaves_half_of_the_way_to_it():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ["forward", "reverse"])
-def test_a_motion_that_cannot_begin_takes_no_steps(adjoint):
+def test_an_invalid_batch_member_takes_no_steps(adjoint):
     """Beside one that can: a body with a negative mass, and a parameter that is no number."""
 
     def ride(mass, stiffness):

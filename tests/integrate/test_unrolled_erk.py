@@ -42,7 +42,7 @@ def motion(solver, jump, args):
 @pytest.mark.parametrize(
     ("method", "jump"), [(diffrax.Tsit5, True), pytest.param(diffrax.Dopri8, False, marks=pytest.mark.slow)]
 )
-def test_the_same_steps_numbers_and_derivatives(method, jump):
+def test_unrolled_stages_give_the_same_steps_values_and_derivatives(method, jump):
     rtol = 1e-11
     found = []
     for solver in (method(), UnrolledERK(method())):
@@ -55,7 +55,7 @@ def test_the_same_steps_numbers_and_derivatives(method, jump):
 
 
 @pytest.mark.slow
-def test_they_are_written_out_where_the_right_hand_side_is_a_native_kernel(native):
+def test_stages_are_unrolled_if_the_right_hand_side_is_a_native_kernel(native):
     system = jk.catalog.DoublePendulum(mass=1.0, length=0.7)
     y = packed(jk.State(jnp.zeros(2), jnp.zeros(2)))
     assert rates_are_native(system, jnp.zeros(()), y, {})
@@ -81,7 +81,7 @@ class Rod(jk.System):
 
 
 @pytest.mark.slow
-def test_a_member_without_mass_leaves_the_gradient_of_the_others():
+def test_a_massless_batch_member_does_not_affect_the_gradients_of_others():
     def ends(length, masses):
         start, ts = jk.State({"angle": 0.3}, {}), jnp.linspace(0.0, 0.5, 3)
         return jax.vmap(lambda m: jk.simulate(Rod(m, length), start, ts, adjoint="reverse").q[-1, 0])(masses)

@@ -40,7 +40,7 @@ def end(delay, adjoint="auto"):
 
 
 @pytest.mark.slow
-def test_the_exact_motion_and_its_derivative_by_a_delay():
+def test_the_solution_and_its_derivative_by_a_delay_are_exact():
     found, slope = jax.jit(lambda d: jax.jvp(lambda d: end(d, "forward"), (d,), (1.0,)))(0.03)
     exact = [place(t, 0.03) for t in (0.0, 0.5, 1.0)]
     np.testing.assert_allclose(found, exact, atol=1e-12)
@@ -51,7 +51,7 @@ def test_the_exact_motion_and_its_derivative_by_a_delay():
 
 
 @pytest.mark.slow
-def test_steps_of_one_length_that_end_at_the_samples():
+def test_fixed_steps_that_end_at_the_samples_are_exact():
     push = jk.Samples(ts, values, zero_order_hold=True)
     ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())
     np.testing.assert_allclose(ride["place"], [place(t, 0.0) for t in ts], atol=1e-13)
@@ -62,7 +62,7 @@ def test_steps_of_one_length_that_end_at_the_samples():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-def test_steps_of_one_length_have_a_derivative_by_values_and_none_by_times(mode):
+def test_fixed_steps_have_derivatives_by_sample_values_and_nan_by_times(mode):
     def end(delay, factor):
         push = jk.Samples(ts + delay, factor * values, zero_order_hold=True)
         ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())
@@ -73,7 +73,7 @@ def test_steps_of_one_length_have_a_derivative_by_values_and_none_by_times(mode)
 
 
 @pytest.mark.slow
-def test_a_rejected_step_behind_a_jump_begins_anew():
+def test_a_rejected_step_after_a_jump_evaluates_its_first_stage_again():
     """Its first stage is not the last one before the jump, for the step that is repeated neither."""
     system, state = jk.catalog.DoublePendulum(), jk.State([0.5, -0.2], [0.7, 1.0])
     torque = jk.Samples(ts, values, zero_order_hold=True)
@@ -87,7 +87,7 @@ def test_an_input_of_the_time_alone_is_refused_by_name():
         jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": lambda t: 1.0})
 
 
-def test_what_is_no_hold_is_refused():
+def test_an_invalid_zero_order_hold_option_raises():
     with pytest.raises(TypeError, match="`zero_order_hold` must be True or False, got 'zero'"):
         jk.Samples(ts, values, zero_order_hold="zero")
 
@@ -120,7 +120,7 @@ class Earlier(eqx.Module):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_kinks_of_samples_that_a_function_calls(form):
+def test_discontinuities_of_samples_called_by_a_function_are_found(form):
     state = jk.State(jnp.zeros(1), jnp.zeros(1))
     kinks = discontinuities_of(Cart(), push_of(form, 0.03, True), {}, jnp.array(0.1), state, fixed=False)
     # Functions are called with the time of the clock, which starts at 0.1 s; the input itself has relative times.
@@ -140,7 +140,7 @@ def end_with(system, push):
 
 
 @pytest.mark.slow
-def test_a_delay_inside_a_function_has_its_derivative():
+def test_a_delay_within_an_input_function_is_differentiable():
     rtol, h = 1e-8, 1e-6
     slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
     found = by_delay(lambda d: end_with(Cart(), push_of("asked earlier", d, True)))
@@ -149,7 +149,7 @@ def test_a_delay_inside_a_function_has_its_derivative():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", ["branch", "controller"])
-def test_samples_that_a_function_calls_are_those_given(form):
+def test_samples_called_by_a_function_equal_samples_passed_directly(form):
     rtol = 1e-11
     found, given = (
         by_delay(lambda d, form=form: end_with(Cart(), push_of(form, d, False))) for form in (form, "direct")
@@ -166,7 +166,7 @@ class Blown(Cart):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Blown")
-def test_samples_of_a_description_have_derivatives_by_their_times():
+def test_samples_stored_in_a_system_have_derivatives_by_their_times():
     rtol, h = 1e-8, 1e-6
     slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
     found = by_delay(lambda d: end_with(Blown(jk.Samples(ts + d, values, zero_order_hold=True)), None))
@@ -182,7 +182,7 @@ class Late(Cart):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Late")
-def test_samples_that_a_description_reads_from_outside_are_met():
+def test_discontinuities_of_samples_captured_by_a_system_are_found():
     rtol, h = 1e-8, 1e-6
     slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
     np.testing.assert_allclose(by_delay(lambda d: end_with(Late(d), None)), (place(1.0, 0.03), slope), rtol=rtol)
@@ -201,7 +201,7 @@ def test_samples_that_a_description_reads_from_outside_are_met():
         ),
     ],
 )
-def test_calls_of_samples_that_steps_cannot_follow_are_refused(push, options, message):
+def test_unsupported_calls_of_samples_in_input_functions_raise(push, options, message):
     with pytest.raises(ValueError, match=message):
         jk.simulate(Cart(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], {"push": push}, **options)
 
@@ -210,7 +210,7 @@ samples_held = jk.Samples(ts, values, zero_order_hold=True)
 
 
 @pytest.mark.parametrize("f", ["linear", "held", pytest.param("motion", marks=pytest.mark.slow)])
-def test_memory_goes_with_the_number_of_samples(f):
+def test_memory_is_proportional_to_the_number_of_samples(f):
     """A table of samples by times of 20 000 would take 3.2 GB."""
     n, per_sample = 20_000, 1000
 
@@ -235,7 +235,7 @@ class Two(Cart):
 @pytest.mark.slow
 @pytest.mark.parametrize(("shift", "slope"), [(0.0, np.nan), (0.05, values[0] - values[4])], ids=["same", "other"])
 @pytest.mark.parametrize("mode", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
-def test_jumps_of_two_signals_at_one_time_have_no_silent_derivative(mode, shift, slope):
+def test_simultaneous_jumps_of_two_signals_have_nan_derivatives_by_delay(mode, shift, slope):
     """By the delay of one of them. A step that ends at both jumps has one derivative with respect to its end."""
 
     def end(delay):

@@ -43,7 +43,7 @@ SYSTEMS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_both_forms_agree(name, monkeypatch):
+def test_scalar_and_array_programs_agree(name, monkeypatch):
     args = SYSTEMS[name]()
     moved = jax.tree.map(lambda x: 0.3 * jnp.ones_like(x), args)
     found = []
@@ -56,7 +56,7 @@ def test_both_forms_agree(name, monkeypatch):
 
 
 @pytest.mark.slow
-def test_both_forms_agree_in_reverse(monkeypatch):
+def test_scalar_and_array_programs_agree_in_reverse_mode(monkeypatch):
     system, t, q, u, inputs = SYSTEMS["double pendulum"]()
     found = []
     for most in (12, 0):
@@ -67,7 +67,7 @@ def test_both_forms_agree_in_reverse(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_long_chain_keeps_its_energy():
+def test_the_energy_of_a_long_chain_is_conserved():
     chain, _, q, u, _ = at(Chain(n=14), 14)
     assert not components.is_written_out(14)
     state = jk.State(0.3 * q, 0.5 * u)
@@ -86,7 +86,7 @@ def test_a_long_chain_keeps_its_energy():
 
 
 @pytest.mark.slow
-def test_the_work_grows_with_the_number_of_links():
+def test_the_operation_count_is_proportional_to_the_number_of_links():
     def operations(n):
         leaves, treedef = jax.tree.flatten((*at(Chain(n=n), n), jnp.ones(n)))
         column = lambda *x: rates._mass_times.__wrapped__(*jax.tree.unflatten(treedef, x))  # noqa: E731

@@ -91,7 +91,7 @@ def tree_of_all_joints():
 
 
 @pytest.mark.slow
-def test_a_tree_of_every_joint_accelerates_as_in_mujoco():
+def test_accelerations_of_a_tree_of_all_joints_agree_with_mujoco():
     system = tree_of_all_joints()
     for state in FIGURES["states"]:
         inputs = dict(zip(system.inputs, state["inputs"], strict=True))
@@ -100,7 +100,7 @@ def test_a_tree_of_every_joint_accelerates_as_in_mujoco():
 
 
 @pytest.mark.slow
-def test_two_hinges_are_the_double_pendulum_of_the_catalogue():
+def test_two_hinges_equal_the_double_pendulum_of_the_catalogue():
     m, l = 1.3, 0.7
     bar = {"mass": m, "center": (0, -l / 2, 0), "inertia": (m * l**2 / 12, 0, m * l**2 / 12)}
     links = [Link("1", None, hinge("a"), **bar), Link("2", "1", hinge("b"), (0, -l, 0), **bar)]
@@ -114,7 +114,7 @@ def test_two_hinges_are_the_double_pendulum_of_the_catalogue():
 
 
 @pytest.mark.slow
-def test_armature_stands_on_the_diagonal_of_the_mass_matrix_and_nowhere_else():
+def test_armature_affects_only_the_diagonal_of_the_mass_matrix():
     chain = [
         Link("a", None, free("r", armature=0.3), **BAR),
         Link("b", "a", ball("s", armature=0.2), (0, 0, -0.4), **BAR),
@@ -132,7 +132,7 @@ def test_armature_stands_on_the_diagonal_of_the_mass_matrix_and_nowhere_else():
 
 
 @pytest.mark.slow
-def test_a_planar_joint_and_a_universal_joint_move_as_their_parts():
+def test_planar_and_universal_joints_equal_their_component_joints():
     disk = Link("disk", None, planar("p", ((0, 0, 1), (1, 0, 0)), damping=0.4), mass=2.0, inertia=(0.2, 0.3, 0.2))
     system = mechanism([disk], gravity=(0, 0, -9.0), actuators=[Actuator("F", "p_x"), Actuator("T", "p_angle")])
     u_dot = jk.accelerations(system, 0.0, [0.1, 0.2, 0.3], [1.0, 2.0, 3.0], {"F": 5.0, "T": 0.6})
@@ -144,7 +144,7 @@ def test_a_planar_joint_and_a_universal_joint_move_as_their_parts():
     np.testing.assert_array_equal(one, two)
 
 
-def test_a_spring_on_a_ball_joint_is_smooth_where_it_rests_and_takes_the_shorter_way():
+def test_a_ball_joint_spring_is_smooth_at_rest_and_takes_the_shorter_rotation():
     system = mechanism(
         [Link("a", None, ball("s", stiffness=2.0), mass=1.0, inertia=(0.5, 0.5, 0.5))], gravity=(0, 0, 0)
     )
@@ -160,7 +160,7 @@ def test_a_spring_on_a_ball_joint_is_smooth_where_it_rests_and_takes_the_shorter
 
 @pytest.mark.slow
 @pytest.mark.parametrize("base", [free("base"), planar("base"), [ball("s"), slide("x", (1, 2, 0))]])
-def test_the_methods_of_a_tree_of_joints_agree(base):
+def test_motion_and_rates_of_a_tree_of_joints_are_consistent(base):
     """`check_description` relies on this and does not check trees."""
     links = [
         Link("trunk", None, base, **BAR),
@@ -207,7 +207,7 @@ def four_bar(across=0.0, **more):
 
 
 @pytest.mark.slow
-def test_a_four_bar_linkage_accelerates_as_in_sympy():
+def test_accelerations_of_a_four_bar_linkage_agree_with_sympy():
     system = four_bar(dependent=("q2", "q3"))
     assert system.dependent_speeds == ("q2_rate", "q3_rate")  # of three residuals two, since it lies in a plane
     for state in FOUR_BAR["states"]:
@@ -217,7 +217,7 @@ def test_a_four_bar_linkage_accelerates_as_in_sympy():
         np.testing.assert_allclose([rates[x] for x in ("q1_rate", "q2_rate", "q3_rate")], expected, rtol=RTOL)
 
 
-def test_what_is_dependent_is_found_and_may_be_assembled():
+def test_dependent_coordinates_are_chosen_and_can_be_assembled():
     system = four_bar()
     assert len(system.dependent_speeds) == 2
     state = FOUR_BAR["states"][0]
@@ -249,12 +249,12 @@ def test_a_named_joint_is_independent(kept):
         ({"poses": {"start": {"q1": 1.0}}}, "the pose 'start' needs one value per coordinate; see 'q2'"),
     ],
 )
-def test_choices_of_loops_that_are_refused(more, words):
+def test_invalid_choices_of_dependent_coordinates_raise(more, words):
     with pytest.raises((ValueError, TypeError), match=words):
         four_bar(**more)
 
 
-def test_a_loop_is_closed_by_its_own_links_only():
+def test_only_the_links_of_a_loop_enter_its_constraint():
     """A four-bar linkage at the end of a chain, whose links do not affect the loop."""
     side = [Link("left", "link4", hinge("l", (0, 1, 0)), **BAR), Link("right", "link4", hinge("r", (0, 1, 0)), **BAR)]
     links = [*pendulums(5), *side, Link("coupler", "left", hinge("c", (0, 1, 0)), (0, 0, -0.4), **BAR)]
@@ -273,13 +273,13 @@ def test_a_loop_is_closed_by_its_own_links_only():
     np.testing.assert_allclose(trial.slopes(q) @ (2 * step), change, atol=1e-14)
 
 
-def test_a_loop_in_a_plane_that_ends_beside_its_beginning_is_refused():
+def test_a_planar_loop_with_an_out_of_plane_offset_is_rejected():
     with pytest.raises(ValueError, match=r"Loop\('ground', 'end'\) cannot be satisfied: its residual is 0.1 "):
         four_bar(across=0.1)
 
 
 @pytest.mark.slow
-def test_a_rigid_loop_is_a_body():
+def test_two_welded_bodies_move_as_one_body():
     slab = {"mass": 1.0, "inertia": (0.1, 0.2, 0.3), "center": (0.1, 0.2, 0.0)}
     a, b = Link("a", None, free("r"), **slab), Link("b", None, hinge("h", (0, 0, 1)), (0.1, 0.0, 0.0), **slab)
     turned = (0.0, 0.0, np.sin(0.2), np.cos(0.2))
@@ -299,7 +299,7 @@ def test_a_rigid_loop_is_a_body():
 @pytest.mark.parametrize(
     "turned", [(1.0, 0.0, 0.0, 0.0), (0.0, 0.6, -0.8, 0.0), (0.5, 0.5, 0.5, 0.5), (0.0, 0.0, 0.0, 1.0)]
 )
-def test_a_turned_weld_holds_in_one_orientation_only(turned):
+def test_a_rotated_weld_is_satisfied_in_one_orientation_only(turned):
     TOLERANCE = 1e-9
     slab = {"mass": 1.0, "inertia": (0.1, 0.2, 0.25)}
     sites = [Site("on a", "a", (0.0, 0.0, 0.1)), Site("on b", "b", (0.0, 0.0, -0.1), turned)]
@@ -319,7 +319,7 @@ def test_a_turned_weld_holds_in_one_orientation_only(turned):
 
 
 @pytest.mark.slow
-def test_a_rigid_loop_in_a_plane_is_not_closed_half_a_turn_away():
+def test_a_planar_rigid_loop_is_not_closed_at_half_a_turn():
     links = [Link("a", None, hinge("a"), mass=1.0), Link("b", "a", hinge("b"), (0.5, 0.0, 0.0), mass=1.0)]
     links.append(Link("c", "b", hinge("c"), (0.5, 0.0, 0.0), mass=1.0))
     sites = [Site("hand", "c"), Site("goal", None, (0.7, 0.2, 0.0), ("3-1-2", (np.pi, 0.0, 0.0)))]
@@ -337,7 +337,7 @@ def test_a_coupling_is_a_gear():
     np.testing.assert_allclose(alpha, [2.0 / (0.2 + 9 * 0.03)], rtol=1e-13)
 
 
-def test_a_coupling_is_of_two_joints_and_exact_numbers():
+def test_invalid_couplings_raise():
     """Text that reads as a number is none, here and in a gear; `dependent` is refused where nothing is solved."""
     gears = [Link(n, None, hinge(n), mass=1.0, inertia=(0, 0, I)) for n, I in (("g", 0.2), ("p", 0.03))]
     for coefficients in ("12", ("0", "2"), (0.0, np.nan), ()):
@@ -354,7 +354,7 @@ def test_a_coupling_is_of_two_joints_and_exact_numbers():
 # Structure and parameters
 
 
-def test_one_structure_is_one_class_and_survives_a_pickle():
+def test_equal_structures_share_a_class_and_can_be_pickled():
     one, two = mechanism(pendulums()), mechanism([*reversed(pendulums())])
     assert type(one) is type(two)
     assert type(mechanism(pendulums(damping=0.1))) is not type(one)
@@ -468,12 +468,12 @@ def test_a_loop_may_be_made_of_traced_numbers():
         ),
     ],
 )
-def test_what_is_wrong_is_named(links, more, words):
+def test_invalid_mechanisms_raise_by_name(links, more, words):
     with pytest.raises(ValueError, match=words):
         mechanism(links, **more)
 
 
-def test_an_inertia_matrix_may_be_off_symmetry_by_rounding_errors():
+def test_an_inertia_matrix_may_be_asymmetric_by_rounding_errors():
     turned = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     inertia = turned @ np.diag([0.1, 0.2, 0.25]) @ turned.T
     assert (inertia != inertia.T).any()
@@ -493,7 +493,7 @@ def test_an_inertia_matrix_may_be_off_symmetry_by_rounding_errors():
         ),
     ],
 )
-def test_what_is_structure_is_not_traced(what, links, more):
+def test_structural_values_must_not_be_traced(what, links, more):
     def made(x):
         return mechanism(links(x), **{name: part(x) for name, part in more.items()})
 
@@ -507,7 +507,7 @@ def test_a_universal_joint_has_two_axes():
         universal("h", np.eye(3))
 
 
-def test_an_axis_has_a_direction():
+def test_a_zero_axis_raises():
     with pytest.raises(ValueError, match="axis of 'h'"):
         hinge("h", (0, 0, 0))
     with pytest.raises(TypeError, match="not a Link"):
@@ -527,7 +527,7 @@ def crank_with_slider(L, across=0.0, rigid=False):
 
 
 @pytest.mark.parametrize("L", [1e-9, 1e-6, 1e6, 1e9])
-def test_a_loop_is_closed_in_any_unit_of_length(L):
+def test_loop_closure_does_not_depend_on_the_unit_of_length(L):
     right, system = crank_with_slider(1.0), crank_with_slider(L)
     assert system.dependent_coordinates == right.dependent_coordinates
     assert system.structure.loops[0].independent == right.structure.loops[0].independent
@@ -541,7 +541,7 @@ def test_a_loop_is_closed_in_any_unit_of_length(L):
         crank_with_slider(L, across=1e-4 * L)
 
 
-def test_half_a_turn_away_a_weld_is_open():
+def test_a_weld_is_not_satisfied_at_half_a_turn():
     """sin(pi) = 0: the sines alone would say that it is closed."""
     welded = mechanism(
         [Link("a", None, free("a"), mass=1.0, inertia=(0.1, 0.2, 0.25))],
@@ -557,7 +557,7 @@ def test_half_a_turn_away_a_weld_is_open():
 
 
 @pytest.mark.slow
-def test_a_coordinate_that_is_named_stays_though_the_library_chose_it_as_dependent():
+def test_named_coordinates_are_fixed_even_if_chosen_as_dependent():
     system = crank_with_slider(1.0)
     first, second = system.dependent_coordinates
     free_one = next(c for c in system.coordinates if c not in system.dependent_coordinates)
@@ -601,7 +601,7 @@ def test_stops_are_contacts_of_a_mechanism():
 @pytest.mark.parametrize(
     "stops", [(1.0, 0.5), (1.0, 1.0), 0.3, (0.1,), ("a", 1.0), ((0.0, 1.0), 2.0), (float("nan"), 1.0)]
 )
-def test_stops_are_two_limits(stops):
+def test_stops_must_be_a_lower_and_a_larger_upper_limit(stops):
     with pytest.raises(ValueError, match="stops of 'q' must be a lower and a larger upper limit"):
         hinge("q", stops=stops)
 
@@ -618,6 +618,6 @@ def test_dry_friction_is_a_contact_of_a_mechanism():
     assert parameters_of(slider, ["friction.x"]).units == ("N",)
 
 
-def test_a_mechanism_has_four_stops():
+def test_a_mechanism_has_at_most_four_stops():
     with pytest.raises(ValueError, match=r"6 contacts, which are the limits of q0, q1, q2. At most 4 .* fewer joints"):
         mechanism(pendulums(3, stops=(-1.0, 1.0)))

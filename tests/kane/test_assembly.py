@@ -48,7 +48,7 @@ class Plane(jk.System):
 
 
 @pytest.mark.slow
-def test_what_is_named_is_held_and_other_orientations_are_none(balls):
+def test_named_coordinates_are_fixed_and_unnamed_orientations_are_identity(balls):
     for given in ({"a4": 1.0}, {"x": 2.0, "a1": 0.0}):
         expected = np.array([given.get("x", 0.0), 0.0, 0.0, *IDENTITY, *IDENTITY])
         np.testing.assert_array_equal(jk.assemble(balls, given).q, expected)
@@ -60,7 +60,7 @@ def test_what_is_named_is_held_and_other_orientations_are_none(balls):
     np.testing.assert_allclose(body, [1.0, 0, 0, 0, -0.8, 0, 0.6], atol=1e-15)
 
 
-def test_what_is_named_and_contradicts_the_constraints_is_refused(balls):
+def test_named_values_that_violate_the_constraints_are_rejected(balls):
     with pytest.raises(ValueError, match=r"TwoBalls: .*a4 = 0\.9.*Named values are fixed"):
         jk.assemble(balls, {"a4": 0.9})
     with pytest.raises(ValueError, match=r"b1 = 0\.1.*b4 = 0\.9"):
@@ -78,7 +78,7 @@ def test_what_is_named_and_contradicts_the_constraints_is_refused(balls):
 
 
 @pytest.mark.slow
-def test_what_is_left_out_is_found():
+def test_omitted_coordinates_are_solved_for():
     np.testing.assert_allclose(jk.assemble(Plane(), {"x": 2.0, "angle": 0.5}).q, [2.0, 5.0, 0.5], atol=1e-15)
     np.testing.assert_allclose(
         jk.assemble(Plane(), {"y": 5.0}).q, [2.0, 5.0, 0.0], atol=1e-12
@@ -93,7 +93,7 @@ def test_what_is_left_out_is_found():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("given", [{"x": 2.0}, {"x": 1.0}])  # no such place; a place where y has no derivative
-def test_the_derivatives_of_what_is_not_found_are_nan(given):
+def test_derivatives_are_nan_if_assembly_fails(given):
     found = jax.jit(lambda x: jk.assemble(OnACircle(), {"x": x}).q[1])
     assert np.isnan(found(given["x"]))
     for derivative in (jax.grad, jax.jacfwd, lambda f: jax.jacfwd(jax.grad(f))):
@@ -101,7 +101,7 @@ def test_the_derivatives_of_what_is_not_found_are_nan(given):
 
 
 @pytest.mark.slow
-def test_one_that_is_not_found_leaves_the_others_as_they_are():
+def test_a_failed_batch_member_does_not_affect_the_others():
     x = jnp.array([0.6, 2.0, 1.0, 0.0, jnp.nan])
     found = jax.vmap(lambda x: jk.assemble(OnACircle(), {"x": x}).q[1])
     good = np.array([True, False, False, True, False])
@@ -118,7 +118,7 @@ def test_one_that_is_not_found_leaves_the_others_as_they_are():
 
 
 @pytest.mark.slow
-def test_parameters_move_what_is_found():
+def test_assembled_coordinates_are_differentiable_by_parameters():
     def y(height):
         return jk.assemble(Plane(height=height), {"x": 2.0}).q
 
@@ -127,7 +127,7 @@ def test_parameters_move_what_is_found():
 
 
 @pytest.mark.slow
-def test_euler_parameters_among_many_coordinates():
+def test_euler_parameters_among_many_coordinates_are_recognized():
     """120 quaternions between 120 other coordinates: with one random point, some of 600 windows matched by accident."""
 
     class Many(jk.System):

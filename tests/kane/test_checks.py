@@ -24,11 +24,11 @@ def evaluate(system, q=STATE[0], u=STATE[1]):
     return jk.accelerations(system, 0.0, q, u)
 
 
-def test_the_right_one_passes():
+def test_a_consistent_system_passes():
     assert np.isfinite(evaluate(Slider())).all()
 
 
-def test_no_motion():
+def test_a_system_without_motion_raises():
     class Empty(jk.System):
         coordinates, speeds = ("x",), ("x_dot",)
 
@@ -36,7 +36,7 @@ def test_no_motion():
         evaluate(Empty(), [0.0], [0.0])
 
 
-def test_speeds_that_are_not_the_rates_of_the_coordinates():
+def test_speeds_other_than_coordinate_rates_require_q_dot():
     class TooFewSpeeds(jk.System):
         coordinates = ("x", "angle")
         speeds = ("x_dot",)
@@ -181,7 +181,7 @@ class TwoHingesOnOneAxis(jk.System):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_a_mass_matrix_that_is_singular_but_for_rounding(many):
+def test_a_numerically_singular_mass_matrix_raises(many):
     system = TwoHingesOnOneAxis(many=many)
     rng = np.random.default_rng(0)
     for q, u in rng.normal(size=(4, 2, len(system.coordinates))):
@@ -193,7 +193,7 @@ def test_a_mass_matrix_that_is_singular_but_for_rounding(many):
         assert np.isfinite(evaluate(TwoHingesOnOneAxis(many=many, **light), q, u)).all()
 
 
-def test_what_motion_and_loads_return():
+def test_invalid_return_values_of_motion_and_loads_raise():
     class NoMotion(Slider):
         def motion(self, t, q, u):
             return super().motion(t, q, u).bodies
@@ -228,7 +228,7 @@ def test_what_motion_and_loads_return():
         (np.ones((2, 3)), None, None),  # a batch; `simulate` says what it needs
     ],
 )
-def test_parameters(value, error, message):
+def test_parameter_values_are_checked(value, error, message):
     if error is None:
         assert DoublePendulum(mass=value).mass.shape == (2, 3)
         return
@@ -242,7 +242,7 @@ def test_integers_become_floats():
     assert float(jax.grad(lambda p: jk.accelerations(p, 0, [1, 0], [0, 1]).sum())(pendulum).length) != 0.0
 
 
-def test_a_negative_mass_of_a_parameter_that_was_not_declared_positive():
+def test_a_negative_mass_from_an_unrestricted_parameter_raises():
     with pytest.raises(ValueError, match=r"Slider, body 'rod': the mass is -1 kg"):
         evaluate(Slider(mass=-1.0))
 
@@ -279,7 +279,7 @@ ASKED = {
 
 @pytest.mark.slow_cases(all_but=["assemble"])
 @pytest.mark.parametrize("asked", ASKED.values(), ids=ASKED)
-def test_one_rule_for_inertias_that_no_body_can_have(asked):
+def test_impossible_inertias_are_checked_by_the_same_rule_everywhere(asked):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         asked(Spinner(1.0, 1.0, 2.0))  # a flat plate
@@ -295,7 +295,7 @@ def test_one_rule_for_inertias_that_no_body_can_have(asked):
 
 
 @pytest.mark.slow
-def test_in_a_batch_bodies_that_cannot_be_have_a_status():
+def test_impossible_bodies_in_a_batch_have_status_invalid():
     # possible, rounded, measured, refused, negative
     I33 = np.array([2.0, 2.003, 2.1, 2.2, -0.1])
     right = [0, 0, 0, 4, 4]
@@ -341,7 +341,7 @@ def test_an_inertia_needs_a_frame():
 # -- names
 
 
-def test_one_name_for_two_parts_of_a_motion():
+def test_duplicate_names_in_a_motion_raise():
     N, O = jk.inertial()
     A, P = N.rotate(3, 0.1, 0.0, "A"), O.fixed(N.x)
     rod, other, unnamed = (jk.Body(1.0, 0.0, O, name=name) for name in ("A", "A", "body"))
@@ -385,7 +385,7 @@ def test_one_name_for_two_parts_of_a_motion():
         ({"dependent_coordinates": ("x", "x")}, ValueError, "x is not a coordinate, or is repeated"),
     ],
 )
-def test_names_of_a_class(names, error, message):
+def test_invalid_names_of_a_class_raise(names, error, message):
     with pytest.raises(error, match=message):
         type("Named", (Slider,), names)()
     properties = {kind: property(lambda self, given=given: given) for kind, given in names.items()}
@@ -393,7 +393,7 @@ def test_names_of_a_class(names, error, message):
         type("Named", (Slider,), properties)()
 
 
-def test_lists_of_names_and_the_name_of_an_auxiliary_speed():
+def test_lists_of_names_are_accepted_and_auxiliary_speed_names_checked():
     listed = type("Listed", (Slider,), {"coordinates": ["x", "angle"]})
     assert listed.coordinates == ("x", "angle")
     assert np.isfinite(evaluate(listed())).all()
@@ -409,7 +409,7 @@ def test_lists_of_names_and_the_name_of_an_auxiliary_speed():
         evaluate(Held())
 
 
-def test_shapes_and_names():
+def test_wrong_shapes_and_names_raise():
     bike = WhippleBicycle.benchmark()
     q, u = np.zeros(8), np.zeros(3)
     with pytest.raises(ValueError, match=r"WhippleBicycle: q must have the shape \(8,\).*Got \(7,\)"):
@@ -423,7 +423,7 @@ def test_shapes_and_names():
 
 
 @pytest.mark.slow
-def test_assemble_says_when_it_cannot():
+def test_assemble_reports_why_it_fails():
     bike = WhippleBicycle.benchmark()
     with pytest.raises(ValueError, match=r"constraints do not determine pitch with roll = 1\.571"):
         jk.assemble(bike, {"roll": np.pi / 2})
@@ -440,7 +440,7 @@ def test_assemble_says_when_it_cannot():
 
 
 @pytest.mark.slow
-def test_assemble_is_differentiable_twice_and_maps():
+def test_assemble_is_twice_differentiable_and_can_be_vmapped():
     bike = WhippleBicycle.benchmark()
     pitch = lambda x: jk.assemble(bike, jnp.zeros(8).at[jnp.array([0, 2])].set(x)).q[4]  # noqa: E731
     x, h = jnp.array([0.3, -0.5]), 1e-5
@@ -472,7 +472,7 @@ def test_assemble_and_simulate_in_one_program():
     np.testing.assert_allclose(final_height(0.6), np.cos(end), atol=1e-7)
 
 
-def test_text_beside_a_traced_number_is_refused():
+def test_text_in_a_list_with_a_traced_number_is_rejected():
     with pytest.raises(TypeError, match="'x' must be a real number"):
         jax.jit(lambda x: jk.assemble(OnACircle(), {"x": [x, "one"]}).q)(0.6)
 
@@ -502,7 +502,7 @@ class TurningByOthers(Turning):
     by_rates = False
 
 
-def test_locked_angles_are_no_missing_mass():
+def test_gimbal_lock_is_not_reported_as_missing_mass():
     """drake 1596: at a pitch of a quarter turn."""
     q, u = jnp.array([0.0, -np.pi / 2, 0.0]), jnp.array([0.3, 0.2, 0.1])
     with pytest.raises(ValueError, match=r"the speeds a, c can change together without moving any body .*Euler param"):
@@ -528,7 +528,7 @@ class Coincident(jk.System):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("derivative", [lambda f: f, jax.grad, jax.jacfwd])
-def test_a_force_without_direction_is_refused_under_derivatives_too(derivative):
+def test_a_force_without_direction_is_rejected_under_derivatives(derivative):
     def end(length):
         return jk.simulate(Coincident(length), jk.State([0.0], [0.0]), jnp.linspace(0.0, 1.0, 3)).q[-1, 0]
 
@@ -552,7 +552,7 @@ class OnAPin(jk.System):
         )
 
 
-def test_a_moment_about_one_axis_alone_may_be_about_another_point():
+def test_a_single_moment_of_inertia_may_refer_to_another_point():
     assert jk.mass_matrix(OnAPin(), 0.0, [0.3], [0.0]).item() == pytest.approx(0.2, rel=1e-12)
     with pytest.raises(ValueError, match=r"central moments: the inertia was given about the point 'O'"):
         jk.accelerations(OnAPin(inertia=0.1), 0.0, [0.3], [0.0])
@@ -560,7 +560,7 @@ def test_a_moment_about_one_axis_alone_may_be_about_another_point():
         jk.accelerations(OnAPin(inertia=0.1, moments="all"), 0.0, [0.3], [0.0])
 
 
-def test_bodies_are_judged_together_as_each_by_itself():
+def test_the_batched_body_check_agrees_with_the_single_check():
     """Also a rotor, a particle, and an inertia that is not finite."""
     rng = np.random.default_rng(0)
     moments = np.concatenate([rng.uniform(-0.1, 2.0, (40, 3)), [[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [1.0, 1.0, np.nan]]])

@@ -31,7 +31,7 @@ def test_steady_precession_of_the_top():
 
 
 @pytest.mark.slow
-def test_VC_dot_of_the_bicycle_and_the_books_order_of_products():
+def test_VC_dot_of_the_bicycle_agrees_with_the_corrected_formula():
     # Example 7, [VC-dot]: in its second and third lines the products stand in the wrong order, R_B2C and [J] are
     # missing. Right is the expression of [VD-dot], with C in the place of D.
     bicycle = CATALOG["WhippleBicycle"].example()

@@ -36,7 +36,7 @@ def evaluate(system, state=STATE):
     ],
     ids=["abs", "maximum", "minimum", "clip", "square", "where"],
 )
-def test_speeds_of_both_signs_and_all_sizes(bent):
+def test_non_affine_velocities_are_detected_at_speeds_of_any_sign_and_size(bent):
     class Bent(Slider):
         def rate(self, u):
             return bent(u["x_dot"])
@@ -77,13 +77,13 @@ def calls():
 
 
 @pytest.mark.parametrize("call", calls())
-def test_refused_wherever_it_is_met(call):
+def test_every_function_rejects_an_inconsistent_system(call):
     wrong = type("Wrong", (Doubled,), {})()  # a class of its own, which nobody has looked at
     with pytest.raises(ValueError, match=REFUSED):
         calls()[call](wrong)
 
 
-def test_under_a_trace_without_defaults_there_are_trial_numbers():
+def test_traced_parameters_without_defaults_are_checked_at_random_values():
     class Tilted(jk.System):
         """Right for any axis and any quaternion of length one."""
 
@@ -105,7 +105,7 @@ def test_under_a_trace_without_defaults_there_are_trial_numbers():
     np.testing.assert_allclose(jax.jit(energy)(*given), 0.5 * (0.1 + 0.25) * 4.0, rtol=1e-12)
 
 
-def test_every_structure_is_looked_at():
+def test_every_static_structure_is_checked():
     class Links(jk.System):
         number: int = eqx.field(static=True)
 
@@ -132,7 +132,7 @@ def test_every_structure_is_looked_at():
         evaluate(Links(3), jk.State(np.zeros(3), np.zeros(3)))
 
 
-def test_what_is_prescribed_in_time_is_looked_at_when_it_moves():
+def test_prescribed_motions_are_checked_at_times_when_they_move():
     class Driven(Slider):
         factor: float = eqx.field(static=True, default=1.0)
 
@@ -150,7 +150,7 @@ def test_what_is_prescribed_in_time_is_looked_at_when_it_moves():
 # -- named points and frames, constraints
 
 
-def test_named_frames_and_points():
+def test_inconsistent_named_frames_and_points_raise():
     class WrongFrame(Slider):
         def motion(self, t, q, u):
             motion = super().motion(t, q, u)
@@ -179,7 +179,7 @@ def test_named_frames_and_points():
         evaluate(NotFixed())
 
 
-def test_points_of_contact_are_points_of_a_body_and_pass():
+def test_contact_points_fixed_to_a_body_pass_the_check():
     class Wheel(jk.System):
         """A wheel that slides and turns on the ground; its contact is another point of it at every instant."""
 
@@ -201,7 +201,7 @@ def test_points_of_contact_are_points_of_a_body_and_pass():
     np.testing.assert_allclose(u_dot, [-2.5, -7.5], rtol=1e-9)
 
 
-def test_a_velocity_residual_that_contradicts_the_configuration():
+def test_a_velocity_residual_that_contradicts_the_configuration_raises():
     class OnACircle(jk.System):
         sign: float = eqx.field(static=True)
         coordinates, speeds = ("x", "y"), ("x_dot",)
@@ -225,7 +225,7 @@ def test_a_velocity_residual_that_contradicts_the_configuration():
 
 
 @pytest.mark.slow
-def test_rates_of_euler_parameters_that_leave_the_constraint():
+def test_rates_of_euler_parameters_that_violate_the_unit_norm_raise():
     class Top(jk.System):
         factor: float = eqx.field(static=True)
         coordinates, speeds = ("e1", "e2", "e3", "e4"), ("w1", "w2", "w3")
@@ -262,7 +262,7 @@ def test_rates_of_euler_parameters_that_leave_the_constraint():
 
 
 @pytest.mark.filterwarnings("ignore:.*its description uses:UserWarning")  # a constant matrix is no single numbers
-def test_a_matrix_that_is_no_rotation():
+def test_a_matrix_that_is_not_a_rotation_raises():
     class Sheared(Slider):
         def motion(self, t, q, u):
             N, O = jk.inertial()
@@ -299,7 +299,7 @@ class Pushed(jk.System):
 
 
 @pytest.mark.parametrize("way", ["given", "again", "at"])
-def test_loads_act_on_points_that_loads_made(way):
+def test_loads_may_act_on_points_created_in_loads(way):
     q, u, w = jnp.array([0.4]), jnp.array([0.5]), {"torque": 0.3}
     np.testing.assert_allclose(jk.accelerations(Pushed(way), 0.0, q, u, w), [(7.0 - 1.5 + 0.3) / 1.0], rtol=1e-12)
     np.testing.assert_allclose(jk.generalized_active_forces(Pushed(way), 0.0, q, u, w), [5.8], rtol=1e-12)
@@ -328,7 +328,7 @@ def test_loads_on_points_of_a_motion_without_speeds_are_refused():
     ids=["numpy", "if", "max", "float", "item", "index"],
 )
 @pytest.mark.parametrize("method", ["motion", "q_dot", "loads", "configuration_constraints"])
-def test_what_asks_for_the_value_of_what_is_traced(ask, error, method):
+def test_methods_that_need_concrete_values_raise(ask, error, method):
     class Asking(Slider):
         def motion(self, t, q, u):
             return super().motion(t, (ask(q[0]) if method == "motion" else q[0], q[1]), u)
@@ -348,7 +348,7 @@ def test_what_asks_for_the_value_of_what_is_traced(ask, error, method):
 
 
 @pytest.mark.slow
-def test_constraints_are_numbers_and_vectors_however_nested():
+def test_nested_residuals_of_numbers_and_vectors_are_accepted():
     class Nested(Slider):
         speeds, dependent_speeds = ("x_dot",), ("angle_dot",)
 
@@ -375,7 +375,7 @@ def test_constraints_are_numbers_and_vectors_however_nested():
         (lambda u: (u[0], jnp.stack([u[1], u[1]])), r"Odd.q_dot must be 2 numbers .*shape \(2,\)"),
     ],
 )
-def test_what_q_dot_returns(returned, message):
+def test_invalid_return_values_of_q_dot_raise(returned, message):
     class Odd(Slider):
         def q_dot(self, t, q, u):
             return returned(u)
@@ -384,7 +384,7 @@ def test_what_q_dot_returns(returned, message):
         evaluate(Odd())
 
 
-def test_methods_without_a_return():
+def test_methods_without_a_return_value_raise():
     class NoLoads(Slider):
         def loads(self, t, q, u, motion, inputs):
             jk.weight(motion, motion.N.y)
@@ -407,7 +407,7 @@ def test_methods_without_a_return():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("k", [1, 2])
-def test_a_residual_that_its_dependent_speed_does_not_enter(k):
+def test_a_residual_without_its_dependent_speed_raises(k):
     class Blind(jk.System):
         coordinates = ("x", "y", "z")
         speeds = ("x_dot", "y_dot", "z_dot")[: 3 - k]
@@ -427,7 +427,7 @@ def test_a_residual_that_its_dependent_speed_does_not_enter(k):
     assert np.isnan(jax.jit(lambda u: jk.dependent_speeds(system, 0.0, q, u))(u)).any()
 
 
-def test_a_force_on_what_has_no_mass():
+def test_a_force_on_a_massless_point_raises():
     class Light(jk.System):
         coordinates, speeds = ("x", "y"), ("x_dot", "y_dot")
 

@@ -22,7 +22,7 @@ def crank_rocker():
 
 
 @pytest.mark.slow
-def test_a_minute_of_a_four_bar_linkage():
+def test_projection_prevents_drift_of_a_four_bar_linkage_over_a_minute():
     system, state = crank_rocker()
     ts = jnp.linspace(0.0, 60.0, 601)
     free = jk.audit(system, jk.simulate(system, state, ts))
@@ -33,7 +33,7 @@ def test_a_minute_of_a_four_bar_linkage():
 
 
 @pytest.mark.slow
-def test_the_nearest_coordinates_that_meet_the_constraints():
+def test_projection_finds_the_nearest_consistent_coordinates():
     """Of Euler parameters those of the same direction."""
     entry = jk.catalog.CATALOG["SpinningTop"]
     q = jnp.array(entry.q)
@@ -54,7 +54,7 @@ def test_stabilized_and_projected_coordinates_do_not_drift():
 
 
 @pytest.mark.slow
-def test_a_projected_motion_has_gradients_also_where_it_ends_early():
+def test_a_projected_simulation_has_gradients_after_an_early_end():
     top = jk.catalog.SpinningTop()
     entry = jk.catalog.CATALOG["SpinningTop"]
     state = jk.State(jnp.array(entry.q), jnp.array(entry.u))
@@ -89,7 +89,7 @@ def test_the_best_dependent_speeds_of_the_bicycle():
     assert len(conditions) == 10  # the best, and three for each of its three speeds
 
 
-def test_the_best_of_many_choices_is_found():
+def test_the_best_of_many_choices_of_dependent_speeds_is_found():
     rng = np.random.default_rng(5)
     for _ in range(3):
         C = rng.normal(size=(5, 18)) * np.where(np.arange(18) < 12, 1e-4, 1.0)  # 8568 choices; the first are bad
@@ -115,7 +115,7 @@ class Twice(jk.System):
         return jk.Motion([jk.Body(1.0, 0.0, P)], [slope, 3.0 * slope + self.drift])
 
 
-def test_redundant_and_conflicting_residuals_are_told_apart():
+def test_redundant_and_conflicting_residuals_are_distinguished():
     redundant = best_dependent_speeds(Twice(), 0.0, jnp.array([0.1, 0.2]))
     assert (redundant.rank, redundant.redundant, redundant.conflicting) == (1, (1,), ())
     assert "rank 1" in str(redundant)
@@ -151,7 +151,7 @@ def spatial_pendulum(**parameters):
     return system, jnp.array(entry.q), jnp.array(entry.u)
 
 
-def test_the_best_dependent_speeds_are_asked_for_at_numbers():
+def test_best_dependent_speeds_rejects_non_finite_coordinates():
     """NaN in a residual's rows would pass for a good choice, or for singular values that do not converge."""
     bicycle = jk.catalog.WhippleBicycle.benchmark()
     with pytest.raises(ValueError, match="WhippleBicycle: q is not finite: steer"):
@@ -176,7 +176,7 @@ def test_a_massless_speed_is_refused_by_name():
 
 
 @pytest.mark.slow
-def test_locked_angles_are_met_by_an_event_or_an_error_with_advice():
+def test_gimbal_lock_triggers_an_event_or_an_error_with_advice():
     system, q, u = spatial_pendulum()
     with pytest.raises(ValueError, match=r"theta11, theta12, theta13 are not finite.*Euler parameters"):
         jk.simulate(system, jk.State(q.at[1].set(0.0), u), jnp.linspace(0.0, 1.0, 3))
@@ -202,7 +202,7 @@ class Wedge(jk.System):
         return u["vx"], u["vy"]
 
 
-def test_one_residual_is_weighed_against_the_other_speeds():
+def test_the_condition_of_a_single_residual_includes_the_other_speeds():
     q = jnp.array([0.1, 0.2])
     wedge = best_dependent_speeds(Wedge(), 0.0, q)
     np.testing.assert_allclose([x for _, x in wedge.choices], [1.0, 1e9], rtol=1e-9)  # sqrt(1 + 1e-18) / 1e-9
@@ -237,7 +237,7 @@ class Repeated(jk.System):
 
 
 @pytest.mark.slow
-def test_residuals_that_repeat_or_vanish_are_projected_with_derivatives():
+def test_projection_with_redundant_or_zero_residuals_is_differentiable():
     q = jnp.array([0.6001, 0.8001, 0.3])
 
     def nearest(q, radius):
@@ -255,7 +255,7 @@ def test_residuals_that_repeat_or_vanish_are_projected_with_derivatives():
 
 
 @pytest.mark.slow
-def test_a_simulation_is_led_back_where_residuals_repeat():
+def test_stabilization_and_projection_work_with_redundant_residuals():
     state = jk.State(jnp.array([0.6, -0.8, 0.0]), jnp.array([1.0, 0.5]))
     ts = jnp.linspace(0.0, 1.0, 3)
     for options in ({"project": True}, {"stabilize": 5.0}):

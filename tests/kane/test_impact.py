@@ -90,7 +90,7 @@ PINOCCHIO = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [pytest.param(x, marks=[pytest.mark.slow] * (x[0] > "3")) for x in PINOCCHIO])
-def test_impulses_of_pinocchio(case):
+def test_impulses_agree_with_pinocchio(case):
     q, before, residuals, e, u, p = PINOCCHIO[case]
     after = jk.impact(chain(len(q)), 0.0, q, before, residuals, e)
     np.testing.assert_allclose(after.u, u, rtol=0, atol=RTOL * np.abs(u).max())
@@ -166,7 +166,7 @@ def over_kerb(hoop, release=("ground",)):
 
 
 @pytest.mark.slow
-def test_a_hoop_strikes_a_kerb():
+def test_the_impact_of_a_hoop_on_a_kerb_agrees_with_the_closed_form():
     # Angular momentum about the edge. The velocity residuals of the road are released.
     after = over_kerb(Hoop())
     np.testing.assert_allclose(after.u, [3.9857142857142858], rtol=RTOL)
@@ -178,7 +178,7 @@ def test_a_hoop_strikes_a_kerb():
 
 
 @pytest.mark.slow
-def test_a_struck_slider_crank_stays_closed():
+def test_an_impact_preserves_the_loop_closure_of_a_slider_crank():
     system = SliderCrank()
     q = jk.assemble(system, {"crank": 0.9, "rod": -0.3, "x": 0.5}, {}).q
     after = jk.impact(system, 0.0, q, [12.0], lambda t, q, u, motion: u["x_dot"], 0.4)
@@ -216,7 +216,7 @@ def by_multipliers(system, q, u, residuals, e):
 
 
 @pytest.mark.slow
-def test_a_bicycle_keeps_its_nonholonomic_constraints():
+def test_an_impact_preserves_nonholonomic_constraints():
     bicycle, entry = CATALOG["WhippleBicycle"].example(), CATALOG["WhippleBicycle"]
     q, u = jnp.array(entry.q), jnp.array(entry.u)
     struck = in_plane("S")
@@ -265,7 +265,7 @@ def test_both_corners_of_a_block_stick():
 
 
 @pytest.mark.slow
-def test_a_repeated_residual_shares_its_impulse():
+def test_a_repeated_residual_divides_the_impulse_equally():
     once = jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda *args: left(*args)[1], 0.5)
     twice = jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda *args: left(*args)[1:] * 2, 0.5)
     assert once.unique
@@ -275,7 +275,7 @@ def test_a_repeated_residual_shares_its_impulse():
 
 
 @pytest.mark.slow
-def test_residuals_that_contradict_each_other():
+def test_contradictory_impact_residuals_raise():
     def after(u, e):
         return jk.impact(Block(), 0.0, FALLS_Q, u, lambda *a: left(*a)[1:] * 2, (0.5, e)).u
 
@@ -352,7 +352,7 @@ def right_y(t, q, u, motion):
     return motion["right"].velocity.dot(motion.N.y)
 
 
-def test_a_released_hinge_leaves_a_free_body():
+def test_releasing_a_hinge_gives_the_impact_of_a_free_body():
     # about the left corner: v = omega x r
     rate = 0.9
     free = jk.impact(Block(), 0.0, [0.0, 0.6, 0.0], [-0.6 * rate, 0.2 * rate, rate], right_y, 0.5)
@@ -363,7 +363,7 @@ def test_a_released_hinge_leaves_a_free_body():
 
 
 @pytest.mark.slow
-def test_a_released_point_that_already_moves_stays_with_its_speeds():
+def test_releasing_a_moving_point_does_not_change_the_impact():
     """Its auxiliary speeds along x and y have the same partial velocities as the speeds."""
     free, released = (jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, left, release=x) for x in ((), ("center",)))
     np.testing.assert_allclose(released.u, free.u, rtol=RTOL)
@@ -377,7 +377,7 @@ def strike(x, e, leg, q):
 
 
 @pytest.mark.slow
-def test_derivatives_are_those_of_differences():
+def test_derivatives_agree_with_central_differences():
     # central differences; truncation h^2 = 1e-10
     point = STRIKE_U, jnp.array(0.3), jnp.array(5.0), STRIKE_Q
     f, h = jax.jit(strike), 1e-5
@@ -463,7 +463,7 @@ def test_a_singular_mass_matrix_is_explained():
         jk.impact(Massless(), 0.0, STRIKE_Q, STRIKE_U, toe)
 
 
-def test_impacts_of_events_have_residuals_and_coefficients():
+def test_an_event_impact_stores_residuals_and_coefficients():
     N, _ = jk.inertial()
     hit = jk.Impact(1.0 * N.x, [2.0, 3.0], restitution=(0.5, 0.25), release="foot")
     assert hit.residuals == (1.0, 0.0, 0.0, 2.0, 3.0)

@@ -62,7 +62,7 @@ class CartesianPendulum(jk.System):
 
 
 @pytest.mark.slow
-def test_a_closed_loop_moves_as_the_pendulum_in_its_angle():
+def test_a_constrained_cartesian_pendulum_equals_a_pendulum_in_its_angle():
     loop = CartesianPendulum(length=1.3)
     state = jk.assemble(loop, {"x": 0.5, "y": -1.0}, {"x_dot": 0.8})
     x, y = np.asarray(state.q)
@@ -95,7 +95,7 @@ class RollingCoin(jk.System):
 
 
 @pytest.mark.slow
-def test_a_residual_with_a_term_in_time_is_affine_not_only_linear():
+def test_residuals_may_be_affine_in_the_speeds():
     coin = RollingCoin(belt=3.0)
     at = (coin, 2.0, [0.3, 0.1], [1.5])
     np.testing.assert_allclose(jk.dependent_speeds(*at), [0.5 * 1.5 + 6.0], rtol=1e-15)
@@ -106,7 +106,7 @@ def test_a_residual_with_a_term_in_time_is_affine_not_only_linear():
 
 
 @pytest.mark.slow
-def test_results_add_up_to_kanes_equations():
+def test_results_satisfy_kanes_equations():
     bike = WhippleBicycle.benchmark()
     state = jk.assemble(bike, {"roll": 0.1, "steer": 0.2}, {"rear_wheel_rate": -10.0, "roll_rate": 0.3})
     at, inputs = (bike, 0.0, state.q, state.u), {"steer_torque": 2.0}
@@ -136,7 +136,7 @@ SYSTEMS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_derivatives_in_every_argument_both_modes_and_twice(name):
+def test_derivatives_by_every_argument_agree_with_differences(name):
     """Parameters, time, state and inputs, against central differences."""
     rtol = 1e-6
     make, q, u = SYSTEMS[name]
@@ -223,7 +223,7 @@ class Beads(jk.System):
         return [jk.Force(-self.stiffness * q[i] * motion.N.x, body) for i, body in enumerate(motion.bodies)]
 
 
-def test_a_second_call_outside_of_jit_traces_nothing(monkeypatch):
+def test_a_second_call_outside_jit_does_not_retrace(monkeypatch):
     """Of a system of many speeds, whose solve was traced in every call."""
     q, u, traced, solve = np.linspace(-1.0, 1.0, 13), np.zeros(13), [], jax.lax.custom_linear_solve
     monkeypatch.setattr(jax.lax, "custom_linear_solve", lambda *args, **more: traced.append(1) or solve(*args, **more))

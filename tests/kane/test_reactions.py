@@ -81,7 +81,7 @@ class Disc(jk.System):
 
 
 @pytest.mark.slow
-def test_contact_force_of_a_disc_is_the_sum_at_its_contact_and_at_the_ground():
+def test_contact_force_of_a_disc_is_divided_between_contact_and_ground():
     disc, q, u = Disc(), jnp.array([0.2, 0.1, 0.0, 0.0, 0.0]), jnp.array([0.5, -0.4, 2.0])
     forces = constraint_forces(disc, 0.0, q, u)
     whole = momentum_rate(disc, q, u) - np.array([0.0, 0.0, 9.81])
@@ -90,7 +90,7 @@ def test_contact_force_of_a_disc_is_the_sum_at_its_contact_and_at_the_ground():
 
 
 @pytest.mark.slow
-def test_joint_forces_of_a_pendulum_are_newtons():
+def test_joint_forces_of_a_pendulum_satisfy_newtons_law():
     # By hand: link 2 is carried at A, both at O; the acceleration of a mass centre from angles, rates and their rates.
     system, q, u = moving("DoublePendulum")
     inputs = {"shoulder_torque": 0.7, "elbow_torque": -1.3}
@@ -108,7 +108,7 @@ def test_joint_forces_of_a_pendulum_are_newtons():
 
 
 @pytest.mark.slow
-def test_joint_forces_of_the_spatial_pendulum_are_newtons():
+def test_joint_forces_of_the_spatial_pendulum_satisfy_newtons_law():
     system, q, u = moving("SpatialDoublePendulum")
     forces = constraint_forces(system, 0.0, q, u)
     weights = np.array([[0.0, 9.81 * m, 0.0] for m in (1.2, 0.8)])
@@ -118,7 +118,7 @@ def test_joint_forces_of_the_spatial_pendulum_are_newtons():
 
 
 @pytest.mark.slow
-def test_a_rail_carries_a_slider():
+def test_the_force_of_a_rail_is_normal_to_the_rail():
     # Exercise 5.2: along the rail nothing but the loads, across it the weights and the bar's momentum
     system, q, u = moving("SliderWithPinnedBar")
     force = constraint_forces(system, 0.0, q, u, {"force": 3.0})["A"]
@@ -126,7 +126,7 @@ def test_a_rail_carries_a_slider():
     np.testing.assert_allclose(force, [0.0, p_dot[1] + 3.0 * 9.81, 0.0], rtol=RTOL, atol=1e-12)
 
 
-def test_walls_of_the_piston_and_of_the_slider():
+def test_guide_forces_of_piston_and_slider_agree_with_newton_euler():
     # Exercise 5.1, by Newton and Euler on the bar: the wall of A pushes along x, the guide of B along y.
     system, q, u = moving("BarWithPiston")
     F = 4.0
@@ -155,7 +155,7 @@ def test_a_declared_auxiliary_speed_agrees_with_sympy():
 
 
 @pytest.mark.slow
-def test_a_closed_loop_carries_forces_at_all_its_joints():
+def test_joint_forces_of_a_closed_loop_balance_its_momentum():
     figures = FIGURES["four_bar_linkage"]
     system = FourBarLinkage(**figures["params"])
     state = figures["states"][0]
@@ -185,7 +185,7 @@ class Bracketed(jk.System):
         return jk.weight(motion, -10.0 * motion.N.z), jk.Torque(3.0 * motion.N.z, motion["beam"])
 
 
-def test_a_frame_carries_a_moment():
+def test_constraint_moments_of_a_frame():
     forces = constraint_forces(Bracketed(), 0.0, jnp.array([0.0]), jnp.array([3.0]))
     # a = (-0.5 * 3^2, 0.5 * 3 / (2/3), 0); the weight of 20 N at 0.5 m bends the root, the driving torque is a load
     np.testing.assert_allclose(forces["O"], [-9.0, 4.5, 20.0], rtol=RTOL)
@@ -232,14 +232,14 @@ class Lift(jk.System):
         return jk.weight(motion, -9.81 * motion.N.y)
 
 
-def test_a_moving_constraint_does_work():
+def test_the_power_of_a_moving_constraint():
     t = jnp.array(0.5)
     equations = Reactions(Lift(), t, jnp.array([0.3, 0.1]), jnp.array([0.7]), None, jnp.zeros(1))
     np.testing.assert_allclose(equations.power_of_prescribed_motions(), 2.0 * (9.81 + 2 * t) * t**2, rtol=RTOL)
 
 
 @pytest.mark.slow
-def test_along_a_trajectory_under_jit_and_in_gradients():
+def test_constraint_forces_along_a_trajectory_under_jit_and_in_gradients():
     system, q, u = moving("DoublePendulum")
     inputs = {"elbow_torque": 0.4}
     swing = jk.simulate(system, jk.State(q, u), jnp.linspace(0.0, 0.5, 6), inputs)

@@ -24,7 +24,7 @@ def residual(q, L):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-def test_sizes_of_terms_follow_the_units(dtype):
+def test_term_sizes_scale_with_the_units(dtype):
     def sizes(factor):
         q, L = jnp.array([0.0, 0.0, factor, 0.0], dtype), factor * jnp.array([1.0, 2.0, 3.0], dtype)
         return term_sizes(residual, q, L)
@@ -34,18 +34,18 @@ def test_sizes_of_terms_follow_the_units(dtype):
     np.testing.assert_allclose(jax.jit(sizes)(1e9), sizes(1e9), rtol=1e-6)
 
 
-def test_an_argument_that_is_zero_has_the_size_that_is_given():
+def test_a_zero_argument_has_the_given_size():
     sizes = term_sizes(lambda a, b: a - 2.0 * b, jnp.zeros(()), jnp.zeros(()), sizes=(jnp.ones(()), None))
     assert sizes == 1.0
     np.testing.assert_array_equal(relative(np.zeros(2), np.array([0.0, 3.0])), 0.0)
 
 
-def test_no_derivative_is_taken_through_sizes():
+def test_term_sizes_have_zero_derivatives():
     assert jax.grad(lambda x: term_sizes(lambda y: y - 1.0, x))(3.0) == 0.0
 
 
 @pytest.mark.slow
-def test_ranks_do_not_follow_the_units():
+def test_ranks_do_not_depend_on_the_units():
     rng = np.random.default_rng(0)
     A = rng.normal(size=(3, 5))
     A[0, 1] = 0.0
@@ -64,7 +64,7 @@ def test_ranks_do_not_follow_the_units():
 
 
 @pytest.mark.slow
-def test_a_least_norm_solution_has_derivatives_where_rows_repeat():
+def test_a_least_norm_solution_is_differentiable_with_repeated_rows():
     def x(a, xp=jnp):
         row = xp.stack([a, 2.0 + a * a, 1.0])
         return least_norm(xp.stack([row, 3.0 * row]), xp.stack([a, 3.0 * a]))

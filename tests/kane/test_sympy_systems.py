@@ -29,7 +29,7 @@ def test_accelerations_of_all_speeds_agree_with_sympy(name):
 @pytest.mark.slow
 @pytest.mark.optimized
 @pytest.mark.published
-def test_four_bar_linkage_at_the_state_printed_in_sympys_test(published):
+def test_accelerations_of_a_four_bar_linkage_agree_with_sympys_printed_state(published):
     printed = FIGURES["four_bar_linkage"]["published_in_test"]
     l1, l2, l3, l4, rho = printed["p"]
     system = FourBarLinkage(l1, l2, l3, l4, rho)

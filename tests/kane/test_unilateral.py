@@ -60,7 +60,7 @@ def block(b, h):
     return M, [[[0.0, 1.0, -b], [1.0, 0.0, h]], [[0.0, 1.0, b], [1.0, 0.0, h]]]
 
 
-def test_a_rocking_block_changes_its_corner():
+def test_impacts_of_a_rocking_block_agree_with_housner():
     # Housner: the ratio of the rates is 1 - 3/2 sin^2(alpha) = 0.85
     b, h = 0.2, 0.6
     rates = [1.064938523307031, -0.9051977448109763, 0.7694180830893298, -0.6540053706259303]
@@ -83,7 +83,7 @@ def test_both_corners_of_a_wide_block_stick():
     assert not result.unique
 
 
-def test_a_contact_that_is_not_closed_transmits_nothing():
+def test_an_open_contact_transmits_no_impulse():
     u, result = strike(*block(0.2, 0.6), [0.0, -1.0, 0.0], 0.0, 2.0, closed=[True, False])
     alone, single = strike(block(0.2, 0.6)[0], block(0.2, 0.6)[1][:1], [0.0, -1.0, 0.0], 0.0, 2.0)
     np.testing.assert_allclose(u, alone, atol=RTOL)
@@ -92,7 +92,7 @@ def test_a_contact_that_is_not_closed_transmits_nothing():
 
 
 @pytest.mark.slow
-def test_balls_that_touch():
+def test_sequential_and_simultaneous_impacts_of_balls():
     # masses (4/5)^i, e = 9/10, exact fractions; three equal balls at once by Newton's law
     M, u = np.diag([0.8**i for i in range(3)]), [1.0, 0.0, 0.0]
     gaps = [[[-1.0, 1.0, 0.0]], [[0.0, -1.0, 1.0]]]
@@ -137,7 +137,7 @@ def sphere(u, mu, e=0.5):
 
 
 @pytest.mark.slow
-def test_a_sphere_slides_or_sticks_in_space():
+def test_a_sphere_slides_or_sticks_in_three_dimensions():
     before = np.array([3.0, 1.0, -2.0, 0.5, -1.0, 0.3])
     slip = np.array([3.0 + 1.0, 1.0 + 0.5])
     _, slides = sphere(before, 0.1)
@@ -177,7 +177,7 @@ def test_random_impacts_satisfy_the_contact_laws(c, rows):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("c", "rows"), [(2, 2), pytest.param(1, 3, marks=pytest.mark.slow)])
-def test_derivatives_are_those_of_differences(c, rows):
+def test_derivatives_agree_with_central_differences(c, rows):
     # central differences of step 1e-5; at least one contact slides
     G, v, e, mu = random_problem(c, rows, 0)
     closed = jnp.ones(c, bool)

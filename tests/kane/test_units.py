@@ -97,7 +97,7 @@ SYSTEMS = [four_bar, slider_crank]
 
 @pytest.mark.slow_cases("four_bar")
 @pytest.mark.parametrize("make", SYSTEMS)
-def test_assembly_in_other_units(make):
+def test_assembly_does_not_depend_on_the_units(make):
     system, named, _ = make(1.0, 1.0, 1.0)
     q = np.asarray(jk.assemble(system, named).q)
     for factors in FACTORS:
@@ -120,7 +120,7 @@ def test_assembly_in_other_units(make):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make", SYSTEMS)
-def test_dependent_speeds_in_other_units(make):
+def test_best_dependent_speeds_do_not_depend_on_the_units(make):
     system, named, _ = make(1.0, 1.0, 1.0)
     best = jk.best_dependent_speeds(system, 0.0, jk.assemble(system, named).q)
     assert best.rank == 2
@@ -133,7 +133,7 @@ def test_dependent_speeds_in_other_units(make):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make", SYSTEMS)
-def test_assembly_in_float32(make):
+def test_assembly_in_float32_does_not_depend_on_the_units(make):
     guess = {four_bar: [1.0, -0.5, -1.5], slider_crank: [0.0, 1.0, 0.0]}[make]
     first = None
     for L in (1.0, 1e-9, 1e9):
@@ -157,7 +157,7 @@ def test_assembly_in_float32(make):
         pytest.param(slider_crank, {"project": True}, marks=pytest.mark.slow),
     ],
 )
-def test_simulations_led_back_to_the_constraints_in_other_units(make, options):
+def test_projection_and_stabilization_do_not_depend_on_the_units(make, options):
     """One program for all units: from a state that is off by 1e-7 of its terms. A gain [1/s] is static."""
 
     @jax.jit

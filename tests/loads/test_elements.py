@@ -38,7 +38,7 @@ PAIRS = pytest.mark.parametrize(("law", "sharp"), LAWS.values(), ids=LAWS)
 
 
 @PAIRS
-def test_laws_resist_alike_both_ways_and_never_drive(law, sharp):
+def test_resistance_laws_are_odd_and_dissipative(law, sharp):
     found = np.asarray(law(jnp.array(V), 0.01))
     np.testing.assert_allclose(found, -found[::-1], atol=1e-15)
     assert np.all(found * V >= 0.0)
@@ -46,7 +46,7 @@ def test_laws_resist_alike_both_ways_and_never_drive(law, sharp):
 
 
 @PAIRS
-def test_laws_tend_to_the_sharp_ones_with_the_square_of_the_width(law, sharp):
+def test_smoothed_laws_converge_with_the_square_of_the_width(law, sharp):
     v = np.array([-3.0, -0.4, -0.07, 0.07, 0.4, 3.0])
     errors = [np.abs(np.asarray(law(jnp.array(v), width)) - sharp(v)) for width in (2e-4, 1e-4)]
     assert np.all(errors[0] < 1e-5)
@@ -57,7 +57,7 @@ def test_laws_tend_to_the_sharp_ones_with_the_square_of_the_width(law, sharp):
 @pytest.mark.slow_cases(all_but=["quadratic-float32", "quadratic-float64"])
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 @PAIRS
-def test_all_slopes_are_finite_at_rest_too(law, sharp, dtype):
+def test_derivatives_of_laws_are_finite_at_rest(law, sharp, dtype):
     v = jnp.array(V, dtype)
     f = lambda v: law(v, 0.01)  # noqa: E731
 
@@ -76,7 +76,7 @@ def test_all_slopes_are_finite_at_rest_too(law, sharp, dtype):
 
 
 @pytest.mark.slow
-def test_slopes_at_rest_are_what_they_should_be():
+def test_derivatives_of_laws_at_rest_agree_with_closed_forms():
     at_rest = lambda law: float(jax.grad(law)(0.0))  # noqa: E731
     assert at_rest(lambda v: coulomb(v, 0.7, width=0.02)) == pytest.approx(0.7 / 0.02, rel=RTOL)
     level = 0.3 + 0.2 * np.exp(-((0.02 / 0.1) ** 2))
@@ -86,7 +86,7 @@ def test_slopes_at_rest_are_what_they_should_be():
     assert at_rest(lambda x: dead_zone(x, -0.2, 0.2, width=0.01)) == pytest.approx(inside, rel=1e-10)
 
 
-def test_smoothing_is_off_by_what_is_stated():
+def test_the_error_of_smoothing_agrees_with_the_documented_formula():
     x, width = np.array([0.5, 2.0, 30.0]), 1e-3
     np.testing.assert_allclose(np.asarray(smooth_abs(jnp.array(x), width)) - x, width**2 / (2 * x), rtol=1e-4)
     np.testing.assert_allclose(1 - np.asarray(smooth_sign(jnp.array(x), width)), width**2 / (2 * x**2), rtol=1e-4)
@@ -94,7 +94,7 @@ def test_smoothing_is_off_by_what_is_stated():
 
 
 @pytest.mark.slow
-def test_a_stribeck_curve_has_its_peak_before_it_falls():
+def test_a_stribeck_curve_peaks_at_static_friction_and_then_decreases():
     v = jnp.linspace(1e-4, 1.0, 4000)
     force = stribeck(v, 0.3, 0.5, 0.1, width=1e-4)
     assert float(jnp.max(force)) == pytest.approx(0.5, rel=1e-3)
@@ -102,7 +102,7 @@ def test_a_stribeck_curve_has_its_peak_before_it_falls():
     assert np.all(np.diff(np.asarray(force)[50:1500]) < 0)
 
 
-def test_ends_of_an_interval():
+def test_dead_zones_with_one_and_two_ends():
     """At an end the depth is width / 2; far from both, x - end but for width^2 / 4 of its inverse distance."""
     one, other = (lambda x: dead_zone(x, None, 1.5, width=1e-3)), (lambda x: dead_zone(x, -0.5, None, width=1e-3))
     both = lambda x: dead_zone(x, -0.5, 1.5, width=1e-3)  # noqa: E731
@@ -125,7 +125,7 @@ def level(v):
 
 
 @pytest.mark.slow
-def test_bristles_at_a_steady_rate_are_the_stribeck_curve():
+def test_lugre_friction_at_steady_rate_equals_the_stribeck_curve():
     v = np.array([-0.5, -0.02, 0.003, 0.2])
     z = np.sign(v) * level(v) / 1e4
     force, z_dot = lugre(jnp.array(v), jnp.array(z), damping=30.0, viscous=0.4, **BRISTLES)
@@ -134,7 +134,7 @@ def test_bristles_at_a_steady_rate_are_the_stribeck_curve():
 
 
 @pytest.mark.slow
-def test_bristles_at_rest_are_a_spring_and_a_damper():
+def test_lugre_friction_at_rest_is_a_spring_and_a_damper():
     force = lambda v, z: lugre(v, z, damping=30.0, viscous=0.4, **BRISTLES)  # noqa: E731
     (dv, dz), (z_dot_v, z_dot_z) = jax.jacfwd(force, (0, 1))(0.0, 0.0)
     assert (float(dv), float(dz)) == pytest.approx((30.4, 1e4), rel=RTOL)
@@ -144,7 +144,7 @@ def test_bristles_at_rest_are_a_spring_and_a_damper():
 
 
 @pytest.mark.slow
-def test_bristles_bend_no_farther_than_static_friction_bends_them():
+def test_lugre_deflection_is_bounded_by_static_friction():
     """Where |z| = static / stiffness, z_dot is not outwards, whatever the rate."""
     v = jnp.linspace(-2.0, 2.0, 401)
     for side in (-1.0, 1.0):
@@ -153,7 +153,7 @@ def test_bristles_bend_no_farther_than_static_friction_bends_them():
 
 
 @pytest.mark.slow
-def test_bristles_give_back_no_more_than_they_took_up_to_the_stated_damping():
+def test_lugre_friction_is_passive_up_to_the_documented_damping():
     """force v - d/dt (stiffness z^2 / 2) = a y^2 - damping a v y + damping v^2, a = |v| / level, y = stiffness z."""
     v, z = (x.ravel() for x in np.meshgrid(np.linspace(-0.3, 0.3, 41), np.linspace(-1.5e-4, 1.5e-4, 601)))
 
@@ -206,7 +206,7 @@ def bench():
 
 
 @pytest.mark.slow
-def test_a_block_slides_as_far_as_smoothed_friction_lets_it(bench):
+def test_the_slide_of_a_block_with_smoothed_friction_agrees_with_closed_form(bench):
     """x = integral of |v| dv / (mu g), |v| = sqrt(v^2 + w^2): its energy goes into friction; and the same of time."""
     v, w, a = bench["block_rate"], 0.05, 0.4 * 9.81
     path = lambda v: (v * np.hypot(v, w) + w**2 * np.arcsinh(v / w)) / (2 * a)  # noqa: E731
@@ -217,7 +217,7 @@ def test_a_block_slides_as_far_as_smoothed_friction_lets_it(bench):
     assert 0.0 < v[-1] < 1e-3  # it creeps
 
 
-def test_a_ball_falls_with_the_square_of_its_speed(bench):
+def test_a_fall_with_quadratic_drag_agrees_with_the_closed_form(bench):
     """v = v_end tanh(g t / v_end), v_end^2 = m g / c."""
     v_end = np.sqrt(1.5 * 9.81 / 0.3)
     np.testing.assert_allclose(bench["ball_rate"], v_end * np.tanh(9.81 * TS / v_end), rtol=1e-8)
@@ -226,13 +226,13 @@ def test_a_ball_falls_with_the_square_of_its_speed(bench):
     )
 
 
-def test_a_motor_starts_in_its_time_constant(bench):
+def test_the_motor_speed_follows_its_time_constant(bench):
     """w = V / k (1 - exp(-t / T)), T = J R / k^2 = 0.16 s."""
     np.testing.assert_allclose(bench["shaft_rate"], 240.0 * (1 - np.exp(-TS / 0.16)), rtol=1e-8)
 
 
 @pytest.mark.slow
-def test_slopes_of_a_system_at_rest(kernels):
+def test_derivatives_of_a_system_at_rest_agree_with_closed_forms(kernels):
     """By hand: d a / d v of the block is -mu g / width, of the ball -c width / m, of the motor -k^2 / (R J)."""
     system, zeros = Bench(), jnp.zeros(3)
 
@@ -266,7 +266,7 @@ def test_a_system_in_single_precision(by_xla):
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
-def test_a_stribeck_curve_of_a_sliding_point_and_in_a_hinge():
+def test_stribeck_friction_of_a_sliding_point_and_of_a_hinge():
     class Sliding(jk.System):
         coordinates, speeds = ("x", "angle"), ("v", "w")
 
@@ -292,7 +292,7 @@ def test_a_stribeck_curve_of_a_sliding_point_and_in_a_hinge():
 
 
 @pytest.mark.slow
-def test_a_gear_with_play_turns_its_link_beyond_the_gap_only():
+def test_a_gear_with_backlash_transmits_torque_outside_the_gap_only():
     class Gear(jk.System):
         coordinates, speeds = ("motor", "link"), ("motor_rate", "link_rate")
 
@@ -368,7 +368,7 @@ class Gimbal(jk.System):
 
 
 @pytest.mark.slow
-def test_a_rotor_feels_its_carrier_turn():
+def test_a_rotor_includes_the_rotation_of_its_carrier():
     spinning = type("Spinning", (Gimbal,), {"spins": True})()
     for q, u in (((0.3, 0.5, 0.2), (1.0, -2.0, 30.0)), ((0.0, -1.0, 4.0), (0.5, 0.7, -80.0))):
         at = jnp.array(q), jnp.array(u)
@@ -384,7 +384,7 @@ TOUCHES = BRISTLES | {"stiffness": 1e3, "falloff": 0.05, "damping": 40.0, "visco
 
 
 @pytest.mark.parametrize("share", [0.5, 0.7, 1.0])
-def test_what_yields_gives_back_no_more_than_it_took_and_stays_within(share):
+def test_bouc_wen_hysteresis_is_passive_and_bounded(share):
     v, z = (x.ravel() for x in np.meshgrid(np.linspace(-0.3, 0.3, 21), np.linspace(-4e-3, 4e-3, 101)))
     force, z_dot = bouc_wen(jnp.array(v), jnp.array(z), **YIELDS | {"share": share})
     assert np.min(np.asarray(force) * v - 500.0 * z * np.asarray(z_dot)) > -1e-12
@@ -393,7 +393,7 @@ def test_what_yields_gives_back_no_more_than_it_took_and_stays_within(share):
 
 
 @pytest.mark.slow
-def test_what_yields_is_a_spring_at_first_and_then_has_its_yield_force():
+def test_bouc_wen_hysteresis_is_elastic_and_then_has_the_yield_force():
     force = lambda v, z: bouc_wen(v, z, **YIELDS)  # noqa: E731
     (dv, dz), (z_dot_v, z_dot_z) = jax.jacrev(force, (0, 1))(0.0, 0.0)
     assert (float(dv), float(dz), float(z_dot_v), float(z_dot_z)) == pytest.approx((0.0, 500.0, 1.0, 0.0), abs=1e-9)
@@ -435,7 +435,7 @@ def held():
 
 
 @pytest.mark.slow
-def test_bristles_and_yielding_as_integrated_by_hand(held):
+def test_lugre_and_bouc_wen_simulations_agree_with_scipy(held):
     def rates(t, y, push):
         v, w, z, s = y[2:]
         friction = 1.0 + 0.5 * np.exp(-((v / 0.05) ** 2))
@@ -450,7 +450,7 @@ def test_bristles_and_yielding_as_integrated_by_hand(held):
             np.testing.assert_allclose(held[name][i], by_hand[k], rtol=1e-6, atol=1e-7, err_msg=name)
 
 
-def test_bristles_hold_what_smoothed_friction_lets_creep(held):
+def test_lugre_friction_holds_a_block_that_creeps_with_smoothed_friction(held):
     """Less than static: the block comes to rest where the bristles carry the push, and stays there."""
     assert held["bent"][0, -1] == pytest.approx(1.2 / 1e3, rel=1e-6)
     assert np.ptp(held["rubbed"][0, 10:]) < 1e-9
@@ -458,7 +458,7 @@ def test_bristles_hold_what_smoothed_friction_lets_creep(held):
 
 
 @pytest.mark.slow
-def test_slopes_of_states_at_rest(kernels):
+def test_derivatives_by_element_states_at_rest_agree_with_closed_forms(kernels):
     """By hand: of accelerations by speeds, and by states."""
     system, zeros = Held(), jnp.zeros(2)
 
@@ -495,7 +495,7 @@ class Tilted(jk.System):
 
 
 @pytest.mark.slow
-def test_zeros_that_nobody_knows_are_parameters():
+def test_zero_offsets_can_be_parameters():
     """It hangs along the vertical, which is off by the tilt; the encoder reads that less its zero."""
     f = jax.jit(lambda tilt, angle: jk.accelerations(Tilted(tilt=tilt), 0.0, angle[None], jnp.zeros(1))[0])
     np.testing.assert_allclose(f(0.05, jnp.array(0.05)), 0.0, atol=1e-14)

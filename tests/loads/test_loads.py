@@ -50,14 +50,14 @@ ALONG = np.array([0.6, 0.8])
         (lambda P, Q, i: jk.loads.actuator(P, Q, i["force"]), -7.0),
     ],
 )
-def test_struts_pull_along_their_line_with_their_reaction(law, tension):
+def test_strut_forces_act_along_the_line_with_an_opposite_reaction(law, tension):
     on_P, on_Q = forces(law, Q0, (0.0, 1.0, 1.0, 2.0), {"force": 7.0})  # they part at (1, 1) . (0.6, 0.8)
     np.testing.assert_allclose(on_P, tension * ALONG, rtol=RTOL)
     np.testing.assert_allclose(on_Q, -tension * ALONG, rtol=RTOL)
 
 
 @pytest.mark.slow
-def test_a_spring_of_no_length_may_shrink_to_a_point():
+def test_a_spring_of_zero_rest_length_may_shrink_to_a_point():
     law = lambda P, Q, i: jk.loads.spring(P, Q, 10.0)  # noqa: E731
     system = type("Two", (Two,), {"law": staticmethod(law)})()
     f = lambda q: jk.accelerations(system, 0.0, q, jnp.zeros(4))  # noqa: E731
@@ -66,7 +66,7 @@ def test_a_spring_of_no_length_may_shrink_to_a_point():
 
 
 @pytest.mark.slow
-def test_friction_is_coulombs_but_for_its_smoothing():
+def test_friction_approximates_coulombs_law():
     def law(P, Q, inputs):
         return jk.loads.friction(P, Q, 20.0, 0.5, speed=1e-6)
 
@@ -104,14 +104,14 @@ class Hinged(jk.System):
         )
 
 
-def test_hinges():
+def test_torsional_springs_and_dampers_of_hinges():
     u_dot = jk.accelerations(Hinged(), 0.0, jnp.array([0.2, 0.7]), jnp.array([1.5, -0.5]))
     on_disk = -8.0 * np.sin(0.5) + 0.3 * 2.0
     np.testing.assert_allclose(u_dot, [-on_disk - 0.7, on_disk / 2.0], rtol=1e-10)
 
 
 @pytest.mark.slow
-def test_what_a_spring_takes_it_gives_back():
+def test_a_spring_conserves_energy():
     law = lambda P, Q, i: jk.loads.spring(P, Q, 10.0, 4.5)  # noqa: E731
     system = type("Two", (Two,), {"law": staticmethod(law)})()
     state = jk.State(jnp.array(Q0), jnp.array([0.0, 1.0, 1.0, -0.5]))
@@ -124,7 +124,7 @@ def test_what_a_spring_takes_it_gives_back():
     assert "conserved" in str(audit)
 
 
-def test_loads_take_bodies_for_their_mass_centres():
+def test_loads_on_bodies_act_at_their_mass_centres():
     class Bodies(Two):
         def loads(self, t, q, u, motion, inputs):
             return jk.loads.spring(motion["one"], motion["two"], 10.0, 4.5)
@@ -152,7 +152,7 @@ def test_axes_and_normals_may_have_any_length():
 
 
 @pytest.mark.parametrize("length", [0, 0.0, np.float64(0.0), np.int64(0), jnp.array(0.0)])
-def test_no_length_however_it_is_written(length):
+def test_a_spring_of_zero_rest_length_in_every_number_type(length):
     together = (1.0, 1.0, 1.0, 1.0)
     law = lambda P, Q, i: jk.loads.spring(P, Q, 10.0, length)  # noqa: E731
     if isinstance(length, jax.Array):  # an array is a number that may change: it has no direction where it is zero
@@ -164,7 +164,7 @@ def test_no_length_however_it_is_written(length):
     np.testing.assert_array_equal(forces(law, together), np.zeros((2, 2)))
 
 
-def test_a_spring_between_points_that_are_always_in_one_place():
+def test_a_spring_between_coincident_points_raises():
     with pytest.raises(ValueError, match=r"is zero, so it has no direction. .* two points always coincide"):
         forces(lambda P, Q, i: jk.loads.spring(P, P.fixed(0.0 * P.velocity.frame.x), 10.0, 0.5), Q0)
 
@@ -184,7 +184,7 @@ LAWS = {
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_what_is_no_number_of_a_law_is_named(name):
+def test_non_numeric_arguments_of_a_law_are_rejected_by_name(name):
     law, numbers = LAWS[name]
     law(**numbers)
     law(**{key: np.float32(x) for key, x in numbers.items()})

@@ -104,7 +104,7 @@ def sweep(system):
         pytest.param(sweep, 8, 200, marks=pytest.mark.slow),
     ],
 )
-def test_a_cell_that_is_run_again_frees_the_programs_of_its_old_class(cell, times, each, limit, system):
+def test_rerunning_a_notebook_cell_frees_the_programs_of_the_old_class(cell, times, each, limit, system):
     """`each`: the mappings of one run, for which it was refused after some 150 to 700 runs."""
     jk.forget()  # programs of other tests that are dropped and requested again would raise the bound
     cell(system)
@@ -176,7 +176,7 @@ def test_reduce_functions_are_freed_with_their_programs(system):
 
 
 @pytest.mark.slow
-def test_a_method_of_an_object_without_weak_references_is_compiled_once(system):
+def test_methods_of_objects_without_weak_references_are_compiled_once(system):
     controller, other = Controller(1.0), Controller(1.0)
     pushed = [last(system, {"push": controller.method}, step=0.1)]
     n = counts[id(controller)]
@@ -191,7 +191,7 @@ def test_a_method_of_an_object_without_weak_references_is_compiled_once(system):
 
 
 @pytest.mark.slow
-def test_functions_with_the_same_code_keep_their_own_programs(system):
+def test_functions_with_the_same_code_have_separate_programs(system):
     functions = [{"push": lambda t, state, push=push: push} for push in (1.0, 2.0, 3.0)]
     for _ in range(2):
         values = [last(system, f, step=0.1) for f in functions]
@@ -199,7 +199,7 @@ def test_functions_with_the_same_code_keep_their_own_programs(system):
 
 
 @pytest.mark.slow
-def test_classes_of_the_same_name_keep_their_own_programs():
+def test_classes_of_the_same_name_have_separate_programs():
     systems = [class_of_cell(k)() for k in (4.0, 9.0)]
     for forget in (False, True):
         if forget:
@@ -240,7 +240,7 @@ class EqualToAll(Constant):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [Constant, ConstantWithSlots, EqualToAll])
-def test_controllers_that_are_compared_by_value(kind, system):
+def test_controllers_compared_by_value_have_separate_programs(kind, system):
     """The first two have no hash, the second no weak references."""
     for push in (1.0, 2.0):
         assert last(system, kind(push), step=0.1) == pytest.approx(expected(4.0, push), rel=1e-5)
@@ -248,7 +248,7 @@ def test_controllers_that_are_compared_by_value(kind, system):
 
 @pytest.mark.slow
 @on_linux
-def test_models_that_are_used_in_turn_are_not_compiled_in_every_round(limit):
+def test_models_used_alternately_are_not_recompiled_in_every_round(limit):
     systems = [class_of_cell(k)() for k in (4.0, 5.0, 6.0)]
     last(systems[0])
     limit(0)
@@ -287,7 +287,7 @@ def test_the_least_recently_used_programs_are_dropped(monkeypatch):
     assert process.limit.mappings == 4000
 
 
-def test_the_limit_rises_where_dropped_programs_are_used_again(monkeypatch):
+def test_the_limit_increases_if_dropped_programs_are_used_again(monkeypatch):
     process, made = Mapped(monkeypatch, each=100), []
     for _ in range(5):
         made.append(0)
@@ -299,14 +299,14 @@ def test_the_limit_rises_where_dropped_programs_are_used_again(monkeypatch):
 
 
 @pytest.mark.slow
-def test_mappings_of_other_code_do_not_drop_programs_each_time(monkeypatch):
+def test_memory_mappings_of_other_code_do_not_cause_repeated_dropping(monkeypatch):
     process = Mapped(monkeypatch, each=10, others=5000)
     for i in range(20):
         process.caches[0].keep(i, i)
     assert len(process.caches[0]) == 20
 
 
-def test_a_warning_before_the_limit(monkeypatch):
+def test_a_warning_is_issued_before_the_limit_of_memory_mappings(monkeypatch):
     process = Mapped(monkeypatch, each=10, others=50_000)
     with pytest.warns(UserWarning, match=r"50\d\d\d memory mappings, and Linux terminates it at 65530.*jaxkane.forget"):
         process.caches[0].keep(0, 0)
@@ -315,7 +315,7 @@ def test_a_warning_before_the_limit(monkeypatch):
         process.caches[0].keep(1, 1)
 
 
-def test_a_result_is_dropped_with_any_of_its_owners():
+def test_a_cached_result_is_dropped_when_any_owner_is_deleted():
     class Owner:
         pass
 
@@ -326,7 +326,7 @@ def test_a_result_is_dropped_with_any_of_its_owners():
     assert (results.known("both", None), results.known("b", None), len(results)) == (None, 2, 1)
 
 
-def test_threads_share_caches_whose_owners_end():
+def test_caches_are_thread_safe_while_owners_are_deleted():
     class Owner:
         pass
 

@@ -160,7 +160,7 @@ def test_a_method_that_is_replaced_is_detected(monkeypatch):
 
 
 @pytest.mark.parametrize("where", ["import moon", "from moon import gravity", "import planets.moon"])
-def test_modules_that_are_imported_inside(where, monkeypatch):
+def test_changes_in_modules_imported_within_a_method_are_detected(where, monkeypatch):
     moon, planets = types.ModuleType("moon"), types.ModuleType("planets")
     vars(moon)["gravity"], vars(planets)["moon"] = 9.81, moon
     for name, module in {"moon": moon, "planets": planets, "planets.moon": moon}.items():
@@ -201,7 +201,7 @@ def places():
 
 
 @pytest.mark.parametrize("name", [name for name, *_ in places()])
-def test_places_that_are_looked_into(name):
+def test_changes_in_captured_objects_are_detected(name):
     read, change = {name: both for name, *both in places()}[name]
     before = version_of(read)
     assert version_of(read) == before
@@ -217,7 +217,7 @@ class Slots:
 
 
 @pytest.mark.parametrize("make", [Slots, lambda x: collections.deque([x]), lambda x: np.array([x], dtype=object)])
-def test_objects_that_are_not_looked_into_are_identified(make):
+def test_opaque_objects_are_compared_by_identity(make):
     things = [make(9.81), make(9.81)]
     one, other, again = (version_of(lambda thing=thing: thing) for thing in (*things, things[0]))
     assert one == again != other
@@ -353,7 +353,7 @@ def bytes_of(answer):
 @pytest.mark.parametrize(
     "name", [*QUESTIONS, *(pytest.param(name, marks=pytest.mark.slow) for name in QUESTIONS_THAT_COMPILE)]
 )
-def test_every_public_function_sees_the_change(name, monkeypatch):
+def test_every_public_function_detects_a_changed_global(name, monkeypatch):
     ask = (QUESTIONS | QUESTIONS_THAT_COMPILE)[name]
     fixed_ride()
     before = bytes_of(ask())
@@ -364,7 +364,7 @@ def test_every_public_function_sees_the_change(name, monkeypatch):
 
 
 @pytest.mark.slow
-def test_output_functions_of_a_linear_model_are_looked_into(monkeypatch):
+def test_changes_in_output_functions_of_a_linear_model_are_detected(monkeypatch):
     model = lambda: jk.stability.linearize(Still(), CENTER_OF_STILL, outputs=OUTPUTS)  # noqa: E731
     assert float(model().C[0, 0]) == pytest.approx(9.81, rel=RTOL)
     monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
@@ -395,7 +395,7 @@ SHORT = {"step": 0.1, "solver": diffrax.Midpoint()}  # exact here, and compiled 
 
 
 @pytest.mark.slow
-def test_simulate_follows_descriptions_and_controllers(monkeypatch):
+def test_simulate_detects_changes_in_systems_and_controllers(monkeypatch):
     controller = Controller()
     last = lambda: float(jk.simulate(Drop(), REST, TS, controller, **SHORT)["x"][-1])  # noqa: E731
     assert last() == pytest.approx(fall(9.81), rel=1e-9)
@@ -405,7 +405,7 @@ def test_simulate_follows_descriptions_and_controllers(monkeypatch):
     assert last() == pytest.approx(fall(2.62), rel=1e-9)
 
 
-def test_input_functions_of_every_kind_are_looked_into(monkeypatch):
+def test_changes_in_input_functions_of_every_kind_are_detected(monkeypatch):
     controller = Controller()
     ways = [controller, {"push": controller.method}, {"push": push}, {"push": functools.partial(push, scale=HELD)}]
     ways += [jax.tree_util.Partial(push), jax.jit(push), eqx.filter_jit(push), Holder(push, 1.0)]
@@ -426,7 +426,7 @@ class Walled(Still):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("derivative", [pytest.param(jax.jacrev, marks=pytest.mark.slow), jax.jacfwd])
-def test_a_closure_of_an_input_function_has_the_derivatives_of_an_input(derivative):
+def test_values_captured_by_an_input_function_are_differentiable(derivative):
     start = jk.State(np.array([0.5]), np.array([0.3]))
     given = lambda k: jk.simulate(Walled(), start, TS, {"push": k}, **SHORT)["x"]  # noqa: E731
     captured = lambda k: jk.simulate(Walled(), start, TS, {"push": lambda t, state: 1.0 * k}, **SHORT)["x"]  # noqa: E731
@@ -436,7 +436,7 @@ def test_a_closure_of_an_input_function_has_the_derivatives_of_an_input(derivati
 
 
 @pytest.mark.slow
-def test_a_sweep_is_differentiated_forward_by_what_its_functions_read():
+def test_a_sweep_is_differentiable_by_values_captured_in_its_functions():
     start = jk.State(np.array([0.5]), np.array([0.3]))
 
     def last(k):
@@ -449,7 +449,7 @@ def test_a_sweep_is_differentiated_forward_by_what_its_functions_read():
 
 
 @pytest.mark.parametrize("method", ["events", "loads"])
-def test_a_traced_number_in_the_closure_of_a_description_is_refused(method):
+def test_a_traced_value_captured_by_a_system_is_rejected(method):
     def ends_at(k):
         read = {"events": lambda self, t, q, u: {"wall": q[0] - k}, "loads": lambda self, *_: [k]}[method]
         system = type("Walled", (Still,), {method: read, "__module__": __name__})()
@@ -460,7 +460,7 @@ def test_a_traced_number_in_the_closure_of_a_description_is_refused(method):
 
 
 @pytest.mark.slow
-def test_traced_numbers_that_a_description_has_kept_are_no_closure():
+def test_tracers_stored_by_an_earlier_trace_are_not_captured_values():
     """What an earlier trace left behind is nobody's."""
     kept = []
 
@@ -482,7 +482,7 @@ class Holder(eqx.Module):
 
 
 @pytest.mark.slow
-def test_sweeps_fits_models_and_forces_follow(monkeypatch):
+def test_sweeps_fits_linear_models_and_forces_detect_changes(monkeypatch):
     table = {"mass": np.array([1.0, 2.0])}
     trial = jk.fit.Trial(TS, {"x": fall(1.62) * (TS / TS[-1]) ** 2}, sigma=1.0)
     problem = jk.fit.Problem.of(Drop(), trial, ["mass"], simulation=jk.fit.Simulation(**SHORT))
@@ -522,7 +522,7 @@ class Hung(jk.System):
         return jk.weight(motion, -GRAVITY * motion.N.z)
 
 
-def test_what_came_back_is_not_traced_again(monkeypatch):
+def test_unchanged_systems_are_not_retraced(monkeypatch):
     calls = []
 
     class Counted(Drop):
@@ -541,7 +541,7 @@ def test_what_came_back_is_not_traced_again(monkeypatch):
     assert len(calls) > n
 
 
-def test_values_that_come_back_find_their_program_again():
+def test_restored_values_reuse_their_program():
     seen = []
 
     @ScalarFunction
@@ -558,7 +558,7 @@ def test_values_that_come_back_find_their_program_again():
     assert seen == [2.0, 5.0, 2]
 
 
-def test_nan_zeros_and_arrays_of_other_types_are_told_apart():
+def test_nan_signed_zeros_and_arrays_of_other_types_are_distinguished():
     space: dict[str, Any] = {}
     exec("def f():\n    return x", space)
     versions = []
@@ -584,7 +584,7 @@ def test_nan_zeros_and_arrays_of_other_types_are_told_apart():
     assert version_of(space["f"]) == versions[9]  # not the same array, but the same numbers
 
 
-def test_objects_that_name_each_other_and_long_chains_come_to_an_end():
+def test_cyclic_references_and_deep_nesting_terminate():
     chain = []
     for _ in range(5000):
         chain = [chain]
@@ -599,7 +599,7 @@ def test_objects_that_name_each_other_and_long_chains_come_to_an_end():
 
 
 @pytest.mark.slow
-def test_forget_reads_what_cannot_be_seen():
+def test_forget_discards_programs_with_undetectable_captured_values():
     hidden = array.array("d", [9.81])  # of a C extension
     system = with_gravity(lambda self: hidden[0])
     outer = jax.jit(lambda v: jk.accelerations(system, 0.0, jnp.zeros(1), v)[0])
@@ -610,7 +610,7 @@ def test_forget_reads_what_cannot_be_seen():
 
 
 @pytest.mark.slow
-def test_what_is_gone_is_not_kept():
+def test_deleted_systems_and_controllers_are_not_kept_alive():
     """JAX's registry keeps every class of a pytree for ever; nothing else does, and no controller is kept."""
 
     def once(n):
@@ -627,7 +627,7 @@ def test_what_is_gone_is_not_kept():
 
 
 @pytest.mark.slow
-def test_systems_and_their_arrays_are_not_kept():
+def test_programs_do_not_keep_systems_and_their_arrays_alive():
     """A program takes the numbers of a system; it keeps neither them nor the system."""
     system = Bead(jnp.array(3.0))
     gone = [weakref.ref(system), weakref.ref(system.mass)]
@@ -642,7 +642,7 @@ def test_systems_and_their_arrays_are_not_kept():
 
 
 @pytest.mark.slow
-def test_threads_agree():
+def test_results_of_several_threads_agree():
     found, n = [], 8
 
     def look():
@@ -656,7 +656,7 @@ def test_threads_agree():
     assert len(set(found)) == 1
 
 
-def test_a_cache_is_bounded_and_keeps_no_failure():
+def test_a_cache_is_bounded_and_does_not_store_failures():
     cache = Cache(2)
     for i in (0, 1, 0, 2):
         assert cache.get(i, lambda i=i: [i]) == [i]
@@ -668,7 +668,7 @@ def test_a_cache_is_bounded_and_keeps_no_failure():
     assert len(cache) == 0
 
 
-def test_a_function_that_is_gone_and_its_programs_are_not_kept():
+def test_a_deleted_function_and_its_programs_are_freed():
     f = ScalarFunction(lambda x: jnp.sin(x) * 2.5)
     f(jnp.array(1.0))
     f.numpy(np.array(1.0))
@@ -678,7 +678,7 @@ def test_a_function_that_is_gone_and_its_programs_are_not_kept():
     assert gone() is None
 
 
-def test_threads_share_a_cache_that_is_full():
+def test_a_full_cache_is_thread_safe():
     cache, failed = Cache(1000), []
 
     def fill(start):
@@ -699,14 +699,14 @@ def test_threads_share_a_cache_that_is_full():
     assert len(cache) == 1000
 
 
-def test_a_look_walks_through_nothing(monkeypatch):
+def test_checking_an_unchanged_system_does_not_traverse_it(monkeypatch):
     system = Drop()
     version = version_of(system)
     monkeypatch.setattr("jaxkane._scalarjit.captured_values._Walk", None)  # it would be called to look anew
     assert version_of(system) == version
 
 
-def test_every_compiled_function_of_the_library_follows():
+def test_every_compiled_function_detects_changes():
     """One at module level that is compiled by itself would keep what was read when it was traced."""
     source = Path(jk.__file__).parent
     wrong = r"^@(eqx\.filter_jit|jax\.jit)\s+def (\w+)"

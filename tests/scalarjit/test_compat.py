@@ -28,13 +28,13 @@ USED = {
 
 
 @pytest.mark.parametrize("module", USED)
-def test_it_is_there(module):
+def test_the_used_interfaces_of_jax_exist(module):
     found = importlib.import_module(module)
     missing = [name for name in USED[module].split() if not hasattr(found, name)]
     assert not missing, f"{module} lacks {', '.join(missing)}: see jaxkane/_scalarjit/compat.py for what is lost"
 
 
-def test_jaxprs_are_what_they_are_read_as():
+def test_jaxprs_have_the_expected_structure():
     """A program by its equations, in `interpret`; and what follows from which input."""
     program = jax.make_jaxpr(lambda x, y: (jnp.sin(x) * 2.0 + np.arange(3.0), y))(1.0, 2.0)
     names: list[str] = []
@@ -56,7 +56,7 @@ def test_jaxprs_are_what_they_are_read_as():
     assert [len(internals.types_of(p)[0]) for p in internals.programs_in(inner)] == [1]
 
 
-def test_what_they_do(by_xla):
+def test_the_used_interfaces_of_jax_behave_as_expected(by_xla):
     assert internals.MISSING is None
     traced = jax.jit(ScalarFunction(lambda x: jnp.sin(x) * 2.0)).trace(0.5)
     text = traced.lower(lowering_platforms=("cpu",)).as_text()
@@ -67,7 +67,7 @@ def test_what_they_do(by_xla):
     assert internals.settings() == before
 
 
-def test_without_the_frontend_attribute_only_speed_goes(by_xla, monkeypatch):
+def test_without_the_frontend_attribute_results_are_unchanged(by_xla, monkeypatch):
     monkeypatch.delattr("jax.experimental.xla_metadata.set_xla_metadata")
     f = jax.jit(jax.grad(ScalarFunction(lambda x: jnp.sin(x) * 1.5)))
     assert "xla_cpu_small_call" not in f.lower(0.5).as_text()
@@ -106,14 +106,14 @@ print("right")
 
 
 @pytest.mark.slow
-def test_without_what_programs_are_made_of_results_stay_right():
+def test_without_internals_of_jax_results_are_correct():
     run = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, timeout=300, check=False)
     assert run.stdout.strip() == "right", run.stderr[-2000:]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("flags", ["", "--xla_cpu_enable_fast_math=false"])
-def test_a_release_that_computes_wrongly_is_repaired_before_it_starts(flags):
+def test_a_faulty_jax_release_is_corrected_by_xla_flags_on_import(flags):
     code = (
         "import os, jax; jax.__version_info__ = (0, 10, 2); import jaxkane; print(os.environ['XLA_FLAGS']); "
         "assert jax.jit(lambda x: x + 1)(1) == 2; import importlib; importlib.reload(jaxkane); "
@@ -125,7 +125,7 @@ def test_a_release_that_computes_wrongly_is_repaired_before_it_starts(flags):
     assert run.stdout.splitlines() == [f"{flags} {internals.NO_FUSIONS}=".strip()] * 2
 
 
-def test_such_a_release_that_has_started_is_told(monkeypatch):
+def test_a_faulty_jax_release_that_is_already_initialized_causes_a_warning(monkeypatch):
     jax.block_until_ready(jnp.zeros(1))
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setattr(jax, "__version_info__", (0, 12, 0))

@@ -113,13 +113,13 @@ def first(cache, python):
 
 
 @pytest.mark.slow
-def test_it_says_what_it_did(first, cache):
+def test_configure_prints_a_summary(first, cache):
     assert first[0] == f"jaxkane: float64, {KERNELS}"
     assert first[1].startswith(f"  Compiled programs are stored in {cache} (none yet)")
     assert first[2].startswith("  Stored programs return NaN instead of raising an exception. The `status`")
 
 
-def test_programs_of_simulations_are_kept_for_the_next_process(first, cache, python):
+def test_compiled_simulations_are_reused_by_the_next_process(first, cache, python):
     assert {"jit_solve", "jit__solve"} <= {path.name.rsplit("-", 2)[0] for path in cache.iterdir()}
     _, compiled, dtype, *bytes_of_first = first[-1].split()
     assert int(compiled) > 3
@@ -132,11 +132,11 @@ def test_programs_of_simulations_are_kept_for_the_next_process(first, cache, pyt
 
 
 @pytest.mark.slow
-def test_errors_are_errors_with_a_cache(cache, python):
+def test_exceptions_are_raised_with_a_cache(cache, python):
     python(f"jk.configure(cache={str(cache)!r}, verbose=False)\n" + REFUSALS)
 
 
-def test_child_processes_inherit_it_and_nothing_is_said_twice(cache, python):
+def test_child_processes_inherit_the_configuration_without_repeated_output(cache, python):
     code = (
         f"import os, subprocess, sys\nfor _ in range(2): jk.configure(cache={str(cache)!r}, devices=3)\n"
         "print(len(jax.local_devices(backend='cpu')))\n"
@@ -149,7 +149,7 @@ def test_child_processes_inherit_it_and_nothing_is_said_twice(cache, python):
     assert lines[3:] == ["3", f"True {cache} 0.0"]
 
 
-def test_without_a_cache_nothing_but_the_precision_changes(python):
+def test_without_a_cache_only_the_precision_changes(python):
     code = (
         "print(jk.configure(cache=False, native=False))\nimport equinox._errors as e\n"
         "print(e.EQX_ON_ERROR, jax.numpy.ones(1).dtype)"
@@ -161,7 +161,7 @@ def test_without_a_cache_nothing_but_the_precision_changes(python):
     ]
 
 
-def test_it_warns_when_it_comes_too_late_and_refuses_no_devices(python):
+def test_configure_warns_if_called_too_late_and_rejects_zero_devices(python):
     code = (
         "x = jax.numpy.ones(3)\nimport warnings\nwith warnings.catch_warnings(record=True) as told:\n"
         "    warnings.simplefilter('always')\n    jk.configure(cache=False, devices=2, verbose=False)\n"
@@ -175,7 +175,7 @@ def test_it_warns_when_it_comes_too_late_and_refuses_no_devices(python):
     assert "`devices` must be a number of CPU devices" in run.stderr
 
 
-def test_without_llvm_xla_does_the_work_and_says_so(python):
+def test_without_llvm_xla_is_used_and_reported(python):
     code = (
         "import sys, warnings\nsys.modules['llvmlite'] = sys.modules['llvmlite.binding'] = None\n"
         "warnings.simplefilter('error')\njk.configure(cache=False)\n"
@@ -208,7 +208,7 @@ def test_the_environment_may_switch_native_kernels_off():
         ("on", True),
     ],
 )
-def test_words_for_on_and_off_in_the_environment(word, is_on):
+def test_environment_values_for_on_and_off(word, is_on):
     assert switched_on(word) is is_on
 
 
@@ -218,13 +218,13 @@ def test_an_unknown_word_in_the_environment_is_refused():
 
 
 @pytest.mark.parametrize("option", [{"float64": "no"}, {"native": "off"}, {"native": 0}, {"cache": 3}])
-def test_options_of_another_type_are_refused_before_anything_is_set(option):
+def test_options_of_the_wrong_type_raise_before_any_setting_changes(option):
     with pytest.raises(TypeError, match=f"configure: `{next(iter(option))}` must be"):
         configure(**option)
 
 
 @pytest.mark.parametrize("why", ["read only", "no home"])
-def test_without_a_place_for_the_cache_it_warns_once_and_goes_on(python, why):
+def test_an_unwritable_cache_folder_warns_once_and_is_ignored(python, why):
     """As with a home that is read only, in a container or on a cluster."""
     refused = {
         "read only": "from pathlib import Path\ndef refuse(*_, **__): raise PermissionError(13, 'Permission denied')\n"
@@ -244,7 +244,7 @@ def test_without_a_place_for_the_cache_it_warns_once_and_goes_on(python, why):
     assert told[0].startswith("jaxkane.configure: compiled programs cannot be stored")
 
 
-def test_checks_of_the_user_still_raise_with_a_cache(cache, python):
+def test_equinox_checks_of_the_user_raise_with_a_cache(cache, python):
     """Before, while and after jaxkane compiles a program; and with the cache switched off again."""
     code = (
         f"jk.configure(cache={str(cache)!r}, native=False, verbose=False)\n"
@@ -267,7 +267,7 @@ def test_checks_of_the_user_still_raise_with_a_cache(cache, python):
     assert python(code).stdout.splitlines() == ["True True True False", "None True"]
 
 
-def test_traces_of_several_threads_restore_the_setting_of_the_checks(monkeypatch, tmp_path):
+def test_concurrent_traces_restore_the_setting_of_equinox_checks(monkeypatch, tmp_path):
     """The first sets it, and the last restores it, in whatever order they end."""
     monkeypatch.setattr(checks, "EQX_ON_ERROR", "raise")
     before = jax.config.jax_compilation_cache_dir
@@ -285,13 +285,13 @@ def test_traces_of_several_threads_restore_the_setting_of_the_checks(monkeypatch
 
 
 @pytest.mark.parametrize("devices", ["2", True, 2.5, 0])
-def test_devices_that_are_no_number(devices):
+def test_an_invalid_number_of_devices_raises(devices):
     with pytest.raises(ValueError, match="`devices` must be a number of CPU devices, 1 or more; got"):
         _split_cpu(devices)
 
 
 @pytest.mark.slow
-def test_a_cache_in_the_place_of_a_file(tmp_path):
+def test_a_cache_folder_that_is_a_file_raises(tmp_path):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "inside"):
         with pytest.raises(ValueError, match=r"file.* is a file, or is inside one. Pass the name of a folder"):

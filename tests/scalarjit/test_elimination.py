@@ -55,14 +55,14 @@ def numbers(batch=()):
 
 
 @pytest.mark.slow
-def test_the_solution_is_that_of_the_matrix():
+def test_the_solution_agrees_with_a_dense_solve():
     p, b = numbers()
     assert tree.is_native(p, b)
     np.testing.assert_allclose(tree(p, b), solved(along_a_tree, p, b), rtol=1e-11)
 
 
 @pytest.mark.slow
-def test_in_batches_of_sides_of_matrices_and_of_both():
+def test_batches_of_right_hand_sides_and_of_matrices():
     p, b = numbers((11,))
     ps = p[None] * jnp.linspace(1.0, 1.3, 11)[:, None]
     of_sides, of_matrices, of_both = (
@@ -76,13 +76,13 @@ def test_in_batches_of_sides_of_matrices_and_of_both():
 
 
 @pytest.mark.slow
-def test_in_float32():
+def test_elimination_in_float32():
     p, b = (x.astype(jnp.float32) for x in numbers())
     assert tree(p, b).dtype == jnp.float32
     np.testing.assert_allclose(tree(p, b), solved(along_a_tree, p, b), rtol=1e-3)
 
 
-def test_where_all_is_connected_lapack_solves_it(monkeypatch):
+def test_dense_systems_are_solved_by_lapack(monkeypatch):
     monkeypatch.setattr(elimination, "_MOST_NODES", 5)
     solve = ScalarSolve(along_a_tree, by_lapack)
     assert not solve.is_native(*numbers())
@@ -94,7 +94,7 @@ def test_a_singular_matrix_gives_nan(solve):
     assert np.isnan(solve(*numbers())).any()
 
 
-def test_the_work_grows_with_the_unknowns():
+def test_the_operation_count_is_proportional_to_the_number_of_unknowns():
     def operations(n):
         def form(x):
             z = [x[0]]

@@ -64,7 +64,7 @@ def by_plain_jax(name):
 @pytest.mark.slow_cases(all_but=["native-jit-*", "native-eager-itself", "XLA-jit-itself", "XLA-jit-batch"])
 @pytest.mark.parametrize("name", TRANSFORMATIONS)
 @pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
-def test_the_same_as_plain_jax(name, compiled, kernels):
+def test_results_agree_with_plain_jax(name, compiled, kernels):
     ours = TRANSFORMATIONS[name](program)
     if compiled:
         ours = jax.jit(ours)
@@ -76,7 +76,7 @@ def test_the_same_as_plain_jax(name, compiled, kernels):
 @pytest.mark.slow_cases(all_but=["short-*", "long-itself"])
 @pytest.mark.parametrize("name", TRANSFORMATIONS)
 @pytest.mark.parametrize("long", [False, True], ids=["short", "long"])
-def test_a_program_as_windows(name, long, by_xla, monkeypatch):
+def test_a_program_written_as_reduce_windows_agrees_with_plain_jax(name, long, by_xla, monkeypatch):
     monkeypatch.setattr(xla, "_SHORT", 0)
     monkeypatch.setattr(xla, "_LONG", 0 if long else 1000)
     found = jax.jit(TRANSFORMATIONS[name](ScalarFunction(plain)))(*ARGUMENTS)
@@ -85,7 +85,7 @@ def test_a_program_as_windows(name, long, by_xla, monkeypatch):
 
 @pytest.mark.slow_cases(all_but=["jit"])
 @pytest.mark.parametrize("name", ["jit", "reverse", "batch", "batch of gradients", "gradient of a loop"])
-def test_a_long_program_that_chooses(name, by_xla, monkeypatch):
+def test_a_long_program_with_a_selection_agrees_with_plain_jax(name, by_xla, monkeypatch):
     monkeypatch.setattr(xla, "_SHORT", 0)
     monkeypatch.setattr(xla, "_LONG", 0)
 
@@ -112,7 +112,7 @@ def many(a, x, flag):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_every_operation_as_windows(dtype, by_xla, monkeypatch):
+def test_every_operation_written_as_reduce_windows_agrees_with_plain_jax(dtype, by_xla, monkeypatch):
     monkeypatch.setattr(xla, "_SHORT", 0)
     monkeypatch.setattr(xla, "_LONG", 0 if dtype == np.float32 else 1000)
     values = np.array([[0.3, -1.5, 2.5], [0.0, -0.0, np.inf], [np.nan, 1.0, -1.0], [0.5, 0.5, 1e30]])
@@ -133,7 +133,7 @@ def test_every_operation_as_windows(dtype, by_xla, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.optimized
-def test_windows_are_not_cut(by_xla, on_cpu, monkeypatch):
+def test_reduce_windows_are_not_split_into_several_kernels(by_xla, on_cpu, monkeypatch):
     """Else a division that is read more than once ends a kernel, and every kernel has sines of its own."""
 
     def divided(a, x):
@@ -172,7 +172,7 @@ def test_an_empty_batch_on_a_gpu():
 @pytest.mark.parametrize("whole", [jnp.int32(3), jnp.array([1, 2])], ids=["int32", "two of int64"])
 @pytest.mark.parametrize("transform", ["jit", "batch"])
 @pytest.mark.filterwarnings("ignore:.*its description uses a result of int")
-def test_whole_numbers_among_the_results(whole, transform, kernels):
+def test_integer_results_are_preserved(whole, transform, kernels):
     f = ScalarFunction(lambda a, b, x: (plain(a, b, x)[0], whole))
     _, found = jax.jit(TRANSFORMATIONS[transform](f))(*ARGUMENTS)
     np.testing.assert_array_equal(found, jnp.broadcast_to(whole, found.shape), strict=True)
@@ -180,13 +180,13 @@ def test_whole_numbers_among_the_results(whole, transform, kernels):
     jax.jit(TRANSFORMATIONS[transform](f)).trace(*ARGUMENTS).lower(lowering_platforms=("cuda",))
 
 
-def test_repetition_goes():
+def test_common_subexpressions_and_unused_operations_are_removed():
     once = cse(jax.make_jaxpr(lambda x: jnp.sin(x) + jnp.sin(x) * jnp.cos(x) + 0.0 * jnp.tan(x))(1.0))
     names = [e.primitive.name for e in once.jaxpr.eqns]
     assert names.count("sin") == 1
 
 
-def test_it_is_traced_once():
+def test_a_function_is_traced_once():
     calls = []
 
     @ScalarFunction
@@ -225,7 +225,7 @@ print("alive")
 
 
 @pytest.mark.slow
-def test_the_process_stays_alive():
+def test_unusual_programs_do_not_crash_the_process():
     run = subprocess.run([sys.executable, "-c", CRASHES], capture_output=True, text=True, timeout=300, check=False)
     assert run.stdout.strip() == "alive", run.stderr[-2000:]
 
@@ -245,7 +245,7 @@ def test_a_batch_without_jit_is_compiled_once(on_cpu, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_value_of_the_trace_under_way_is_not_kept():
+def test_tracers_of_the_current_trace_are_not_stored():
     box = {}
     f = ScalarFunction(lambda x: box["k"] * jnp.sin(x))
 
@@ -271,7 +271,7 @@ FIRST_CALLS = {
 
 
 @pytest.mark.parametrize("name", FIRST_CALLS)
-def test_a_first_call_inside_a_trace_leaves_nothing_behind(name):
+def test_a_first_call_within_a_trace_leaks_no_tracers(name):
     f = ScalarFunction(lambda x: jnp.sin(x) * jnp.cos(0.5 * x))
     x = jnp.array(0.4)
     with jax.checking_leaks():
@@ -280,7 +280,7 @@ def test_a_first_call_inside_a_trace_leaves_nothing_behind(name):
     np.testing.assert_allclose(f(0.4), np.sin(0.4) * np.cos(0.2), rtol=1e-14)  # and of a weak type
 
 
-def test_the_precision_may_be_switched_between_calls():
+def test_the_precision_can_be_changed_between_calls():
     f = ScalarFunction(lambda x: (2.0 * x, jnp.full(2, 0.5)))
     x = jnp.float32(0.4)
     assert [y.dtype for y in f(x)] == [jnp.float32, jnp.float64]
@@ -289,7 +289,7 @@ def test_the_precision_may_be_switched_between_calls():
     assert [y.dtype for y in f(x)] == [jnp.float32, jnp.float64]
 
 
-def test_numbers_that_print_alike_are_not_the_same():
+def test_constants_with_equal_printed_digits_are_not_merged():
     """Common ones are found by their bits: arrays print eight digits, -0.0 equals 0.0, and no NaN is itself."""
     near = [np.array(0.1234567891234), np.array(0.1234567895678)]
     f = lambda x: [x * near[0], x * near[1], jnp.arctan2(x * 0.0, -1.0), jnp.arctan2(x * -0.0, -1.0), x + jnp.nan]  # noqa: E731
@@ -316,7 +316,7 @@ SLOW = {
 
 @pytest.mark.slow_cases(all_but=["cond", "while"])
 @pytest.mark.parametrize("name", SLOW)
-def test_what_cannot_be_one_function_is_told_once_by_name(name, monkeypatch):
+def test_operations_that_prevent_a_single_program_cause_one_warning(name, monkeypatch):
     monkeypatch.setattr(programs, "_warned", set())
     f = ScalarFunction(SLOW[name])
     ball, x = Ball(jnp.array(1.5)), jnp.array(0.4)
@@ -328,7 +328,7 @@ def test_what_cannot_be_one_function_is_told_once_by_name(name, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
-def test_products_of_small_matrices_are_written_out():
+def test_products_of_small_matrices_are_expanded_to_scalars():
     A, B = (np.random.default_rng(i).normal(size=s) for i, s in ((0, (2, 3, 4)), (1, (4, 2, 5))))
     f = lambda b, x: jnp.einsum("bij,jbk->bik", b.a * A, x * jnp.asarray(B))  # noqa: E731
     ball, x = Ball(jnp.array(1.5)), jnp.array(0.4)
@@ -339,7 +339,7 @@ def test_products_of_small_matrices_are_written_out():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
-def test_lapack_of_the_method_itself_is_not_told():
+def test_lapack_calls_of_the_library_cause_no_warning():
     def solved(x):
         rows = [[1.0 + x if i == j else 0.1 * x for j in range(7)] for i in range(7)]
         return solve(rows, [x, *map(float, range(1, 7))])[0][0] + determinant(rows)
@@ -350,7 +350,7 @@ def test_lapack_of_the_method_itself_is_not_told():
 
 
 @pytest.mark.usefixtures("native")
-def test_what_kernels_cannot_do_is_told_once_by_name(monkeypatch):
+def test_operations_unsupported_by_native_kernels_cause_one_warning(monkeypatch):
     monkeypatch.setattr(programs, "_warned", set())
     f = ScalarFunction(lambda ball, x: ball.a * jnp.asarray(x).astype(jnp.int32).astype(float))
     match = "Ball: its description uses convert_element_type of float64, which native"
@@ -379,7 +379,7 @@ def moving_about(a, x, y):
 
 
 @pytest.mark.slow
-def test_a_program_is_transposed_as_jax_transposes_it():
+def test_the_transpose_of_a_program_agrees_with_jax():
     rtol = 1e-14
     x, y, unused = jnp.arange(1.0, 5.0), jnp.array(0.7), jnp.array(3.0)
     for a in (0.4, -0.4):
@@ -404,7 +404,7 @@ def of_many_operations(a, x, y, n):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moving", [(0, 1, 2), (1,), (0, 2)], ids=str)
-def test_the_derivative_of_a_program_is_that_of_jax(moving):
+def test_the_derivative_of_a_program_agrees_with_jax(moving):
     rtol = 1e-14
     args = (jnp.array(0.7), jnp.array([0.5, 0.9, 1.4]), jnp.array(0.8), jnp.array(3))
     dxs = [jnp.cos(jnp.arange(1.0, args[i].size + 1.0)).reshape(args[i].shape) for i in moving]
@@ -420,7 +420,7 @@ def test_the_derivative_of_a_program_is_that_of_jax(moving):
     assert len(cse(tangent).jaxpr.eqns) == len(tangent.jaxpr.eqns)
 
 
-def test_numbers_that_do_not_move_have_no_derivative(kernels):
+def test_undifferentiated_arguments_have_symbolic_zero_tangents(kernels):
     """Not even zero: JAX leaves out what is computed of it."""
     f = ScalarFunction(lambda a, x: (jnp.sin(a), a * x, jax.lax.stop_gradient(x)))
     still = lambda x: jnp.exp(f(0.5, x)[2]) * f(0.5, x)[0]  # noqa: E731
@@ -442,7 +442,7 @@ def test_numbers_of_two_types_and_shapes_are_converted(operation):
 
 
 @pytest.mark.slow
-def test_packed_numbers_are_the_tree(kernels):
+def test_packed_arguments_give_the_same_results_as_the_pytree(kernels):
     rtol = 1e-14
     single = jnp.array(2.0, jnp.float32)  # of another type, and not read
     tree = {"a": jnp.array(0.7), "b": [jnp.array(-1.2), None], "x": jnp.array([0.3, 0.9]), "n": single}
@@ -459,7 +459,7 @@ def test_packed_numbers_are_the_tree(kernels):
     assert Packed.of({"x": jnp.ones(2)}, jnp.float64) == {"x": pytest.approx(jnp.ones(2))}
 
 
-def test_what_members_share_remains_shared():
+def test_outputs_shared_by_batch_members_remain_unbatched():
     """Only an output without an axis of members may be given out without one."""
     a, b = jnp.array(0.7), jnp.arange(1.0, 4.0)
     shared, product, square = jax.jit(jax.vmap(of_two, in_axes=(None, 0), out_axes=(None, 0, 0)))(a, b)
@@ -476,7 +476,7 @@ def test_what_members_share_remains_shared():
     np.testing.assert_array_equal(batch, [np.ones(3), 2 * b])
 
 
-def test_where_devices_share_the_work_it_is_one_operation_too():
+def test_a_sharded_program_is_one_operation():
     """JAX places constants on the devices of a mesh, by an operation that is none of scalars."""
 
     @ScalarFunction
@@ -511,7 +511,7 @@ NESTED = [(FWD,), (REV,), (FWD, FWD), (FWD, REV), (REV, FWD), (FWD, FWD, FWD)]
 @pytest.mark.slow
 @pytest.mark.parametrize("modes", NESTED, ids=lambda modes: "-".join(mode.__name__ for mode in modes))
 @pytest.mark.parametrize("shape", [once, in_a_loop])
-def test_value_and_derivative_as_one_operation(shape, modes, native):
+def test_value_and_derivative_in_one_program_agree_with_plain_jax(shape, modes, native):
     ours, plain = shape(_pair.in_forward_mode), shape(_pair.__wrapped__)
     for mode in reversed(modes):
         ours, plain = mode(ours), mode(plain)
@@ -523,7 +523,7 @@ def test_value_and_derivative_as_one_operation(shape, modes, native):
 
 @pytest.mark.slow_cases(all_but=["XLA-once"])
 @pytest.mark.parametrize("shape", [once, in_a_loop])
-def test_value_and_derivative_as_one_operation_by_linearize_and_in_batches(shape, kernels):
+def test_value_and_derivative_in_one_program_with_linearize_and_vmap(shape, kernels):
     ours, plain = shape(_pair.in_forward_mode), shape(_pair.__wrapped__)
     v, dv = jnp.array([0.3, 0.7]), jnp.array([1.0, -2.0])
     for f in (ours, plain):

@@ -103,7 +103,7 @@ def by_plain_jax(name, f):
     [(solution, plain), (around_solution, around_plain), (around_batch, around_plain_batch)],
     ids=["alone", "in another", "a batch in another"],
 )
-def test_the_same_as_plain_jax(name, f, g, kernels):
+def test_results_agree_with_plain_jax(name, f, g, kernels):
     """Operation by operation too, but for what XLA alone would compile hundreds of."""
     ours, expected = TRANSFORMATIONS[name](f), by_plain_jax(name, g)
     for one in (jax.jit(ours), ours)[: 2 if kernels == "native" or name in ("itself", "forward", "reverse") else 1]:
@@ -113,7 +113,7 @@ def test_the_same_as_plain_jax(name, f, g, kernels):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
-def test_it_is_the_equations_that_are_differentiated(jacobian):
+def test_derivatives_are_computed_from_the_linear_equations(jacobian):
     """Told that the residual is twice what it is, the derivative of the solution is twice what it was, and nothing
     else."""
     others, x = jacobian(solution, 1)(*ARGUMENTS)
@@ -149,7 +149,7 @@ def around_at_rest(spring, a, z):
 
 
 @pytest.mark.parametrize("f", [at_rest_solution, around_at_rest], ids=["alone", "in another"])
-def test_a_program_that_is_kept_has_the_derivative_of_what_it_solved(f, monkeypatch):
+def test_a_stored_program_differentiates_the_equations_that_it_solved(f, monkeypatch):
     """Its equations are traced when the first derivative is asked for, when what they read may have changed."""
     of_z = lambda z: f(Spring(), jnp.array(0.5), z)  # noqa: E731
     kept = jaxpr_as_fun(jax.make_jaxpr(of_z)(ARGUMENTS[1]))
@@ -161,7 +161,7 @@ def test_a_program_that_is_kept_has_the_derivative_of_what_it_solved(f, monkeypa
     np.testing.assert_allclose(jax.jacfwd(of_z)(ARGUMENTS[1]), 1.5 * slope, rtol=1e-13)
 
 
-def test_singular_equations_have_no_derivative(kernels):
+def test_singular_equations_have_nan_derivatives(kernels):
     """Not 0."""
     singular = LinearSolution(singular_solution, singular_equations)
     for jacobian in (jax.jacfwd, jax.jacrev):

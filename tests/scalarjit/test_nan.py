@@ -51,7 +51,7 @@ def derivative(modes, f):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("modes", ORDERS, ids=named)
-def test_who_reads_what_exists_gets_clean_derivatives(modes):
+def test_derivatives_of_valid_rows_contain_no_nan(modes):
     a, b = P["a"], P["b"]
     masked = lambda a, b: jnp.sum(jnp.where(MISSING[:, None], 0.0, rows(a, b)) ** 2)  # noqa: E731
     read = lambda a, b: jnp.stack([clean(a, b), masked(a, b), expected(a, b)])  # noqa: E731
@@ -63,7 +63,7 @@ def test_who_reads_what_exists_gets_clean_derivatives(modes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("modes", ORDERS, ids=named)
-def test_who_reads_what_is_missing_gets_nan(modes):
+def test_derivatives_of_missing_rows_are_nan(modes):
     """Also where the cotangents of two rows, or the tangents of two parameters, would cancel."""
     a, b = P["a"], P["b"]
 
@@ -76,7 +76,7 @@ def test_who_reads_what_is_missing_gets_nan(modes):
     assert np.isnan(flat(derivative(modes, read)(a, b))).all()
 
 
-def test_what_does_not_move_has_the_derivative_zero():
+def test_derivatives_by_unrelated_arguments_are_zero():
     x, x_dot = jax.jvp(lambda c: rows(P["a"], P["b"]) + 0.0 * c, (1.0,), (1.0,))
     assert np.isnan(x[2:]).all()
     np.testing.assert_array_equal(jax.grad(lambda c: c * clean(P["a"], P["b"]))(2.0), clean(P["a"], P["b"]))
@@ -85,7 +85,7 @@ def test_what_does_not_move_has_the_derivative_zero():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-def test_the_derivative_by_a_part_of_the_origin(mode):
+def test_derivatives_by_one_part_of_the_origin(mode):
     """Single numbers are one part of an origin, each other array is one; those that do not move take no part."""
     f = lambda a, b, c: nan_where(MISSING[1:3], jnp.stack([a * b[0], b[1] * c]), (a, b, c, jnp.arange(4.0)))  # noqa: E731
     first = [mode(f, argnums=i) for i in range(3)]
@@ -97,7 +97,7 @@ def test_the_derivative_by_a_part_of_the_origin(mode):
 
 
 @pytest.mark.slow
-def test_members_of_a_batch_are_told_apart():
+def test_missing_rows_of_batch_members_are_independent():
     """In a shared parameter only the sum over who exists is clean; each member's own are its own."""
     missing = jnp.stack([MISSING, jnp.zeros(4, bool), jnp.ones(4, bool)])
     rows_of = jax.vmap(lambda a, b, missing: rows(a, b, missing)[:2], (None, 0, 0))
@@ -115,7 +115,7 @@ def test_members_of_a_batch_are_told_apart():
 
 
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-def test_a_trial_value_that_is_not_finite_has_the_derivative_zero(mode):
+def test_a_non_finite_trial_value_has_zero_derivative(mode):
     def trial(x):
         both = derivative_free_where_not_finite(lambda x: (jnp.stack([x**2, jnp.sqrt(x - 1.0)]), x**3), x)
         return both[0][0] + both[1] + jnp.where(x > 1.0, both[0][1], 0.0)
@@ -125,7 +125,7 @@ def test_a_trial_value_that_is_not_finite_has_the_derivative_zero(mode):
 
 
 @pytest.mark.slow
-def test_complex_and_single_precision():
+def test_nan_where_with_complex_and_single_precision():
     for missing, dtype in itertools.product((False, True), (jnp.complex64, jnp.float32)):
         f = lambda a: nan_where(jnp.array(missing), (a * 2).astype(dtype), a)  # noqa: B023, E731
         value, slope = jax.jvp(f, (jnp.float32(2.0),), (jnp.float32(1.0),))
@@ -134,14 +134,14 @@ def test_complex_and_single_precision():
         assert bool(np.isnan(jax.grad(lambda a: f(a).real)(jnp.float32(2.0)))) == missing  # noqa: B023
 
 
-def test_without_an_origin_and_without_a_row():
+def test_nan_where_without_origin_and_without_rows():
     assert np.isnan(nan_where(jnp.array(True), jnp.array(1.0), None))
     assert nan_where(jnp.zeros(0, bool), jnp.zeros((0, 3)), P).shape == (0, 3)
 
 
 @pytest.mark.parametrize("mask", [nan_where, nan_derivative_where])
 @pytest.mark.parametrize("batched", ["missing", "origin"])
-def test_a_batch_in_a_loop_of_values_that_all_members_share(mask, batched):
+def test_shared_values_of_a_batch_within_a_loop(mask, batched):
     """The value is one for all, its derivative is each member's."""
 
     def one(x):
@@ -156,7 +156,7 @@ def test_a_batch_in_a_loop_of_values_that_all_members_share(mask, batched):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mask", [nan_where, nan_derivative_where])
-def test_a_batch_in_a_loop_of_one_part_of_the_origin(mask):
+def test_one_part_of_the_origin_in_a_batch_within_a_loop(mask):
     """To the second derivative, along the part that all members share, and along each member's own."""
 
     def one(shared, x):
@@ -171,14 +171,14 @@ def test_a_batch_in_a_loop_of_one_part_of_the_origin(mask):
             assert np.isnan(jax.jacfwd(first, argnums=other)(shared, x)).any()
 
 
-def test_values_without_entries_in_a_batch_in_a_loop():
+def test_empty_values_of_a_batch_within_a_loop():
     f = jax.jit(lambda x: jax.lax.map(jax.vmap(lambda x: nan_where(x > jnp.ones(4), jnp.zeros((4, 0)), x)), x))
     x = jnp.array([[1.0, 2.0]])
     assert jax.jvp(f, (x,), (x,))[1].shape == (1, 2, 4, 0)
 
 
 @pytest.mark.slow
-def test_derivatives_beyond_the_second_order_are_nan_only_where_they_are_not_exact():
+def test_derivatives_beyond_second_order_are_nan_only_if_inexact():
     def f(rough, x):
         return nan_beyond_second_derivative(rough, x**3, x)
 

@@ -41,7 +41,7 @@ def every_operation(x):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error:.*its description uses")
 @pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
-def test_every_operation(plainly, kernels):
+def test_every_operation_agrees_with_xla(plainly, kernels):
     x, expected = plainly
     program = ScalarFunction(every_operation)
     assert native_kernels.Scalars(jax.make_jaxpr(every_operation)(x[0])).graph.nodes, "cannot be written as scalars"
@@ -56,7 +56,7 @@ def test_every_operation(plainly, kernels):
 @pytest.mark.slow_cases(all_but=["native-float32"])
 @pytest.mark.filterwarnings("error:.*its description uses")
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32], ids=["float64", "float32"])
-def test_no_number_and_signed_zeros_as_by_xla(dtype, kernels):
+def test_nan_and_signed_zeros_agree_with_xla(dtype, kernels):
     """Bit for bit, but for the sign of NaN."""
     x = jnp.array([0.0, -0.0, 1.0, -1.0, jnp.inf, -jnp.inf, jnp.nan], dtype)
     f = lambda x: {name: odd(x) for name, odd in ODD.items()}  # noqa: E731
@@ -73,7 +73,7 @@ def test_no_number_and_signed_zeros_as_by_xla(dtype, kernels):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("native")
-def test_a_member_does_not_depend_on_its_place():
+def test_results_do_not_depend_on_the_position_in_the_batch():
     f = ScalarFunction(lambda x, a: jnp.sin(a * x) / (1.0 + x * x))
     x = jnp.linspace(-1.0, 1.0, LARGEST)
     together = jax.jit(jax.vmap(f, (0, None)))(x, 0.3)
@@ -85,7 +85,7 @@ def test_a_member_does_not_depend_on_its_place():
 @pytest.mark.usefixtures("native")
 @pytest.mark.parametrize("long", [10_000, 3])
 @pytest.mark.parametrize("made", [ScalarFunction, ScalarFunction.compile_cheaply], ids=["optimized", "once"])
-def test_a_kernel_of_many_blocks(made, long, native, monkeypatch):
+def test_a_kernel_of_many_blocks_agrees_with_plain_jax(made, long, native, monkeypatch):
     """What all lanes share, what differs from lane to lane, and both; in the order of the program and depth first."""
     monkeypatch.setattr(llvm, "_BLOCK", 2)
     monkeypatch.setattr(llvm, "_LONG", long)
@@ -103,7 +103,7 @@ def test_a_kernel_of_many_blocks(made, long, native, monkeypatch):
     assert program.is_native(a, x[0])
 
 
-def test_the_order_depth_first():
+def test_operations_are_ordered_depth_first():
     """Two sums of products: each product is computed just before its sum, not all products first."""
     program = jax.make_jaxpr(lambda a, b: (a * b, a * a, b * b, a * b + a * a, b * b + a))(1.0, 2.0)
     graph, outputs = graph_of(program)
@@ -139,7 +139,7 @@ def spring(parameters, x):
 
 
 @pytest.mark.slow
-def test_numbers_that_stay_are_one_argument_of_a_kernel(native, monkeypatch):
+def test_shared_arguments_are_passed_to_a_kernel_as_one_array(native, monkeypatch):
     """m, k and rest are one array, where all lanes share them; values and derivatives are those of plain JAX."""
     monkeypatch.setattr(programs, "_FEW", 1)
     parameters, x = (2.0, 5.0, 0.1, jnp.array([1.0, -1.0])), jnp.array([0.3, -0.2])
@@ -160,7 +160,7 @@ def test_numbers_that_stay_are_one_argument_of_a_kernel(native, monkeypatch):
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), found, expected)
 
 
-def test_what_cannot_be_written_is_left_to_xla(native):
+def test_unsupported_operations_are_left_to_xla(native):
     whole = lambda x: x.astype(jnp.int32).astype(x.dtype)  # noqa: E731
     f = ScalarFunction(lambda x: whole(x) + jnp.sin(x))
     programs._warned.clear()
@@ -195,7 +195,7 @@ def close(a, b):
 @pytest.mark.slow
 @pytest.mark.optimized
 @pytest.mark.usefixtures("native")
-def test_the_bicycle_and_its_derivatives_as_by_xla(bicycle):
+def test_the_bicycle_and_its_derivatives_agree_with_xla(bicycle):
     def many(system, t, q, u, inputs):
         return jax.vmap(lambda push: motion_rates(system, t, q, u.at[0].set(push), inputs))(jnp.linspace(0.0, 0.5, 11))
 
@@ -205,7 +205,7 @@ def test_the_bicycle_and_its_derivatives_as_by_xla(bicycle):
 
 
 @pytest.mark.slow
-def test_a_derivative_costs_a_few_values(bicycle):
+def test_a_derivative_takes_the_operations_of_a_few_evaluations(bicycle):
     """Operations of the graphs; all directions of a derivative are lanes of one kernel, which share what they can."""
     leaves, treedef = jax.tree.flatten(bicycle)
     plain = _motion_rates.__wrapped__
@@ -218,7 +218,7 @@ def test_a_derivative_costs_a_few_values(bicycle):
 
 
 @pytest.mark.usefixtures("native")
-def test_kernels_are_kept_beside_the_cache_of_jax(tmp_path):
+def test_kernels_are_stored_in_the_cache_folder_of_jax(tmp_path):
     was = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     try:

@@ -99,7 +99,7 @@ def one_bit(path, _):
 
 
 @pytest.mark.parametrize("damage", [truncated, zeroed, empty, swapped, one_bit])
-def test_damaged_code_is_thrown_away_by_name(damage, tmp_path):
+def test_damaged_object_files_are_reported_and_recompiled(damage, tmp_path):
     files = []
     for text, expected in ((SQUARE, 9.0), (CUBE, 27.0)):
         found, compiler = value(text, tmp_path)
@@ -112,14 +112,14 @@ def test_damaged_code_is_thrown_away_by_name(damage, tmp_path):
     assert value(SQUARE, tmp_path)[0] == 9.0  # and now it is whole: nothing is said
 
 
-def test_a_folder_that_cannot_be_written(tmp_path):
+def test_an_unwritable_cache_folder_causes_a_warning(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.warns(UserWarning, match=r"Compiled code could not be stored in .*file.*: Not a directory") as told:
         assert value(SQUARE, tmp_path / "file" / "folder")[0] == 9.0
     assert len(told) == 1
 
 
-def test_a_folder_that_goes_and_many_who_write(tmp_path):
+def test_a_deleted_cache_folder_and_concurrent_writers(tmp_path):
     folder = tmp_path / "new" / "folder"
     assert value(SQUARE, folder)[0] == 9.0
     for file in folder.iterdir():
@@ -143,7 +143,7 @@ def test_a_folder_that_goes_and_many_who_write(tmp_path):
 HEADER = Path(jax.ffi.include_dir(), "xla/ffi/api/c_api.h")
 
 
-def test_offsets_are_those_of_the_header_of_jaxlib():
+def test_structure_offsets_agree_with_the_header_of_jaxlib():
     if not HEADER.exists():
         pytest.skip(f"this jaxlib ships no header: {HEADER}")
     assert ffi_layout.layout_of(HEADER.read_text()) == ffi_layout.LAYOUT
@@ -183,7 +183,7 @@ def unknown(monkeypatch):
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_another_header_leaves_the_work_to_xla(change, tmp_path, unknown, monkeypatch):
+def test_with_a_different_header_xla_is_used(change, tmp_path, unknown, monkeypatch):
     old, new, words = CHANGES[change]
     text = HEADER.read_text()
     assert old is None or old in text
@@ -200,11 +200,11 @@ def test_another_header_leaves_the_work_to_xla(change, tmp_path, unknown, monkey
     assert not native.is_on()
 
 
-def test_without_the_header_xla_does_the_work(tmp_path):
+def test_without_the_header_xla_is_used(tmp_path):
     assert "cannot be read" in (ffi_layout.mismatch(tmp_path / "c_api.h") or "")
 
 
-def test_a_structure_may_grow_at_its_end(tmp_path):
+def test_fields_appended_to_a_structure_are_ignored(tmp_path):
     """Fields that a later jaxlib appends are not read."""
     text = HEADER.read_text()
     (body,) = re.findall(r"struct XLA_FFI_Buffer \{[^}]*", text)
@@ -217,7 +217,7 @@ def test_a_structure_may_grow_at_its_end(tmp_path):
     assert ffi_layout.mismatch(header) is None
 
 
-def test_a_handler_that_finds_a_moved_structure_makes_an_error(monkeypatch):
+def test_a_handler_with_a_wrong_structure_size_raises(monkeypatch):
     assert native.is_on()
     monkeypatch.setattr(llvm, "LAYOUT", llvm.LAYOUT._replace(frame_size=4096))
     with pytest.raises(jax.errors.JaxRuntimeError, match=r"uses another calling convention .*native=False"):
@@ -234,7 +234,7 @@ class Text:
         return "define void @it( nonsense"
 
 
-def test_an_error_of_llvm_leaves_the_work_to_xla(monkeypatch):
+def test_after_an_llvm_error_xla_is_used(monkeypatch):
     monkeypatch.setattr(native, "_told", set())
     f = ScalarFunction(lambda x: jnp.sin(x) * 1.75)
     with monkeypatch.context() as broken:
@@ -246,7 +246,7 @@ def test_an_error_of_llvm_leaves_the_work_to_xla(monkeypatch):
     assert native.is_on()
 
 
-def test_a_function_that_is_missing_leaves_the_work_to_xla(monkeypatch):
+def test_without_a_required_library_function_xla_is_used(monkeypatch):
     """LLVM would end the process."""
     monkeypatch.setattr(LLVMCompiler, "has", lambda self, function: function != "fmod")
     with pytest.warns(UserWarning, match=r"uses fmod \(not in the mathematical library of this computer\)"):

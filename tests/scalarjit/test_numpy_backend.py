@@ -47,14 +47,14 @@ def the_same(found, right, **tolerance):
 
 
 @pytest.mark.slow
-def test_values_are_those_of_jax():
+def test_values_agree_with_jax():
     assert functions.is_numpy(*ARGUMENTS)
     the_same(functions.numpy(*ARGUMENTS), functions.__wrapped__(*jax.tree.map(jnp.asarray, ARGUMENTS)), rtol=1e-14)
 
     the_same(error_function.numpy(np.array(0.3)), np.array(0.3286267594591274), rtol=1e-15)  # math.erf
 
 
-def test_what_is_no_number_is_so_in_numpy_too_and_nothing_is_said(recwarn):
+def test_nan_and_inf_agree_with_jax_without_warnings(recwarn):
     arguments = ({"a": np.array(-1.0)}, np.array(0.0), np.array([2.0, -1.0, np.nan]))
     right = jax.jit(functions.__wrapped__)(*arguments)
     the_same(functions.numpy(*arguments), right, rtol=1e-14, equal_nan=True)
@@ -62,7 +62,7 @@ def test_what_is_no_number_is_so_in_numpy_too_and_nothing_is_said(recwarn):
 
 
 @pytest.mark.slow
-def test_derivatives_along_several_directions_are_those_of_jax():
+def test_derivatives_along_several_directions_agree_with_jax():
     directions = np.array([[1.0, 0.0], [0.5, 2.0], [0.0, -1.0]])  # (x,d)
     along_b = np.array([0.3, 0.0])
     found = functions.numpy_jvp(ARGUMENTS, (None, along_b, directions))
@@ -73,7 +73,7 @@ def test_derivatives_along_several_directions_are_those_of_jax():
 
 
 @pytest.mark.slow
-def test_what_is_no_program_of_scalars_is_left_to_jax():
+def test_programs_with_array_operations_are_left_to_jax():
     b, x = np.array(2.0), np.array([0.5, 3.0])
     with pytest.warns(UserWarning, match="its description uses"):
         assert not by_a_library.is_numpy(b, x)
@@ -82,7 +82,7 @@ def test_what_is_no_program_of_scalars_is_left_to_jax():
 
 
 @pytest.mark.slow
-def test_single_precision_stays_single():
+def test_float32_stays_float32():
     arguments = jax.tree.map(lambda x: np.asarray(x, np.float32), ARGUMENTS)
     found = functions.numpy(*arguments)
     the_same(found, jax.jit(functions.__wrapped__)(*arguments), rtol=1e-5)
@@ -110,7 +110,7 @@ class Rods(jk.System):
 @pytest.mark.slow_cases("start0-1.5")
 @pytest.mark.parametrize("base", [1.5, 2.0, 3.0, np.nan])
 @pytest.mark.parametrize("start", [(0.5, -0.3), (0.0, 0.0), (np.pi, np.pi)])
-def test_newtons_method_finds_in_numbers_what_it_finds_compiled(base, start):
+def test_newtons_method_agrees_in_numpy_and_compiled(base, start):
     """Where there is one place, two rods in line, none, and no number; from beside, and from where all slopes agree."""
     system = eqx.tree_at(lambda s: s.base, Rods(), jnp.array(base))
     q = jnp.array([*start, 0.2])

@@ -16,7 +16,7 @@ def rows_of(A, values=None):
 
 @pytest.mark.slow_cases("sizes8", "sizes7", "sizes6")
 @pytest.mark.parametrize("sizes", [(3, 3, 3), (1, 3, 3), (2, 3), (1, 1, 1, 3), (4,), (1, 4), (5, 6), (7,), (1, 7)])
-def test_systems_in_blocks(sizes):
+def test_block_triangular_systems_agree_with_numpy(sizes):
     """1e-12: against NumPy, rows and columns shuffled; a block of seven goes to LAPACK."""
     rng = np.random.default_rng(len(sizes))
     n, end = sum(sizes), np.cumsum(sizes)
@@ -32,7 +32,7 @@ def test_systems_in_blocks(sizes):
     assert ("_solved_by_lapack" in traced) == (7 in sizes)
 
 
-def test_a_system_that_is_singular_by_its_zeros_has_no_number():
+def test_a_structurally_singular_system_gives_non_finite_values():
     A = np.eye(5)
     A[4, 4] = 0.0
     assert not np.any(np.isfinite(np.array(solve(rows_of(A), [jnp.ones(())] * 5)[0])[4:]))
@@ -40,7 +40,7 @@ def test_a_system_that_is_singular_by_its_zeros_has_no_number():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [4, 6])
-def test_elimination_exchanges_rows(n):
+def test_elimination_pivots_rows(n):
     """1e-10: numbers that are zero on the diagonal, and pivots of 1e-17; derivatives by the linear equations."""
     rng = np.random.default_rng(n)
     A, b = rng.normal(size=(20, n, n)), rng.normal(size=(20, n))
@@ -65,7 +65,7 @@ def test_elimination_exchanges_rows(n):
         np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
 
 
-def test_elimination_passes_over_exact_zeros():
+def test_elimination_skips_exact_zeros():
     """1e-12: a row without a leading entry, and others whose entry becomes one."""
     pattern = np.array([[0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 1, 0], [1, 0, 0, 1]])
     A, b = pattern * np.random.default_rng(0).normal(size=(4, 4)), np.arange(1.0, 5.0)
@@ -75,13 +75,13 @@ def test_elimination_passes_over_exact_zeros():
     np.testing.assert_allclose(solve(exact, [*b])[0], np.linalg.solve(exact, b), rtol=1e-12)
 
 
-def test_elimination_of_a_singular_matrix_has_no_number():
+def test_elimination_of_a_singular_matrix_gives_non_finite_values():
     row = [jnp.asarray(x) for x in (1.0, 2.0, 3.0, 4.0)]
     rows = [row, row, row[::-1], [2.0, 1.0, jnp.asarray(5.0), jnp.asarray(-1.0)]]
     assert determinant(rows) == 0.0
     assert not np.any(np.isfinite(np.array(solve(rows, row)[0])))
 
 
-def test_elimination_keeps_the_type():
+def test_elimination_preserves_the_dtype():
     rows = [[jnp.asarray(float(1 + i * j), jnp.float32) if i != j else 2.0 for j in range(4)] for i in range(4)]
     assert {x.dtype for x in solve(rows, rows[0])[0]} == {determinant(rows).dtype} == {np.dtype("float32")}

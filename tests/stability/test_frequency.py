@@ -36,7 +36,7 @@ def trials_of(model, number, seconds, noise, smooth=1, seed=0):
         )
 
 
-def test_a_linear_system_is_found_within_the_reported_error():
+def test_the_frequency_response_agrees_within_the_reported_error():
     """The mean square of 100 complex deviations by their errors is two, 20 % is three of its standard deviations."""
     model = model_of(2.0)
     found = frequency_response(model, list(trials_of(model, 8, 80.0, 0.02)), "force", "x", segment=20.0)
@@ -55,7 +55,7 @@ def test_a_linear_system_is_found_within_the_reported_error():
     plt.close("all")
 
 
-def test_irregular_and_different_sampling_is_interpolated():
+def test_irregular_and_unequal_sampling_is_interpolated():
     model = model_of(2.0)
     first, second = trials_of(model, 2, 80.0, 0.0, smooth=10)  # nothing to alias
     second.t = second.t + 0.2 * DT * np.sin(np.arange(second.t.size))
@@ -70,7 +70,7 @@ def test_irregular_and_different_sampling_is_interpolated():
     np.testing.assert_allclose(np.abs(found.measured / found.model)[low], 1.0, atol=0.1)
 
 
-def test_what_has_no_frequency_response_is_refused():
+def test_invalid_arguments_raise():
     model = model_of(2.0)
     (trial,) = trials_of(model, 1, 10.0, 0.0)
     for names, message in ((("torque", "x"), "no input 'torque'"), (("force", "y"), "no output 'y'")):

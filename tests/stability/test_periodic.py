@@ -94,7 +94,7 @@ def test_van_der_pol():
 
 
 @pytest.mark.slow
-def test_van_der_pol_slopes_in_both_modes_and_a_batch():
+def test_derivatives_of_the_van_der_pol_orbit_in_both_modes_and_a_batch():
     for mode in (jax.jacfwd, jax.jacrev):
         slopes = jax.jit(mode(numbers))(1.0)
         np.testing.assert_allclose(slopes, MU_1_SLOPES, rtol=1e-8)
@@ -104,7 +104,7 @@ def test_van_der_pol_slopes_in_both_modes_and_a_batch():
 
 
 @pytest.mark.slow
-def test_without_a_section_and_without_a_period():
+def test_periodic_without_section_and_without_period():
     orbit = periodic(VanDerPol(1.0), NEAR)
     ride = orbit.ride
     assert ride.ok
@@ -114,7 +114,7 @@ def test_without_a_section_and_without_a_period():
 
 
 @pytest.mark.slow
-def test_many_segments_find_an_unstable_orbit_and_a_tiny_multiplier():
+def test_multiple_shooting_finds_an_unstable_orbit_and_tiny_multiplier():
     """With -mu, time runs backwards: the multiplier is 1e37, and a simulation of the orbit does not return to it."""
     orbit = periodic(WithSections(5.0), NEAR, section="top", segments=40)
     np.testing.assert_allclose([orbit["x"], orbit.period], MU_5[:2], rtol=1e-11)
@@ -152,7 +152,7 @@ def test_a_forced_linear_oscillator():
 
 
 @pytest.mark.slow
-def test_slopes_of_a_forced_orbit_contain_those_of_its_period():
+def test_derivatives_of_a_forced_orbit_include_those_of_its_period():
     def found(frequency):
         orbit = periodic(Oscillator(frequency=frequency), REST, **FORCED)
         return jnp.stack([orbit["x"], orbit["v"], orbit.period, jnp.abs(orbit.multipliers[1])])
@@ -185,7 +185,7 @@ def period_of_a_pendulum(angle):
 
 
 @pytest.mark.slow
-def test_orbits_of_a_conservative_system_hold_a_quantity():
+def test_orbits_of_a_conservative_system_require_a_fixed_quantity():
     pendulum, released = Pendulum(), jk.State([1.0], [0.0])
     orbit = periodic(pendulum, released, hold=("angle",), period=2.1)
     np.testing.assert_allclose(orbit.period, period_of_a_pendulum(1.0), rtol=1e-11)
@@ -204,7 +204,7 @@ def test_a_family_of_a_conservative_system():
 
 
 @pytest.mark.slow
-def test_a_pendulum_that_rotates_advances_by_one_turn():
+def test_a_rotating_pendulum_advances_by_one_turn_per_period():
     turn = {"angle": 2 * np.pi}
     orbit = periodic(Pendulum(), jk.State([0.0], [8.0]), hold={"rate": 8.0}, advance=turn, period=1.0)
     np.testing.assert_allclose(orbit.period, 4 / 8 * ellipk(4 * 9.81 / 64), rtol=1e-11)
@@ -288,7 +288,7 @@ class Bead(jk.System):
 
 
 @pytest.mark.slow
-def test_constraints_have_no_multipliers():
+def test_constraints_add_no_floquet_multipliers():
     released = jk.assemble(Bead(), {"x": np.sin(1.0), "y": -np.cos(1.0)}, {"v": 0.0})
     orbit = periodic(Bead(), released, hold=("x",), period=2.1)
     np.testing.assert_allclose(orbit.period, period_of_a_pendulum(1.0), rtol=1e-10)
@@ -317,7 +317,7 @@ def test_rimless_wheel():
 
 
 @pytest.mark.slow
-def test_slopes_of_the_rimless_wheel():
+def test_derivatives_of_the_rimless_wheel_agree_with_the_closed_form():
     found = jax.jit(jax.jacrev(wheel, argnums=(0, 1)))(0.4, 0.08)
     expected = jax.jacfwd(wheel_by_formula, argnums=(0, 1))(0.4, 0.08)
     np.testing.assert_allclose(jnp.stack(found), jnp.stack(expected), rtol=1e-8, atol=1e-8)
@@ -344,7 +344,7 @@ def test_simplest_walker():
 
 
 @pytest.mark.slow
-def test_the_gait_of_the_compass_and_its_period_doubling():
+def test_the_compass_gait_and_its_period_doubling_are_found():
     guess = jk.State([-0.22, 0.32, 0.0], [1.09, 0.38])
     orbit = periodic(CompassGait(), guess, section="heel_strike")
     found = [orbit["stance"], orbit["swing"], orbit["stance_rate"], orbit["swing_rate"], orbit.period]
@@ -364,7 +364,7 @@ def gait_of_two_steps(slope):
 
 
 @pytest.mark.slow
-def test_a_gait_of_two_steps_beyond_the_period_doubling():
+def test_a_two_step_gait_beyond_the_period_doubling():
     slope = np.deg2rad(4.5)
     orbit = gait_of_two_steps(slope)
     walk = jk.simulate(orbit.system, orbit.state, jnp.linspace(0.0, 1.6, 3), rtol=1e-12, atol=1e-12)
@@ -381,7 +381,7 @@ def test_a_gait_of_two_steps_beyond_the_period_doubling():
 
 
 @pytest.mark.slow
-def test_two_steps_of_a_gait_have_the_squares_of_its_multipliers():
+def test_multipliers_over_two_steps_are_the_squares_of_those_over_one():
     guess = jk.State([-0.22, 0.32, 0.0], [1.09, 0.38])
     one, two = (periodic(CompassGait(), guess, section="heel_strike", returns=k) for k in (1, 2))
     np.testing.assert_allclose(two.period, 2.0 * one.period, rtol=1e-11)
@@ -411,13 +411,13 @@ def test_returns_to_a_section_without_a_jump():
         ({"returns": 1.0}, "`returns` must be a positive whole number, got 1.0"),
     ],
 )
-def test_bad_options(options, message):
+def test_invalid_options_raise(options, message):
     with pytest.raises(ValueError, match=message):
         periodic(WithSections(), NEAR, **options)
 
 
 @pytest.mark.slow
-def test_guesses_without_an_orbit():
+def test_guesses_without_a_periodic_orbit_raise():
     with pytest.raises(ValueError, match="the guess is an equilibrium or a steady motion"):
         periodic(WithSections(), REST, section="top", period=6.6)
     with pytest.raises(ValueError, match="the equations depend on the time"):
@@ -432,6 +432,6 @@ def test_guesses_without_an_orbit():
         periodic(RimlessWheel(), jk.State([-0.32, 0.0], [0.1]), section="step")
 
 
-def test_under_a_trace_there_is_no_exception():
+def test_periodic_under_jit_requires_a_period():
     with pytest.raises(ValueError, match=r"under jax\.jit, jax\.vmap and derivatives, pass `period`"):
         jax.eval_shape(lambda mu: periodic(WithSections(mu), NEAR, section="top").period, 1.0)

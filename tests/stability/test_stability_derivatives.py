@@ -44,7 +44,7 @@ QUICK = {("eig", "reverse over reverse"), ("eigvals", "forward over reverse")}
         for mode in MODES
     ],
 )
-def test_second_derivatives_have_closed_forms(way, mode):
+def test_second_derivatives_of_eigenvalues_agree_with_closed_forms(way, mode):
     rtol = 1e-11
     second = jax.jit(MODES[mode](lambda p: largest(WAYS[way](pair(p)))))
     oscillating = jax.hessian(lambda p: (-p[0], jnp.sqrt(p[1] - p[0] ** 2)))
@@ -55,7 +55,7 @@ def test_second_derivatives_have_closed_forms(way, mode):
 
 
 @pytest.mark.slow
-def test_third_derivatives_and_vectors_against_differences():
+def test_third_derivatives_and_eigenvectors_agree_with_differences():
     """Of a general matrix: a parameter moves all of it; vectors as LAPACK scales them."""
     rtol = 1e-7
     rng = np.random.default_rng(3)
@@ -91,7 +91,7 @@ COALESCING = [jnp.array([[1.0, coupled, 0.2], [0.0, 1.0, 0.3], [0.0, 0.0, 3.0]])
 @pytest.mark.parametrize(
     "mode", [m if m == "reverse over reverse" else pytest.param(m, marks=pytest.mark.slow) for m in MODES]
 )
-def test_one_that_is_separated_does_not_mind_that_others_coalesce(mode):
+def test_a_separate_eigenvalue_is_differentiable_while_others_coalesce(mode):
     rtol = 1e-11
     B = jnp.array([[0.1, 0.4, 0.2], [0.3, 0.2, -0.5], [0.7, 0.6, 0.5]])
     second = jax.jit(MODES[mode](lambda p, A: eigvals(A + p * B).real))
@@ -109,12 +109,12 @@ def test_one_that_is_separated_does_not_mind_that_others_coalesce(mode):
 
 
 @pytest.mark.slow
-def test_in_reverse_mode_what_is_not_read_says_nothing():
+def test_unread_coalescing_eigenvalues_add_no_nan_in_reverse_mode():
     hessian_of_first = jax.jit(jax.hessian(lambda A: eigvals(A).real[0]))
     assert all(np.isfinite(hessian_of_first(A)).all() for A in COALESCING)
 
 
-def test_in_single_precision_and_in_batches_of_none():
+def test_eigenvalues_in_single_precision_and_of_empty_batches():
     slope = jax.jit(jax.jacfwd(lambda p: eigvals(pair(p)).real))(jnp.array([1.5, 0.7], jnp.float32))
     assert slope.dtype == jnp.float32
     assert np.isfinite(slope).all()
@@ -168,7 +168,7 @@ def test_an_equilibrium_that_is_not_found_has_no_derivative(derivative):
 
 
 @pytest.mark.slow
-def test_a_member_that_is_not_found_leaves_the_others_their_derivative():
+def test_a_failed_batch_member_does_not_affect_the_derivatives_of_others():
     """Shared length, a batch of torques, of which the second is too large: nobody reads it, or everything is told."""
     torques = jnp.array([0.3, 1.2, 0.5]) * LIMIT
 
@@ -191,7 +191,7 @@ def softest(length, damper=1.0):
 
 
 @pytest.mark.slow
-def test_a_critical_value_that_is_not_there_has_no_derivative():
+def test_a_missing_critical_value_has_nan_derivatives():
     """Hanging, a spring of -m g l makes it unstable; with a damper that drives it, nothing makes it stable."""
     both = jax.jit(jax.value_and_grad(softest))
     np.testing.assert_allclose(both(0.5, 1.0), [-LIMIT, -2 * 9.81], rtol=1e-11)
@@ -199,7 +199,7 @@ def test_a_critical_value_that_is_not_there_has_no_derivative():
 
 
 @pytest.mark.slow
-def test_a_critical_value_among_those_given_and_one_beside_none():
+def test_a_critical_value_at_a_given_value_and_next_to_an_invalid_value():
     """Exactly at a given value the sign is that of rounding; beside a value without a motion nothing can be told."""
     hanging = jk.State(jnp.zeros(1), jnp.zeros(1))
     at = lambda system, spring: (dataclasses.replace(system, spring=spring), hanging)  # noqa: E731
@@ -217,7 +217,7 @@ def sprung(system, spring):
 
 
 @pytest.mark.slow
-def test_critical_values_do_not_depend_on_the_order_of_those_given():
+def test_critical_values_do_not_depend_on_the_order_of_the_given_values():
     up = critical_speeds(Pushed(), jnp.array([-20.0, -3.0, 5.0]), sprung)
     np.testing.assert_allclose(up.values, [-LIMIT], rtol=1e-12)
     for values in ([5.0, -3.0, -20.0], [-3.0, 5.0, -20.0]):
@@ -232,7 +232,7 @@ def test_critical_values_do_not_depend_on_the_order_of_those_given():
 
 
 @pytest.mark.slow
-def test_eigenvalues_that_cease_to_grow_without_passing_the_axis_are_told():
+def test_a_stability_change_without_axis_crossing_causes_a_warning():
     """Without a damper it becomes neutral; with a spring that passes its limit flatly, the crossing is too flat."""
     with pytest.warns(UserWarning, match="falls by 1 more than the detected"):
         found = critical_speeds(Pushed(damper=0.0), jnp.array([-20.0, -3.0, 5.0]), sprung)
@@ -243,7 +243,7 @@ def test_eigenvalues_that_cease_to_grow_without_passing_the_axis_are_told():
 
 
 @pytest.mark.slow
-def test_a_parameter_that_cannot_be_has_no_linear_model_under_a_trace():
+def test_an_invalid_parameter_gives_a_nan_linear_model_under_jit():
     """A length that passes zero is no way to become stable: alone that is an error."""
     hanging = jk.State(jnp.zeros(1), jnp.zeros(1))
     at = lambda system, length: (dataclasses.replace(system, length=length), hanging)  # noqa: E731
@@ -253,7 +253,7 @@ def test_a_parameter_that_cannot_be_has_no_linear_model_under_a_trace():
         critical_speeds(Pushed(), jnp.array([-0.5, 0.5]), at)
 
 
-def test_a_motion_that_is_not_steady_has_no_linear_model_under_a_trace():
+def test_an_unsteady_motion_gives_a_nan_linear_model_under_jit():
     """It was the model of an instant, without a word: now NaN in its row, as it is an error alone."""
     tilts = jnp.array([0.0, 0.4, np.pi])
     found = eigenvalues(Pushed(), tilts, lambda system, angle: jk.State(angle[None], jnp.zeros(1)))
@@ -278,7 +278,7 @@ def test_a_motion_that_is_not_steady_has_no_linear_model_under_a_trace():
 
 
 @pytest.mark.slow
-def test_off_the_constraints_there_is_no_linear_model_of_an_instant_either():
+def test_linearize_rejects_states_that_violate_the_constraints():
     rod = RodOnPin(length=0.7)
     off = jk.State(jnp.array([0.1, 0.1]), jnp.zeros(1))
     with pytest.raises(ValueError, match="violate the configuration constraints"):
@@ -287,7 +287,7 @@ def test_off_the_constraints_there_is_no_linear_model_of_an_instant_either():
 
 
 @pytest.mark.slow
-def test_a_family_along_which_an_input_is_found():
+def test_a_family_of_steady_motions_that_solves_for_an_input():
     """The torque that holds a pendulum, as it is led aside: one equation fewer than unknowns."""
     found = family(Pushed(), equilibrium(Pushed()), towards={"angle": 1}, until={"angle": 1.0}, find=("torque",))
     np.testing.assert_allclose(found.q[-1], [1.0], rtol=1e-9)

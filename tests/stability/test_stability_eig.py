@@ -75,7 +75,7 @@ def by_qr():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_each_is_an_eigenvalue_of_a_matrix_as_near_as_rounding(kind, by_qr):
+def test_eigenvalues_are_backward_stable(kind, by_qr):
     """Backward stability: A + E has it, and the norm of E is the least singular value of A - lambda."""
     tolerance, A, found = 1e-14, matrices(kind), by_qr[kind]
     size = np.abs(A).max(axis=(1, 2))
@@ -88,7 +88,7 @@ def test_each_is_an_eigenvalue_of_a_matrix_as_near_as_rounding(kind, by_qr):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["scaled", "stiff"])
-def test_small_ones_beside_large_ones_are_right(kind, by_qr):
+def test_small_eigenvalues_next_to_large_ones_are_accurate(kind, by_qr):
     """Against forty digits, each to its own size; balancing sees to that. LAPACK is off by up to 1e-9 there."""
     rtol, mpmath = 1e-9, pytest.importorskip("mpmath")
     with mpmath.workdps(40):
@@ -99,7 +99,7 @@ def test_small_ones_beside_large_ones_are_right(kind, by_qr):
 
 
 @pytest.mark.slow
-def test_what_is_no_number_stays_with_its_matrix():
+def test_non_finite_matrices_do_not_affect_other_batch_members():
     A = np.tile(np.eye(4), (4, 1, 1))
     A[1, 2, 0], A[2, 3, 3] = np.nan, np.inf
     A[3] = 0.0
@@ -110,7 +110,7 @@ def test_what_is_no_number_stays_with_its_matrix():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(3, marks=pytest.mark.slow), 7])
-def test_a_batch_is_what_its_members_are(n):
+def test_eigenvalues_of_a_batch_equal_those_of_its_members(n):
     """Whether by QR or by LAPACK, with one leading axis or two, in single precision too."""
     A = np.random.default_rng(n).standard_normal((2, CHUNK + 4, n, n))
     single = np.stack([np.linalg.eigvals(a) for a in A[0, :10]])
@@ -124,7 +124,7 @@ def test_a_batch_is_what_its_members_are(n):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
-def test_a_batch_its_members_and_their_derivatives_have_one_order(kernels):
+def test_eigenvalue_order_is_the_same_in_batches_members_and_derivatives(kernels):
     """Pendulums without and with damping, whose real parts are rounding errors or not: the values of a batch are those
     of its members and those beside a derivative, each in its place, and so are those of `eig`."""
     atol, rng = 1e-12, np.random.default_rng(0)
@@ -151,7 +151,7 @@ def bicycles():
 
 
 @pytest.mark.slow
-def test_a_batch_of_bicycles_against_the_literature(bicycles, kernels):
+def test_eigenvalues_of_a_batch_of_bicycles_agree_with_the_literature(bicycles, kernels):
     """Meijaard et al. (2007), Table 2, among three hundred others; and beside the double root, as LAPACK's."""
     atol, A = 1e-11, bicycles
     found = np.asarray(jax.jit(jax.vmap(eigvals))(A))
@@ -168,7 +168,7 @@ def test_a_batch_of_bicycles_against_the_literature(bicycles, kernels):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
-def test_derivatives_of_values_alone_are_those_of_both(kernels):
+def test_derivatives_of_eigvals_and_eig_agree(kernels):
     rtol = 1e-12
     A = np.random.default_rng(0).standard_normal((CHUNK, 3, 3))
     of_each = lambda f: jax.jit(jax.vmap(jax.jacrev(lambda a: jnp.sum(f(a).real ** 2))))(A)  # noqa: E731
@@ -202,7 +202,7 @@ print("done")
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["native", "LAPACK"])
-def test_programs_in_several_threads_do_not_wait_for_each_other(way):
+def test_programs_in_several_threads_do_not_deadlock(way):
     """jaxlib's batched LAPACK waits in XLA's threads for XLA's threads: each of these programs once hung for ever."""
     run = subprocess.run([sys.executable, "-c", THREADS, way], capture_output=True, text=True, timeout=240, check=False)
     assert run.stdout == "done\n", run.stderr

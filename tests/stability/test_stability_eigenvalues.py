@@ -130,7 +130,7 @@ def test_derivatives_of_eigenvalues_with_respect_to_all_parameters():
 
 
 @pytest.mark.slow
-def test_where_modes_coalesce_there_is_no_derivative():
+def test_coalescing_modes_have_nan_derivatives():
     """Not a silent zero: NaN for the two that meet, numbers for the others, and words."""
 
     def at(v):
@@ -175,7 +175,7 @@ def test_weave_and_capsize_speeds(published, recwarn):
 
 
 @pytest.mark.slow
-def test_riding_backwards_is_riding_forwards_with_time_reversed():
+def test_eigenvalues_of_riding_backwards_are_those_of_reversed_time():
     """Each mode keeps its name: it was castering that capsized."""
     speeds = jnp.linspace(1.0, 10.0, 19)
     forwards, backwards = eigenvalues(BIKE, speeds), eigenvalues(BIKE, -speeds)
@@ -300,7 +300,7 @@ def test_every_crossing_of_many_random_pencils_is_found(seed):
 @pytest.mark.slow
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(st.integers(0, 2**20), st.integers(2, 12))
-def test_a_pair_is_not_torn_while_it_is_one(seed, n):
+def test_a_conjugate_pair_remains_in_its_columns(seed, n):
     """Along a pencil in steps that are small enough, what is a pair in two rows stays in its two columns."""
     A, dA = pencil(seed)
     p = np.linspace(0.0, 0.01, n)
@@ -311,7 +311,7 @@ def test_a_pair_is_not_torn_while_it_is_one(seed, n):
     np.testing.assert_array_equal(together[1:][kept], together[:-1][kept])
 
 
-def test_a_pair_that_becomes_real_and_unstable_within_a_step():
+def test_a_pair_that_becomes_real_and_unstable_within_one_step_is_found():
     """x'' = (p - 0.1) x - 0.4 x' has a pair up to p = 0.06 and grows from 0.1 on; beside it one decays up to 0.07, and
     one exactly up to a value that is given."""
     A, dA = np.zeros((2, 4, 4))
@@ -354,7 +354,7 @@ def reference():
 @pytest.mark.slow
 @given(first=st.integers(0, 900), n=st.integers(1, 12), step=st.integers(1, 1000))
 @settings(max_examples=200, deadline=None, derandomize=True)
-def test_names_are_right_or_not_given(reference, first, n, step):
+def test_mode_names_are_correct_or_omitted(reference, first, n, step):
     """From any speed on, in few or coarse steps, against steps of 0.01 m/s; and they are clear where steps are small,
     or where a pair swings at a single speed."""
     rows = np.arange(first, 1001, step)[:n]
@@ -367,7 +367,7 @@ def test_names_are_right_or_not_given(reference, first, n, step):
         assert clear.all()
 
 
-def test_a_doubtful_name_is_not_given_and_a_warning_says_so():
+def test_an_ambiguous_mode_name_is_omitted_with_a_warning():
     """From 0.22 to 12 m/s in one step two real modes become the weave; which of four cannot be told."""
     speeds = jnp.repeat(jnp.array([0.22, 12.0]), jnp.array([50, 51]), total_repeat_length=101)
     with pytest.warns(UserWarning, match="the modes weave, .*capsize.* cannot be identified and are numbered"):
@@ -375,7 +375,7 @@ def test_a_doubtful_name_is_not_given_and_a_warning_says_so():
     assert found.modes[0] == "mode 1"
 
 
-def test_a_pair_without_a_clear_name_is_one_mode():
+def test_an_unnamed_conjugate_pair_is_one_mode():
     """Two pairs at all values, a pair that becomes real, and two real modes that are always real."""
     pair, other = np.array([-1 + 2j, -1 - 2j]), np.array([-3 + 0.5j, -3 - 0.5j])
     splits = np.array([[-4 + 1j, -4 - 1j], [-4.0, -5.0], [-3.0, -6.0]])
@@ -385,7 +385,7 @@ def test_a_pair_without_a_clear_name_is_one_mode():
     assert _numbers(values[:0]).tolist() == list(range(8))
 
 
-def test_a_pair_is_continued_by_a_pair():
+def test_a_conjugate_pair_is_continued_by_a_conjugate_pair():
     """Where the least sum of changes would continue a pair by a real eigenvalue and by one of another pair."""
     last = np.array([-3.9 + 5.3j, -3.9 - 5.3j, -17 + 34j, -17 - 34j])
     values = np.array([-4.5 + 16j, -4.5 - 16j, -21.0, -57.0])
@@ -400,7 +400,7 @@ def test_a_pair_is_continued_by_a_pair():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the modes .* cannot be identified")
-def test_a_pair_of_a_motorcycle_without_a_clear_name_is_one_mode():
+def test_an_unnamed_conjugate_pair_of_a_motorcycle_is_one_mode():
     """Sharp's motorcycle in steps of 10 m/s: the weave and the wobble are pairs at all speeds, the rear tyre is not."""
     found = eigenvalues(sharp_motorcycle(), jnp.array([10.0, 20.0, 30.0]))
     pairs = np.argwhere(conjugate_pairs(np.asarray(found.eigenvalues)).all(axis=0))
@@ -414,7 +414,7 @@ def test_a_pair_of_a_motorcycle_without_a_clear_name_is_one_mode():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the modes .* cannot be identified")
-def test_names_of_a_motorcycle_at_one_speed_and_in_coarse_steps():
+def test_mode_names_of_a_motorcycle_at_one_speed_and_in_coarse_steps():
     """What is named weave, wobble or capsize is it, and no pair has two names."""
     motorcycle = sharp_motorcycle()
     for v in (20.0, 30.0, 40.0):
@@ -453,7 +453,7 @@ class Inverted(jk.System):
 
 
 @pytest.mark.slow
-def test_any_parameter_of_any_system():
+def test_critical_values_of_any_parameter_of_any_system():
     """It stands from a spring of m g l on; d/dlength is m g."""
     rtol = 1e-12
 
@@ -476,7 +476,7 @@ def test_any_parameter_of_any_system():
     assert softest(dataclasses.replace(system, damper=0.0)).values.size == 0
 
 
-def test_what_is_missing_is_asked_for():
+def test_missing_arguments_raise_with_advice():
     system = Inverted(mass=2.0, length=0.6, spring=20.0, damper=1.0)
     with pytest.raises(ValueError, match=r"Inverted has no default family of steady motions. Pass `motion`"):
         eigenvalues(system, jnp.linspace(0.0, 1.0, 3))

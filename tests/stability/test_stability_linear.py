@@ -28,7 +28,7 @@ def models():
 
 
 @pytest.mark.slow
-def test_the_bicycle_at_eleven_speeds_is_meijaards(models):
+def test_linear_models_of_the_bicycle_agree_with_meijaard_at_eleven_speeds(models):
     atol = 1e-11
     M, C1, K0, K2 = (np.array(PUBLISHED[name]) for name in ("M", "C1", "K0", "K2"))
     for v, A, B in zip(range(11), models.A, models.B, strict=True):
@@ -107,7 +107,7 @@ def _hanging(rod):
 
 
 @pytest.mark.slow
-def test_faults_are_named():
+def test_invalid_linearizations_raise_by_name():
     moving = jk.State(jnp.zeros(8).at[0].set(0.1), jnp.array([0.0, -10.0, 0.0]))
     with pytest.raises(ValueError, match=r"this motion is not steady: roll_rate is accelerated by .*equilibrium or"):
         linearize(BIKE, jk.assemble(BIKE, moving.q, moving.u))
@@ -132,7 +132,7 @@ def at_four(models):
 
 
 @pytest.mark.parametrize("y", [0.0, 1e-14])
-def test_where_constraints_do_not_determine_a_coordinate_there_is_no_linear_model(y):
+def test_linearize_rejects_undetermined_dependent_coordinates(y):
     """A ring at the height of its centre, and a wrong choice of `dependent` below it: an error, NaN under a trace."""
     ring = RodOnPin(length=0.6)
     model = lambda q, dependent: linearize(ring, jk.State(q, jnp.zeros(1)), dependent=dependent, steady=False)  # noqa: E731
@@ -143,7 +143,7 @@ def test_where_constraints_do_not_determine_a_coordinate_there_is_no_linear_mode
 
 
 @pytest.mark.slow
-def test_singular_equations_and_derivatives_are_errors():
+def test_singular_equations_and_derivatives_raise():
     """A ball joint at half a turn, where its norm does not give the last Euler parameter; a speed that is not
     determined; an output without a slope."""
     link = Link("a", None, ball("s", stiffness=2.0), mass=1.0, inertia=(0.5, 0.5, 0.5))
@@ -163,7 +163,7 @@ def test_singular_equations_and_derivatives_are_errors():
         linearize(ring, below, outputs={"distance": lambda t, q, u: jnp.sqrt(q["y"])})
 
 
-def test_names_of_a_linear_model_are_known_and_stand_once():
+def test_unknown_and_repeated_names_of_a_linear_model_raise():
     ring, below = RodOnPin(length=0.6), jk.State(jnp.array([0.0, 0.6]), jnp.zeros(1))
     with pytest.raises(ValueError, match="`dependent` contains unknown names: z; the coordinates are y, x"):
         linearize(ring, below, dependent=("z",))
@@ -189,7 +189,7 @@ def test_lqr_balances_the_bicycle_by_steering(at_four):
             stability.lqr(at_four, Q, R, inputs=("steer_torque",))
 
 
-def test_python_control_gets_the_names_or_is_asked_for(at_four, monkeypatch):
+def test_to_control_preserves_names_and_requires_python_control(at_four, monkeypatch):
     with monkeypatch.context() as without:
         without.setitem(__import__("sys").modules, "control", None)
         with pytest.raises(ImportError, match=r"jaxkane\[control\]"):
@@ -272,7 +272,7 @@ AT_REST = stability.SteadyMotion(
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_what_is_no_argument_is_refused_in_words(case):
+def test_invalid_arguments_raise_an_explained_error(case):
     call, error, words = CASES[case]
     with pytest.raises(error, match=words):
         call()

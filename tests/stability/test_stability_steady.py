@@ -81,7 +81,7 @@ class Sailing(jk.System):
 
 
 @pytest.mark.slow
-def test_what_matters_under_an_input_or_far_away_is_not_cyclic():
+def test_a_coordinate_that_matters_only_with_an_input_is_not_cyclic():
     """x_ddot = wind (1 + x / 2) / m: the model about a wind that another force balances has its mode."""
     system = Sailing()
     assert cyclic_coordinates(system) == ()
@@ -98,7 +98,7 @@ class Unreal(Sailing):
         return (jk.Force(jnp.sqrt(-1.0 - q["x"] ** 2) * motion.N.x, motion["cart"]),)
 
 
-def test_where_nothing_is_finite_nothing_is_called_cyclic():
+def test_cyclic_coordinates_of_a_non_finite_system_raise():
     with pytest.raises(ValueError, match="Unreal: the cyclic coordinates cannot be determined"):
         cyclic_coordinates(Unreal())
 
@@ -142,7 +142,7 @@ def test_steady_precession_of_the_top_and_its_derivatives():
 
 
 @pytest.mark.slow
-def test_fast_and_slow_precession_are_one_family():
+def test_fast_and_slow_precession_belong_to_one_family():
     """Followed at one nutation, the spin falls to its least value, where the two meet, and rises again."""
     rtol = 1e-10
     slow = steady_turn(TOP, {}, {"precession_rate": 2.0}, hold={"nutation": 0.5, "spin_rate": 300.0})
@@ -157,7 +157,7 @@ def test_fast_and_slow_precession_are_one_family():
 
 
 @pytest.mark.slow
-def test_a_disc_rolls_on_a_circle():
+def test_a_disc_that_rolls_on_a_circle_agrees_with_the_closed_form():
     """r/4 u3^2 tan(lean) - 3/2 r u2 u3 = g sin(lean): moments about the centre of a uniform disc."""
     atol = 1e-12
     disc = RollingDisc(m=2.0, r=0.3, g=9.81)
@@ -177,7 +177,7 @@ def test_equilibria():
 
 
 @pytest.mark.slow
-def test_torques_that_hold_a_lean_are_found():
+def test_trim_torques_for_a_given_lean_are_found():
     """Trim: turning at 3 m/s with a lean of 0.2 rad and a steer of 0.1 rad needs a roll and a steer torque."""
     atol = 1e-11
     hold = {"roll": 0.2, "steer": 0.1, "rear_wheel_rate": -10.0}
@@ -189,7 +189,7 @@ def test_torques_that_hold_a_lean_are_found():
 
 
 @pytest.mark.slow
-def test_what_was_held_too_little_or_wrongly_is_named():
+def test_insufficient_or_invalid_hold_conditions_raise():
     with pytest.raises(ValueError, match=r"family of dimension 1, along which roll, steer, .* change\. Hold 1 more"):
         steady_turn(BIKE, {"roll": 0.1, "steer": 0.05}, {"rear_wheel_rate": -20.0})
     with pytest.raises(ValueError, match="no steady motion was found from this guess"):
@@ -217,7 +217,7 @@ def beside_capsize():
 
 
 @pytest.mark.slow
-def test_handlebar_forward_from_capsize_to_rest(beside_capsize):
+def test_forward_handlebar_family_extends_from_capsize_to_rest(beside_capsize):
     """From the capsize speed, over a largest lean, to rest with the frame upright and the wheel turned by 76.76 deg."""
     atol = 1e-11
     turns = family(BIKE, beside_capsize, towards={"roll": 1}, until={"rear_wheel_rate": 0.0}, max_step=0.05)
@@ -245,7 +245,7 @@ def test_rest_with_a_turned_front_wheel_is_an_equilibrium():
 
 
 @pytest.mark.slow
-def test_handlebar_reversed_from_its_capsize_to_spinning_flat():
+def test_reversed_handlebar_family_extends_from_capsize_to_flat_spinning():
     atol = 1e-11
     q = jk.assemble(BIKE, {"steer": np.pi + 0.01, "roll": 0.02}).q
     start = steady_turn(BIKE, q, {"rear_wheel_rate": -26.3}, hold=("steer",))
@@ -258,7 +258,7 @@ def test_handlebar_reversed_from_its_capsize_to_spinning_flat():
 
 
 @pytest.mark.slow
-def test_pivoting_about_the_rear_contact_joins_two_limits():
+def test_the_pivoting_family_connects_two_limits():
     """The third family: other speeds are independent, since the rear wheel's does not determine the yaw rate there."""
     atol = 1e-11
     bicycle = with_speeds(BIKE, ("roll_rate", "yaw_rate", "steer_rate"))
@@ -275,7 +275,7 @@ def test_pivoting_about_the_rear_contact_joins_two_limits():
     assert abs(np.rad2deg(fast["steer"][-1]) - 90) < 10
 
 
-def test_other_independent_speeds_move_alike():
+def test_accelerations_do_not_depend_on_the_choice_of_independent_speeds():
     rtol = 1e-12
     bicycle = with_speeds(BIKE, ("yaw_rate", "pitch_rate", "roll_rate"))
     q = jk.assemble(BIKE, {"roll": 0.2, "steer": -0.3}).q
@@ -317,7 +317,7 @@ class Skate(jk.System):
 
 
 @pytest.mark.slow
-def test_other_independent_speeds_keep_all_else():
+def test_with_speeds_preserves_states_inputs_and_units():
     rtol = 1e-6
     skate, start = Skate(), {"x_dot": 1.0}
     other = with_speeds(skate, ("y_dot",))
@@ -343,7 +343,7 @@ class Row(jk.System):
 
 
 @pytest.mark.slow
-def test_a_turn_depends_on_parameters_as_differences_say():
+def test_derivatives_of_a_steady_turn_agree_with_differences():
     rtol = 1e-7
 
     @jax.jit
@@ -360,7 +360,7 @@ def test_a_turn_depends_on_parameters_as_differences_say():
 
 
 @pytest.mark.slow
-def test_faults_of_a_family_are_named(beside_capsize):
+def test_invalid_families_raise_by_name(beside_capsize):
     with pytest.raises(ValueError, match=r"`towards` must be one name with .*; did you mean .steer."):
         family(BIKE, beside_capsize, towards={"speed": 1})
     with pytest.raises(ValueError, match="too many quantities are held"):

@@ -66,7 +66,7 @@ def ring(length, time):
 
 
 @pytest.mark.parametrize(("length", "time"), SCALES)
-def test_equilibrium_of_a_loop_at_any_scale(length, time):
+def test_equilibrium_of_a_loop_does_not_depend_on_the_units(length, time):
     """tan(angle) = k (rest - y) / (m g): the force is radial. The linear model has the same modes."""
     rtol = 1e-9
     at = equilibrium(ring(length, time), {"y": 0.1 * length, "x": 0.6 * length})
@@ -90,7 +90,7 @@ def scaled_bicycle(length):
 
 
 @pytest.mark.slow
-def test_a_model_of_a_bicycle_turns_as_the_bicycle_does():
+def test_steady_turns_of_a_scaled_bicycle_are_similar():
     """Lengths 1:100 and times 1:10: what was held is held, the wheels touch the ground, the steer is the same."""
     rtol = 1e-10
     turns = []
@@ -122,7 +122,7 @@ def test_steadiness_does_not_depend_on_the_period(period):
 
 
 @pytest.mark.slow
-def test_sizes_of_many_speeds_are_those_of_few(monkeypatch):
+def test_term_sizes_of_scalar_and_array_programs_agree(monkeypatch):
     """Above twelve speeds forces are projected in one program for each direction, and there is no NumPy."""
     system = jk.catalog.RotatingFrameAndBar()
     q, u, values = jnp.array([0.5, 0.8]), jnp.array([0.3, -0.2]), {k: jnp.ones(()) for k in system.inputs}
@@ -171,7 +171,7 @@ class MassOnSpring(jk.System):
         return jk.Force(-self.stiffness * (1.0 + self.growth * t) * q["x"] * motion.N.x, motion["mass"])
 
 
-def test_a_linear_model_has_the_time_of_its_motion():
+def test_a_linear_model_uses_the_time_of_its_steady_motion():
     system = MassOnSpring(growth=1.0)
     at = equilibrium(system, {"x": 0.1}, t=2.0)
     assert float(linearize(system, at).A[1, 0]) == pytest.approx(-3.0, rel=1e-14)
@@ -182,7 +182,7 @@ def test_a_linear_model_has_the_time_of_its_motion():
 
 @pytest.mark.slow_cases(all_but=["100000.0-10000000.0-10000.0"])
 @pytest.mark.parametrize(("length", "mass", "time"), [(1.0, 1.0, 1.0), (1e-6, 1e-9, 1e-3), (1e5, 1e7, 1e4)])
-def test_a_family_with_trim_at_any_scale(length, mass, time):
+def test_a_family_with_trim_does_not_depend_on_the_units(length, mass, time):
     """The torques that hold a pendulum from hanging to 1 rad: -m g l sin(angle) times 3/2 and 1/2 (uniform links)."""
     rtol = 1e-9
     system = jk.catalog.DoublePendulum(mass=mass, length=length, gravity=9.81 * length / time**2)
@@ -199,7 +199,7 @@ def test_a_family_with_trim_at_any_scale(length, mass, time):
 
 
 @pytest.mark.slow
-def test_a_force_to_be_found_that_is_zero_has_a_size():
+def test_a_trim_force_that_is_zero_is_found():
     """It alone balances one equation of a bracket, in which nothing else has a size; with times in units of 1e-9 s."""
     bracket = jk.catalog.Bracket(gravity=9.81e-18)
     names = bracket.coordinates
@@ -219,7 +219,7 @@ def cart(second):
 
 
 @pytest.mark.parametrize("second", [1e-9, 1e-4, 1.0, 1e3, 1e9])
-def test_a_regulator_at_any_scale(second):
+def test_a_regulator_does_not_depend_on_the_unit_of_time(second):
     rtol = 1e-9
     model, units = cart(1.0)
     K, P, poles = lqr(model, np.array([1.0, 2.0, 0.1, 0.1]), 0.5)
@@ -230,7 +230,7 @@ def test_a_regulator_at_any_scale(second):
     np.testing.assert_allclose(np.sort_complex(found[2] * second), np.sort_complex(poles), rtol=rtol)
 
 
-def test_a_riccati_equation_that_is_not_solved_is_an_error(monkeypatch):
+def test_an_unsolved_riccati_equation_raises(monkeypatch):
     import scipy.linalg
 
     model, _ = cart(1.0)
@@ -247,7 +247,7 @@ def test_a_riccati_equation_that_is_not_solved_is_an_error(monkeypatch):
         lqr(model, np.ones(4), 1.0)
 
 
-def test_numbers_that_are_not_finite_are_errors():
+def test_non_finite_numbers_raise():
     with pytest.raises(
         ValueError, match=r"straight_ahead\(WhippleBicycle\): the speed must be finite \[m/s\], got nan"
     ):
@@ -260,19 +260,19 @@ def test_numbers_that_are_not_finite_are_errors():
         steady_turn(BIKE, {}, {"rear_wheel_rate": -12.0}, hold={"yaw_rate": np.nan})
 
 
-def test_no_values_of_a_parameter_are_an_error():
+def test_an_empty_list_of_parameter_values_raises():
     with pytest.raises(ValueError, match=r"WhippleBicycle: `values` is empty\. Pass at least one"):
         jk.stability.eigenvalues(BIKE, np.zeros(0))
 
 
-def test_what_is_held_is_no_unknown():
+def test_held_quantities_are_not_unknowns():
     equations = _steady.SteadyEquations(BIKE, ("steer_torque",), ("roll", "rear_wheel_rate", "yaw_rate", "yaw"))
     assert equations.names == ("steer", "pitch", "roll_rate", "steer_rate", "steer_torque")
     assert equations.hold == ("yaw_rate",)
 
 
 @pytest.mark.slow
-def test_a_coordinate_that_changes_is_not_steady_under_a_trace():
+def test_a_changing_coordinate_is_not_steady_under_jit():
     """A mass that moves through the place of its spring's rest: no force acts."""
     model = jax.jit(lambda v: linearize(MassOnSpring(), jk.State(jnp.zeros(1), v)).A)
     assert np.isnan(model(jnp.array([0.1]))).all()

@@ -10,7 +10,7 @@ import jaxkane as jk
 N, O = jk.inertial()
 
 
-def test_components_that_are_known_stay_exact():
+def test_constant_components_remain_exact():
     B = N.rotate(3, jnp.array(0.3), jnp.array(2.0))
     assert B.z.components_in(N) == (0.0, 0.0, 1.0)
     assert B.x.dot(N.z) == 0.0
@@ -42,7 +42,7 @@ def test_numbers_of_any_kind_multiply_from_both_sides(factor):
         np.testing.assert_allclose(product.to(N), [3.0, 0.0, 0.0])
 
 
-def test_what_is_no_vector_algebra_is_refused():
+def test_invalid_vector_algebra_raises():
     with pytest.raises(TypeError, match=r"a\.dot"):
         N.x * N.y
     with pytest.raises(TypeError):
@@ -51,7 +51,7 @@ def test_what_is_no_vector_algebra_is_refused():
         jnp.ones(3) * N.x
 
 
-def test_inertial_frames_are_equal_but_frames_of_two_evaluations_do_not_meet():
+def test_frames_of_different_evaluations_cannot_be_combined():
     M, _ = jk.inertial()
     A, B = N.rotate(3, 0.3, 1.0), M.rotate(3, 0.3, 1.0)
     np.testing.assert_allclose((2.0 * A.x).dot(M.y), 2.0 * np.sin(0.3))
@@ -60,7 +60,7 @@ def test_inertial_frames_are_equal_but_frames_of_two_evaluations_do_not_meet():
         A.x.dot(B.y + B.x)
 
 
-def test_a_hinge_in_any_direction():
+def test_rotation_about_an_axis_in_any_direction():
     for axis, unit in enumerate((N.x, N.y, N.z), start=1):
         by_number, by_vector = N.rotate(axis, 0.6, 1.5), N.rotate(1.0 * unit, 0.6, 1.5)
         np.testing.assert_allclose(by_vector.matrix(N), by_number.matrix(N), atol=1e-15)
@@ -75,7 +75,7 @@ def test_a_hinge_in_any_direction():
         N.rotate(0, 0.1, 0.0)
 
 
-def test_two_point_one_point_and_differentiation_agree():
+def test_two_point_and_one_point_theorems_agree_with_differentiation():
     # A slider on a turning arm, said in three ways.
     angle, rate, s, s_dot = 0.8, 1.7, 0.4, -0.3
     B = N.rotate(3, angle, rate)
@@ -104,7 +104,7 @@ def test_orientation_given_as_a_function():
     np.testing.assert_allclose(given.angular_velocity.to(N), direct.angular_velocity.to(N), atol=1e-15)
 
 
-def test_a_point_fixed_by_a_vector_of_two_frames_needs_to_be_told_where():
+def test_a_point_fixed_by_a_vector_of_two_frames_requires_a_frame():
     B = N.rotate(1, 0.4, 1.0)
     with pytest.raises(ValueError, match="Pass the frame"):
         O.fixed(N.x + B.y)
@@ -119,7 +119,7 @@ def test_a_point_known_by_its_velocity_alone_has_no_position():
 
 
 @pytest.mark.parametrize("axis", [N.x + N.y, 2.0 * N.z, N.vector(jnp.array(1.0), 2.0, -0.5), -3.0 * N.x + 4.0 * N.y])
-def test_an_axis_of_any_length_turns_by_the_angle(axis):
+def test_the_length_of_an_axis_does_not_change_the_rotation(axis):
     unit = np.asarray(axis.to(N)) / np.linalg.norm(axis.to(N))
     K = np.array([[0, -unit[2], unit[1]], [unit[2], 0, -unit[0]], [-unit[1], unit[0], 0]])
     rodrigues = np.eye(3) + np.sin(0.6) * K + (1 - np.cos(0.6)) * K @ K  # takes components in B to components in N
@@ -128,7 +128,7 @@ def test_an_axis_of_any_length_turns_by_the_angle(axis):
     np.testing.assert_allclose(B.angular_velocity.to(N), 1.5 * unit, rtol=1e-14)
 
 
-def test_a_unit_axis_costs_nothing():
+def test_a_unit_axis_adds_no_operations():
     count = lambda axis: len(  # noqa: E731
         jax.make_jaxpr(lambda a, r: N.rotate(axis, a, r).angular_velocity.dot(N.rotate(3, a, r).y))(0.1, 0.2).eqns
     )
@@ -140,7 +140,7 @@ def test_a_unit_axis_costs_nothing():
     assert N.x.normalize() is N.x
 
 
-def test_an_axis_without_a_direction():
+def test_a_zero_axis_raises_or_gives_nan():
     with pytest.raises(ValueError, match="is zero, so it has no direction"):
         N.rotate(N.x - N.x, 0.1, 0.0)
     lost = N.rotate(N.vector(*jnp.zeros(3)), jnp.array(0.1), 1.0)  # an array is not known while it is traced
@@ -149,7 +149,7 @@ def test_an_axis_without_a_direction():
 
 
 @pytest.mark.slow
-def test_the_direction_of_an_axis_has_derivatives():
+def test_rotations_are_differentiable_by_the_direction_of_the_axis():
     def place(a):
         return N.rotate(N.vector(a, 1.0, 2.0), 0.7, 0.0).y.to(N)
 
@@ -170,7 +170,7 @@ def test_a_fixed_rotation_takes_euler_parameters_of_any_norm():
         N.rotate_euler((0.0, 0.0, 0.0, 0.0))
 
 
-def test_places_near_each_other_are_exact_far_from_the_origin():
+def test_relative_positions_are_exact_far_from_the_origin():
     """1e-15, a million kilometres away: from the last point that both were made from."""
     N, O = jk.inertial()
     away = O.fixed(1e9 * N.x)

@@ -65,7 +65,7 @@ def by_hand(pendulum, angle, rate):
 
 
 @pytest.mark.slow
-def test_it_is_one_program_of_scalars(pendulum):
+def test_a_system_with_a_learned_law_is_one_program_of_scalars(pendulum):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = jk.accelerations(pendulum, 0.0, [0.3], [2.0])
@@ -76,7 +76,7 @@ def test_it_is_one_program_of_scalars(pendulum):
 
 
 @pytest.mark.slow
-def test_its_derivative(pendulum):
+def test_derivatives_by_the_weights_of_a_learned_law(pendulum):
     def last(weight):
         law = eqx.tree_at(lambda law: law.layers[0].weight, pendulum.law.function, weight)
         return jk.simulate(Pendulum(law), START, ts[:11])["angle"][-1]
@@ -90,7 +90,7 @@ def test_its_derivative(pendulum):
 
 
 @pytest.mark.slow
-def test_a_law_is_learned_and_the_mass_stays_physical(pendulum):
+def test_a_learned_law_and_the_mass_are_identified_together(pendulum):
     true = jk.simulate(Rough(network(), mass=0.4), START, ts)
     noise = np.random.default_rng(0).normal(0.0, 1e-3, ts.size)
     trial = Trial(ts, {"angle": true["angle"] + noise}, sigma=1e-3, initial={"angle": 1.0, "rate": 0.5})
@@ -106,7 +106,7 @@ def test_a_law_is_learned_and_the_mass_stays_physical(pendulum):
     assert "weight" not in text
 
 
-def test_what_is_no_learned_function_is_named():
+def test_an_invalid_learned_function_raises_by_name():
     bare = type("Bare", (Pendulum,), {"__annotations__": {"law": Any}, "law": None})
     with pytest.raises(TypeError, match=r"law is a function.*such as a neural network, as `law: Any = jk.learned\(\)`"):
         bare(jnp.tanh)

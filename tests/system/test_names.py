@@ -28,7 +28,7 @@ def test_a_hint_is_short():
 
 
 @pytest.mark.slow
-def test_every_look_up_says_what_was_meant(ride):
+def test_every_lookup_of_a_misspelt_name_suggests_the_correct_one(ride):
     meant = "did you mean 'theta1'"
     state = jk.State([0.1, 0.2], [0.0, 0.0])
     lookups = [
@@ -58,7 +58,7 @@ class Undeclared(OnACircle):
 
 
 @pytest.mark.slow
-def test_dicts_wherever_coordinates_and_speeds_are_taken():
+def test_dicts_are_accepted_for_coordinates_and_speeds():
     circle, at, moving = OnACircle(), {"y": -0.8, "x": 0.6}, {"x_dot": 0.5}
     q, u = np.array([0.6, -0.8]), np.array([0.5])
     for function in (jk.accelerations, jk.equations_of_motion, jk.dependent_speeds, jk.constraint_forces):
@@ -74,12 +74,12 @@ def test_dicts_wherever_coordinates_and_speeds_are_taken():
     np.testing.assert_array_equal(model.A, jk.stability.linearize(PENDULUM, jk.State([0.0, 0.0], [0.0, 0.0])).A)
 
 
-def test_a_state_of_something_else_is_refused():
+def test_a_state_of_the_wrong_type_is_rejected():
     with pytest.raises(TypeError, match=r"state\.u must be an array of numbers, or a dict by name; got None"):
         jk.simulate(PENDULUM, jk.State([0.1, 0.2], None), TS)
 
 
-def test_a_dependent_coordinate_that_is_left_out_is_no_zero():
+def test_an_omitted_dependent_coordinate_is_rejected():
     circle, match = OnACircle(), r"OnACircle: q omits y.*jaxkane\.assemble"
     for evaluate in (
         lambda: jk.accelerations(circle, 0.0, {"x": 1.0}, {}),
@@ -96,7 +96,7 @@ def test_a_dependent_coordinate_that_is_left_out_is_no_zero():
         jk.accelerations(circle, 0.0, {"x": 0.6, "y": -0.8}, {"y_dot": 1.0})
 
 
-def test_what_is_left_out_and_violates_a_constraint_is_refused():
+def test_omitted_coordinates_that_violate_a_constraint_are_rejected():
     with pytest.raises(ValueError, match=r"Undeclared: with y omitted from q.*violated by \[-0\.64\]"):
         jk.accelerations(Undeclared(), 0.0, {"x": 0.6}, {})
     at = jax.jit(lambda x: jk.accelerations(Undeclared(), 0.0, {"y": x}, {"x_dot": 0.5}))
@@ -104,7 +104,7 @@ def test_what_is_left_out_and_violates_a_constraint_is_refused():
     assert np.isnan(at(0.9)).all()
 
 
-def test_a_state_of_traced_numbers_in_a_list():
+def test_a_state_can_be_a_list_of_traced_numbers():
     """As plain numbers in a list are taken; d q / d x = (1, 0), and a type of its own is kept."""
     q = lambda x: jk.State([x, 1], [0.0, 0.0]).q  # noqa: E731
     np.testing.assert_array_equal(jax.jit(jax.jacfwd(q))(0.3), [1.0, 0.0])
@@ -112,7 +112,7 @@ def test_a_state_of_traced_numbers_in_a_list():
 
 
 @pytest.mark.slow
-def test_a_description_that_is_mixed_in_reads_by_name():
+def test_a_mixin_class_can_read_by_name():
     class Spring:  # no System
         def loads(self, t, q, u, motion, inputs):
             return super().loads(t, q, u, motion, inputs), jk.Torque(-5.0 * q["theta1"] * motion.N.z, motion.bodies[0])
@@ -169,13 +169,13 @@ TRIAL_OF_A_BODY = jk.fit.Trial(T, {"omega1": 0.1 * T}, sigma=0.1)
 
 
 @pytest.mark.parametrize("ask", ONE_NAME.values(), ids=ONE_NAME)
-def test_one_name_alone_is_a_name_and_not_its_letters(ask, ride):
+def test_a_single_name_is_not_split_into_letters(ask, ride):
     with pytest.raises((ValueError, KeyError), match="wobble"):
         ask("wobble", ride)
 
 
 @pytest.mark.slow
-def test_one_name_alone_says_the_same_as_a_list_of_it():
+def test_a_single_name_is_equivalent_to_a_list_of_one_name():
     assert (
         _posed(zero_order_hold="shoulder_torque").model.zero_order_hold
         == _posed(zero_order_hold=["shoulder_torque"]).model.zero_order_hold
@@ -188,7 +188,7 @@ def test_one_name_alone_says_the_same_as_a_list_of_it():
     assert models[0].outputs == ("theta2",)
 
 
-def test_what_the_library_does_not_have_is_no_attribute():
+def test_an_unknown_attribute_of_the_module_raises():
     assert {"simulate", "animate", "fit"} <= set(dir(jk))
     with pytest.raises(AttributeError, match="module 'jaxkane' has no attribute 'simulated'"):
         _ = jk.simulated

@@ -16,7 +16,7 @@ SEQUENCES = ("3-2-1", "3-1-2", "3-1-3", "1-2-3")
 ALL_SEQUENCES = ["".join(s) for s in itertools.product("123", repeat=3) if s[0] != s[1] and s[1] != s[2]]
 
 
-def test_the_printed_matrix_of_the_bicycles_frame():
+def test_the_matrix_of_the_bicycle_frame_agrees_with_the_printed_one():
     # Example 7, [R_R2B], 3-1-2 angles psi, phi, theta
     (Sp, Sf, St), (Cp, Cf, Ct) = np.sin(ANGLES), np.cos(ANGLES)
     printed = [
@@ -74,7 +74,7 @@ def test_euler_parameters_are_scalar_last_and_map_to_the_body():
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-3, 0.0099, 0.0101, 2.0])
-def test_rotation_vectors_are_smooth_where_the_series_ends(angle):
+def test_rotation_vectors_are_smooth_at_the_limit_of_the_series(angle):
     vector = angle * np.array([2.0, -1.0, 2.0]) / 3.0
     e = jnp.stack(rotations.of_rotation_vector(jnp.asarray(vector)))
     np.testing.assert_allclose(e, Rotation.from_rotvec(vector).as_quat(), rtol=1e-14)

@@ -109,7 +109,7 @@ def test_load_cells_in_a_joint():
 
 
 @pytest.mark.slow
-def test_a_mounting_is_smooth_at_zero():
+def test_a_mounting_rotation_is_differentiable_at_zero():
     def matrix(r):
         N, _ = jk.inertial()
         return N.rotate_fixed(r).matrix(N)
@@ -175,7 +175,7 @@ def jk_values(names, now):
     return NamedVector([now[name] for name in names], names)
 
 
-def test_filters_are_their_transfer_functions():
+def test_filters_have_their_transfer_functions():
     still = jk.State([0.0], [0.0], jnp.zeros(6))
     model = linearize(Filtered(), still, outputs=("low pass", "butterworth", "pade 1", "pade 2"))
     s = 2j * np.pi * 1.3

@@ -63,7 +63,7 @@ def test_parameters_have_arrays_and_lists_as_defaults():
     ("info", "allowed"),
     [(ParameterInfo(True, ()), {0.5, 1.0, 2.0}), (ParameterInfo(False, (), "", (0.0, 1.0)), {0.0, 0.5, 1.0})],
 )
-def test_members_of_a_batch_may_be_what_one_number_may_be(info, allowed):
+def test_parameter_bounds_are_the_same_for_batch_members_and_single_values(info, allowed):
     numbers = np.array([-1.0, 0.0, 0.5, 1.0, 2.0, np.nan, np.inf])
     np.testing.assert_array_equal(info.allows(numbers), [x in allowed for x in numbers])
     for x in numbers:
@@ -72,7 +72,7 @@ def test_members_of_a_batch_may_be_what_one_number_may_be(info, allowed):
 
 
 @pytest.mark.parametrize("value", [4, True, "left", (1, 2)])
-def test_a_field_that_should_be_static_is_named_with_the_remedy(value):
+def test_a_field_that_must_be_static_raises_with_the_remedy(value):
     annotations = {"links": type(value)}
     Chain = type("Chain", (jk.System,), {"__annotations__": annotations})
     with pytest.raises(TypeError, match=r"Chain\.links = .*equinox\.field\(static=True\).*jk\.parameter"):
@@ -81,7 +81,7 @@ def test_a_field_that_should_be_static_is_named_with_the_remedy(value):
     assert Chain(value).links == value
 
 
-def test_values_by_name_and_their_arithmetic():
+def test_named_vectors_can_be_indexed_and_used_in_arithmetic():
     q = NamedVector([1.0, 2.0, 3.0, 4.0], ("x", "e1", "e2", "e3"))
     assert list(q["e1":"e3"]) == [2.0, 3.0, 4.0]
     assert q["e1":"e3"].names == ("e1", "e2", "e3")
@@ -170,7 +170,7 @@ class Wheel(jk.System):
 
 
 @pytest.mark.slow
-def test_one_moment_about_another_point():
+def test_a_single_moment_of_inertia_about_another_point():
     """M is the moment about the pin."""
     at = (0.0, [0.3], [0.5])
     np.testing.assert_allclose(jk.mass_matrix(Wheel(), *at), [[0.2]], rtol=1e-14)
@@ -180,7 +180,7 @@ def test_one_moment_about_another_point():
 
 
 @pytest.mark.slow
-def test_degrees_go_by_the_units_that_were_declared():
+def test_conversion_to_degrees_follows_the_declared_units():
     class Cart(jk.System):
         coordinates, speeds, inputs = ("q0", "q1"), ("u0", "u1"), ("push",)
         units = {"q0": "rad", "push": "N"}
@@ -205,7 +205,7 @@ def test_degrees_go_by_the_units_that_were_declared():
     plt.close("all")
 
 
-def test_a_sensor_sits_on_its_body_by_a_quaternion():
+def test_a_sensor_frame_can_be_mounted_by_a_quaternion():
     N, _ = jk.inertial()
     B = N.rotate(1, 0.5, 2.0)
     S = B.rotate_euler((0.0, 0.0, 0.6, 0.8))  # about z, by 2 atan(0.6 / 0.8): cosine 0.28, sine 0.96
@@ -214,7 +214,7 @@ def test_a_sensor_sits_on_its_body_by_a_quaternion():
 
 
 @pytest.mark.slow
-def test_the_pendulum_of_the_page_for_sympys_users_moves_as_sympys():
+def test_the_pendulum_of_the_sympy_page_agrees_with_sympy():
     """Figures: SymPy 1.14, `kane.mass_matrix.LUsolve(kane.forcing)` of the page at x = 0.6, vx = 0.5, m = 2, l = 1."""
     page = (Path(__file__).parents[2] / "docs" / "coming_from_sympy.md").read_text(encoding="utf-8")
     block = next(b for b in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class Bob" in b)
@@ -255,14 +255,14 @@ def test_a_torque_on_a_particle_is_refused(what):
         jk.accelerations(Slider(what), 0.0, [0.1, 0.2], [0.3, 0.4])
 
 
-def test_an_input_that_a_description_misspells_is_named_with_those_there_are():
+def test_a_misspelt_input_raises_with_the_available_names():
     misspelt = Slider(lambda motion, inputs: jk.Force(inputs["pusch"] * motion.N.x, motion["bead"]))
     with pytest.raises(KeyError, match="'pusch' in the inputs of Slider; did you mean 'push'"):
         jk.accelerations(misspelt, 0.0, [0.1, 0.2], [0.3, 0.4])
 
 
 @pytest.mark.parametrize("q", ["a", None, object()])
-def test_what_are_no_coordinates_is_refused_by_name(q):
+def test_invalid_coordinates_are_rejected_by_name(q):
     with pytest.raises((TypeError, ValueError), match=r"Slider: q must be 2 numbers \(x, angle\), got"):
         jk.accelerations(Slider(lambda motion, inputs: []), 0.0, q, [0.3, 0.4])
 
@@ -277,7 +277,7 @@ def test_what_are_no_coordinates_is_refused_by_name(q):
         (Slider(), [0.1, 0.2], {"push": [1.0, 2.0]}, "the input 'push' must be one number"),
     ],
 )
-def test_arguments_of_another_kind_are_refused_by_name(system, q, inputs, words):
+def test_arguments_of_the_wrong_type_are_rejected_by_name(system, q, inputs, words):
     with pytest.raises(TypeError, match=re.escape(words)):
         jk.accelerations(system, 0.0, q, [0.3, 0.4], inputs)
 
@@ -299,7 +299,7 @@ N, O = jk.inertial()
         (lambda: jk.Body(1.0, 0.0, O, about=O.fixed(N.x), name="wheel"), "'wheel' has an inertia, but no frame"),
     ],
 )
-def test_what_is_no_vector_frame_or_point_is_refused_in_words(call, words):
+def test_objects_that_are_not_vectors_frames_or_points_raise(call, words):
     with pytest.raises((TypeError, ValueError), match=re.escape(words)):
         call()
 
@@ -313,6 +313,6 @@ def test_what_is_no_vector_frame_or_point_is_refused_in_words(call, words):
         lambda s: jk.stability.equilibrium(s),
     ],
 )
-def test_one_instant_refuses_a_batch_of_systems_by_its_name(ask):
+def test_functions_at_one_instant_reject_a_batch_of_systems_by_name(ask):
     with pytest.raises(ValueError, match=r"DoublePendulum: mass has more axes than declared.*jax.vmap"):
         ask(jk.catalog.DoublePendulum(mass=np.array([1.0, 2.0])))
