@@ -192,7 +192,7 @@ def test_wrong_phases():
 BICYCLE = jk.catalog.WhippleBicycle.benchmark()
 
 
-def test_ends_that_say_the_same_twice_are_refused():
+def test_redundant_boundary_conditions_are_rejected():
     """A pitch that does not belong to roll and steer was once reached by the discretization error."""
     rod = RodOnPin(length=1.0)
     for system, end, message in (
@@ -209,7 +209,7 @@ def test_ends_that_say_the_same_twice_are_refused():
 
 
 @pytest.mark.slow
-def test_a_problem_without_a_solution_names_its_constraints():
+def test_an_infeasible_problem_reports_its_violated_constraints():
     plan = solved(controls={"force": (-1.0, 1.0)})
     assert not plan.ok
     assert "contradict" in plan.reason
@@ -221,7 +221,7 @@ def test_a_problem_without_a_solution_names_its_constraints():
     assert np.all(np.isfinite(plan["x"]))
 
 
-def test_a_derivative_that_is_not_finite_is_named():
+def test_a_derivative_that_is_not_finite_is_reported():
     plan = solved(cost=lambda t, now: jnp.sqrt(now["force"] ** 2))
     assert not plan.ok
     assert plan.reason == "the derivative of `cost` is not finite at the last iterate"

@@ -28,7 +28,7 @@ FASTEST = Problem(
 
 @pytest.mark.slow_cases(all_but=["Cyipopt"])
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
-def test_all_solvers_find_the_same_plan(solver):
+def test_all_solvers_converge_to_the_same_plan(solver):
     """2.05 s without the error of four intervals. A place that is farther by 1 m costs 1.25 s at the speed limit."""
     atol = 1e-5
     plan = solve(FASTEST, intervals=4, solver=solver, tolerance=None)
@@ -153,7 +153,7 @@ def test_progress_is_shown_on_one_line(capsys):
     assert shown.err.count("\n") == 1
 
 
-def test_default_without_ipopt_is_named(monkeypatch):
+def test_the_default_solver_without_ipopt_is_reported(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.warns(UserWarning, match=r"pip install jaxkane\[collocation\]"):
         assert isinstance(default_solver(), TrustConstr)

@@ -88,7 +88,7 @@ def test_polynomials_between_the_nodes(plan):
         plan["force_x"]
 
 
-def test_two_phases_are_one_motion(plan, joined):
+def test_two_phases_equal_one_phase(plan, joined):
     rtol = 1e-6
     assert joined.ok
     assert joined.cost == pytest.approx(plan.cost, rel=rtol)
@@ -187,7 +187,7 @@ def test_continuation():
 
 
 @pytest.mark.slow
-def test_names_that_variables_and_conditions_share():
+def test_conditions_may_share_names_with_variables():
     plan = solve(
         Problem(
             Sled(), 1.0, controls=["force"], cost=effort, start=ENDS["start"],

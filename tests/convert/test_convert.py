@@ -39,7 +39,7 @@ def mjcf(body, rest=""):
 
 @pytest.mark.slow
 @needs_mujoco
-def test_a_file_is_the_tree_that_stands_in_it():
+def test_an_imported_kinematic_tree_agrees_with_mujoco():
     system = jk.convert.from_mjcf(FIGURES["model"], strict=True)  # nothing is left out
     assert type(system).__name__ == "tree"
     assert set(system.mass) == {"base", "arm", "hand", "plate", "leg"}
@@ -51,7 +51,7 @@ def test_a_file_is_the_tree_that_stands_in_it():
 
 
 @needs_mujoco
-def test_a_file_is_read_by_its_path_and_sites_are_points(tmp_path):
+def test_a_file_is_read_from_its_path_and_sites_become_points(tmp_path):
     path = tmp_path / "tree.xml"
     path.write_text(FIGURES["model"])
     system = jk.convert.from_mjcf(path)
@@ -70,7 +70,7 @@ def test_a_file_is_read_by_its_path_and_sites_are_points(tmp_path):
 
 
 @needs_mujoco
-def test_a_loop_is_closed_rigidly():
+def test_accelerations_of_a_closed_loop_agree_with_mujoco():
     import mujoco
 
     system = jk.convert.from_mjcf(LOOP, dependent=("j2", "j3"))
@@ -110,7 +110,7 @@ def test_a_loop_is_closed_rigidly():
         '<weld site1="s" site2="s2"/>',
     ],
 )
-def test_a_loop_is_closed_where_the_file_places_its_bodies(equality):
+def test_a_loop_is_closed_at_the_poses_of_the_file(equality):
     """At qpos0 the bodies meet every equality, as MuJoCo's compiler makes it."""
     import mujoco
 
@@ -132,7 +132,7 @@ def test_a_loop_is_closed_where_the_file_places_its_bodies(equality):
 
 @pytest.mark.slow
 @needs_mujoco
-def test_joints_that_follow_others():
+def test_joint_equalities_become_dependent_coordinates():
     degree = '<equality><joint joint1="k" joint2="j" polycoef="0 2 0.5 0 0"/></equality>'
     two = BODY.format("") + BODY.replace('"a"', '"b"').replace('"j"', '"k"').format("")
     text = mjcf(two, "<option><flag contact='disable'/></option>" + degree)
@@ -147,7 +147,7 @@ def test_joints_that_follow_others():
 
 
 @needs_mujoco
-def test_what_is_left_out_is_said():
+def test_omitted_elements_are_reported():
     text = mjcf(
         '<geom type="plane" size="1 1 1"/>' + BODY.format(' range="-90 90" frictionloss="0.1"'),
         '<option density="1.2"/><actuator><muscle name="m" joint="j"/><motor name="T" joint="j" ctrlrange="-1 1"/>'
@@ -205,7 +205,7 @@ def test_a_limit_of_a_joint_is_a_contact():
 
 
 @needs_mujoco
-def test_which_limits_become_contacts():
+def test_only_the_limits_in_stops_become_contacts():
     limited = BODY.format(' range="-9 9"').replace("<geom ", '<geom contype="0" ')
     three = "".join(limited.replace('"a"', f'"{name}"').replace('"j"', f'"{name}"') for name in "klm")
     with pytest.raises(ValueError, match=r"6 contacts.* k, l, m. At most 4 are possible. Name fewer joints in `stops`"):
@@ -225,7 +225,7 @@ def test_which_limits_become_contacts():
 
 
 @needs_mujoco
-def test_groups_of_actuators_that_are_switched_off_are_off():
+def test_disabled_groups_of_actuators_are_omitted():
     motors = "".join(f'<motor name="m{i}" joint="j" group="{i}"/>' for i in (0, 2, 3))
     off = '<option actuatorgroupdisable="0 3"><flag contact="disable"/></option>'
     system = jk.convert.from_mjcf(mjcf(BODY.format(""), f"{off}<actuator>{motors}</actuator>"), strict=True)
@@ -233,7 +233,7 @@ def test_groups_of_actuators_that_are_switched_off_are_off():
 
 
 @needs_mujoco
-def test_limits_of_what_actuators_do_to_a_joint_are_said():
+def test_limits_of_actuator_forces_on_a_joint_are_reported():
     limited = BODY.format(' actuatorfrcrange="-0.1 0.1" actuatorfrclimited="true"').replace(
         "<geom ", '<geom contype="0" '
     )
@@ -244,7 +244,7 @@ def test_limits_of_what_actuators_do_to_a_joint_are_said():
 
 @needs_mujoco
 @pytest.mark.parametrize(("first", "second"), [("j_1", "j.1"), ("j.1", "j_1")])
-def test_two_names_that_become_one_are_refused(first, second):
+def test_names_that_become_identical_are_rejected(first, second):
     links = f"""<body name="a"><joint name="{first}" axis="0 1 0"/><geom size=".1"/>
       <body><joint name="{second}" axis="0 1 0"/><geom size=".1"/></body></body>"""
     with pytest.raises(ValueError, match=f"the joints '{first}' and '{second}' would both be 'j_1'"):
@@ -255,7 +255,7 @@ def test_two_names_that_become_one_are_refused(first, second):
 
 
 @needs_mujoco
-def test_a_name_of_the_file_is_not_given_to_what_has_none():
+def test_generated_names_do_not_duplicate_names_of_the_file():
     body = '<body><joint axis="0 1 0"/><geom size=".1" contype="0"/>{}</body>'
     named = body.replace("<joint", '<joint name="joint0"')
     system = jk.convert.from_mjcf(mjcf(body.format(named)))
@@ -275,7 +275,7 @@ def test_friction_of_joints_becomes_dry_friction():
 
 
 @needs_mujoco
-def test_names_that_clash_or_are_missing():
+def test_conflicting_and_missing_names_are_replaced():
     off = "<option><flag contact='disable'/></option>"
     text = mjcf(
         '<body name="left foot.1"><joint axis="0 1 0"/><geom size=".1"/><site name="left foot.1"/>'
@@ -291,7 +291,7 @@ def test_names_that_clash_or_are_missing():
 
 
 @needs_mujoco
-def test_degrees_are_those_of_the_file():
+def test_angles_use_the_unit_of_the_file():
     off = "<option><flag contact='disable'/></option>"
     spring = BODY.format(' stiffness="2" springref="30"')
     in_degrees, in_radians = (
@@ -311,13 +311,13 @@ def test_degrees_are_those_of_the_file():
         (mjcf('<body><joint/><geom type="mesh" mesh="m"/></body>'), "cannot read.*mesh"),
     ],
 )
-def test_a_file_that_is_no_mechanism(text, words):
+def test_a_file_that_is_not_a_mechanism_is_rejected(text, words):
     with pytest.raises(ValueError, match=words):
         jk.convert.from_mjcf(text)
 
 
 @needs_mujoco
-def test_what_a_file_switches_off_is_off():
+def test_elements_disabled_by_flags_are_omitted():
     two = BODY.format(' stiffness="2" damping="1"') + BODY.replace('"a"', '"b"').replace('"j"', '"k"').format("")
     rest = '<equality><joint joint1="k" joint2="j"/></equality><actuator><motor joint="j"/></actuator>'
     flags = " ".join(f'{what}="disable"' for what in "contact gravity spring damper actuation equality".split())
@@ -335,14 +335,14 @@ def test_what_a_file_switches_off_is_off():
 
 
 @needs_mujoco
-def test_a_file_that_is_not_there():
+def test_a_missing_file_is_reported():
     with pytest.raises(FileNotFoundError, match=r"'nowhere.xml' does not exist"):
         jk.convert.from_mjcf("nowhere.xml")
 
 
 @pytest.mark.slow
 @needs_mujoco
-def test_a_mass_that_was_brought_over_has_a_derivative():
+def test_accelerations_can_be_differentiated_by_an_imported_mass():
     system = jk.convert.from_mjcf(FIGURES["model"])
     q, u = (jnp.array(FIGURES["states"][0][x]) for x in ("q", "u"))
     alpha = lambda m: jk.accelerations(system.replace({"mass.hand": m}), 0.0, q, u)[6]  # noqa: E731
@@ -350,7 +350,7 @@ def test_a_mass_that_was_brought_over_has_a_derivative():
     np.testing.assert_allclose(slope, (alpha(1.4 + 1e-5) - alpha(1.4 - 1e-5)) / 2e-5, rtol=1e-6)
 
 
-def test_without_mujoco_the_remedy_is_named(monkeypatch):
+def test_the_error_without_mujoco_states_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ImportError, match="pip install mujoco"):
         jk.convert.from_mjcf("<mujoco/>")
@@ -368,7 +368,7 @@ TRUSS = """<mujoco model="truss"><option><flag contact="disable"/></option><worl
 
 
 @needs_mujoco
-def test_poses_of_a_file_and_a_residual_that_nearly_depends_on_the_others():
+def test_poses_of_a_file_and_nearly_redundant_loop_constraints():
     """An axis of five digits: the residual normal to the plane would lock the loop."""
     with pytest.warns(UserWarning, match=r"Loop\('pin_1', 'pin_2'\) \(.*\).*") as told:
         system = jk.convert.from_mjcf(TRUSS, pose="bent", independent=["j2"])

@@ -100,7 +100,7 @@ def rates_of(lagrange, values, system, q, u):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
-def test_a_lagrangian_alone_accelerates_as_in_sympy(name):
+def test_accelerations_of_a_lagrangian_without_bodies_agree_with_sympy(name):
     lagrange, values, system = brought(name)
     q = np.linspace(0.4, 0.9, len(lagrange.q))
     u = np.linspace(0.5, -0.8, len(system.speeds))
@@ -118,7 +118,7 @@ def test_a_lagrangian_alone_accelerates_as_in_sympy(name):
 
 
 @pytest.mark.slow
-def test_its_energy_is_half_u_M_u_and_is_kept():
+def test_the_kinetic_energy_is_half_u_M_u_and_energy_is_conserved():
     _, values, system = brought("elastic_pendulum")
     kinetic = values["m"] * (0.3**2 + 0.8**2 * 0.5**2) / 2
     np.testing.assert_allclose(jk.kinetic_energy(system, 0.0, [0.8, 0.4], [0.3, 0.5]), kinetic, rtol=1e-14)
@@ -132,7 +132,7 @@ def test_its_energy_is_half_u_M_u_and_is_kept():
 
 
 @pytest.mark.slow
-def test_it_is_a_system_as_any_other():
+def test_an_imported_lagrangian_is_differentiable():
     _, _, system = brought("double_pendulum")
     q, u = jnp.array([0.3, -0.5]), jnp.array([0.6, 0.2])
     of = lambda l: jk.accelerations(dataclasses.replace(system, l=l), 0.0, q, u)  # noqa: E731
@@ -149,7 +149,7 @@ def test_it_is_a_system_as_any_other():
 
 
 @pytest.mark.slow
-def test_a_mass_matrix_that_is_not_positive_is_no_number():
+def test_accelerations_are_nan_if_the_mass_matrix_is_not_positive_definite():
     L = m * x.diff() ** 2 / 2 + k * x.diff() * a.diff() + m * a.diff() ** 2 / 2 - g * x
     system = jk.convert.from_sympy(me.LagrangesMethod(L, [x, a]), {"m": 1.0, "k": 2.0, "g": 9.81})
     at = jnp.array([0.1, 0.2])
@@ -158,7 +158,7 @@ def test_a_mass_matrix_that_is_not_positive_is_no_number():
         jk.accelerations(system, 0.0, at, 0.0 * at)
 
 
-def test_what_a_lagrangian_does_not_say_is_named():
+def test_incomplete_or_unsupported_lagrangians_are_rejected():
     kinetic = m * x.diff() ** 2 / 2
     N, P, f = me.ReferenceFrame("N"), me.Point("P"), me.dynamicsymbols("f")
     bring = lambda L, origin=None, **more: jk.convert.from_sympy(  # noqa: E731

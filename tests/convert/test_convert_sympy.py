@@ -152,7 +152,7 @@ def brought(me, model, **more):
 
 @pytest.mark.slow_cases(all_but=["one_dof_spring_mass_damper"])
 @pytest.mark.parametrize("name", MODELS)
-def test_a_model_accelerates_as_in_sympy(me, name):
+def test_accelerations_of_an_imported_model_agree_with_sympy(me, name):
     system = brought(me, name)
     speeds = (*system.speeds, *system.dependent_speeds)
     for state in FIGURES[name]["states"]:
@@ -166,7 +166,7 @@ def test_a_model_accelerates_as_in_sympy(me, name):
 
 
 @pytest.mark.slow
-def test_a_model_is_a_system_as_any_other(me):
+def test_an_imported_model_supports_the_functions_of_a_system(me):
     system = brought(me, "n_link_pendulum_on_cart_n3", name="Cart")
     again = brought(me, "n_link_pendulum_on_cart_n3", name="Cart")
     assert type(system) is type(again)  # one model, one class
@@ -197,7 +197,7 @@ def double_pendulum(me, sm):
 
 
 @pytest.mark.slow
-def test_a_lagrangian_with_bodies_accelerates_as_in_sympy(me):
+def test_accelerations_of_a_lagrangian_with_bodies_agree_with_sympy(me):
     import sympy as sm
 
     lagrange, O = double_pendulum(me, sm)
@@ -219,7 +219,7 @@ def test_a_lagrangian_with_bodies_accelerates_as_in_sympy(me):
     np.testing.assert_allclose(place, [0.7 * (np.cos(0.3) + np.cos(0.4)), 0.7 * (np.sin(0.3) + np.sin(0.4)), 0.0])
 
 
-def test_what_is_prescribed_in_time_is_an_expression_of_time(me):
+def test_a_model_with_explicit_time_dependence(me):
     import sympy as sm
 
     q, u, t = *me.dynamicsymbols("q u"), me.dynamicsymbols._t
@@ -295,7 +295,7 @@ def test_a_lagrangian_with_a_prescribed_motion(me):
     np.testing.assert_allclose(jk.accelerations(system, 0.4, [0.3], [0.2]), [expected], rtol=RTOL)
 
 
-def test_what_a_model_does_not_say_is_named(me):
+def test_missing_values_and_unknown_symbols_are_rejected(me):
     import sympy as sm
 
     params = FIGURES["rolling_disc_minimal"]["params"]
@@ -330,7 +330,7 @@ def test_what_a_model_does_not_say_is_named(me):
 
 
 @pytest.mark.slow
-def test_functions_are_those_of_sympy_or_refused_by_name(me):
+def test_unsupported_sympy_functions_are_rejected(me):
     import sympy as sm
 
     q, u, m = *me.dynamicsymbols("q u"), sm.symbols("m")
@@ -353,14 +353,14 @@ def test_functions_are_those_of_sympy_or_refused_by_name(me):
             jk.convert.from_sympy(make(bad), {m: 1.0})
 
 
-def test_without_sympy_the_remedy_is_named(monkeypatch):
+def test_the_error_without_sympy_states_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "sympy", None)
     with pytest.raises(ImportError, match="pip install sympy"):
         jk.convert.from_sympy(None, {})
 
 
 @pytest.mark.slow
-def test_the_page_on_bringing_models_runs(me):
+def test_the_code_of_the_page_on_importing_models_runs(me):
     pytest.importorskip("mujoco")
     page = (Path(__file__).parents[2] / "docs" / "bringing_models.md").read_text(encoding="utf-8")
     names = {}

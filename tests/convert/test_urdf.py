@@ -40,7 +40,7 @@ def without_mujoco(monkeypatch, request):
 
 
 @pytest.mark.slow
-def test_a_urdf_moves_as_in_mujoco(tmp_path, monkeypatch):
+def test_an_imported_urdf_agrees_with_mujoco(tmp_path, monkeypatch):
     mujoco = pytest.importorskip("mujoco")
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
     text = robot(
@@ -72,7 +72,7 @@ def test_a_urdf_moves_as_in_mujoco(tmp_path, monkeypatch):
     np.testing.assert_allclose(tool, data.body("tool").xpos, rtol=RTOL)
 
 
-def test_links_that_are_fixed_together_become_one_body():
+def test_links_with_fixed_joints_become_one_body():
     """Inertia about the common mass centre: I1 + I2 + m1 m2 / (m1 + m2) (d.d 1 - d d)."""
     text = robot(
         link("base"),
@@ -94,7 +94,7 @@ def test_links_that_are_fixed_together_become_one_body():
     np.testing.assert_allclose(center, (2.0 * first + 0.5 * second) / 2.5, rtol=1e-13)
 
 
-def test_a_massless_root_and_the_link_that_has_its_mass():
+def test_a_massless_root_link_is_merged_with_its_fixed_child():
     text = robot(link("base"), link("trunk", 3.0), joint("f", "base", "trunk", "fixed", origin='xyz="0 0 0.5"'))
     system = jk.convert.from_urdf(text, floating=True)
     assert dict(system.mass) == {"trunk": 3.0}
@@ -123,7 +123,7 @@ def test_planar_and_floating_joints():
 
 
 @pytest.mark.slow
-def test_mimics_of_mimics_and_joints_that_move_no_mass():
+def test_nested_mimic_joints_and_joints_without_mass():
     mimic = '<mimic joint="{}" multiplier="{}" offset="{}"/>'
     text = robot(
         link("base"),
@@ -177,7 +177,7 @@ def further(moments):
     return robot(*TWO, link("b", 1.0, moments), joint("jb", "a", "b", axis="0 1 0"))
 
 
-def test_an_excess_of_rounding_is_accepted_and_one_of_measurement_is_reported(recwarn):
+def test_small_violations_of_the_inertia_inequality_are_accepted_or_reported(recwarn):
     jk.convert.from_urdf(further((0.1, 0.1, 0.2003)))
     assert not recwarn
     with pytest.warns(UserWarning, match=r"r: inertias of the file:\n  b: principal moments 0.1, 0.1, 0.205 .*2.4 %"):
@@ -205,7 +205,7 @@ def test_impossible_inertias_are_refused_or_replaced(moments):
         jk.convert.from_urdf(further(moments), inertias="ignore")
 
 
-def test_inertias_that_do_not_affect_the_motion_are_not_refused():
+def test_impossible_inertias_without_effect_are_accepted():
     """A link that turns about one axis keeps its moment about this axis; one that only slides has no inertia."""
     parts = link("b", 1.0, (0.1, 0.1, 0.5)), joint("jb", "a", "b", axis="1 0 0", origin='rpy="0.4 0 0"')
     with pytest.warns(UserWarning, match="only its moment about the axis"):
@@ -219,7 +219,7 @@ def test_inertias_that_do_not_affect_the_motion_are_not_refused():
     assert set(jk.convert.from_urdf(on_ground, strict=True).mass) == {"arm"}
 
 
-def test_rounding_errors_are_not_inertias_and_a_file_may_ask_for_balance():
+def test_rounded_zero_inertias_are_omitted_and_balanceinertia_is_applied():
     text = robot(*TWO, link("b", 1.0, (-5e-20, -5e-20, 0.0)), joint("jb", "a", "b", axis="0 1 0", origin='xyz="0 1 0"'))
     assert "b" not in jk.convert.from_urdf(text, strict=True).inertia
     balanced = further((0.1, 0.1, 0.4)).replace(
@@ -275,12 +275,12 @@ MIMIC = ONE.replace("</joint>", '<mimic joint="{}"/></joint>')
         (MIMIC.format("j"), "the joints j mimic each other in a circle"),
     ],
 )
-def test_a_file_that_is_not_a_robot_is_refused_by_name(text, words):
+def test_a_file_that_is_not_a_robot_is_rejected(text, words):
     with pytest.raises(ValueError, match=words):
         jk.convert.from_urdf(text)
 
 
-def test_meshes_comments_and_extensions_are_not_read():
+def test_meshes_comments_and_extensions_are_ignored():
     """Meshes need not exist, and a comment may contain a macro."""
     shape = '<visual><geometry><mesh filename="package://nowhere/a.stl"/></geometry></visual></link>'
     extension = "<!-- <xacro:leg/> ${x} --><drake:group name='g'/></robot>"
@@ -291,7 +291,7 @@ def test_meshes_comments_and_extensions_are_not_read():
         jk.convert.from_urdf("\ufeff\n" + text)
 
 
-def test_files_and_names(tmp_path):
+def test_a_urdf_file_is_read_and_its_names_are_converted(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text("\ufeff" + ONE.replace('"arm"', '"fore.arm"'), encoding="utf-8")
     assert set(jk.convert.from_urdf(path).mass) == {"fore_arm"}

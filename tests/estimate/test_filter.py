@@ -62,7 +62,7 @@ def of_cart(method, **options):
 
 
 @ONE_QUICKLY
-def test_of_a_linear_motion_it_is_kalmans(method):
+def test_the_filter_of_a_linear_system_equals_the_kalman_filter(method):
     tolerance = 1e-8  # of the integration
     filter, belief = of_cart(method)
     ys = measured(8)
@@ -77,7 +77,7 @@ def test_of_a_linear_motion_it_is_kalmans(method):
 
 @pytest.mark.slow
 @ONE_QUICKLY
-def test_states_before_are_smoothed_and_late_measurements_find_theirs(method):
+def test_fixed_lag_smoothing_and_late_measurements(method):
     """Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems, 1965."""
     tolerance, lag = 1e-8, 3
     filter, first = of_cart(method, lag=lag)
@@ -174,7 +174,7 @@ def by_hand(method, m, P, torque, y, h, density, sigma, drift):
 
 @pytest.mark.slow
 @METHODS
-def test_of_a_pendulum_it_is_the_filter_by_hand(method):
+def test_the_filter_of_a_pendulum_equals_a_reference_implementation(method):
     tolerance = 1e-10
     h, density, drift, sigma = 0.05, 0.01, 0.02, {"rate": 0.05, "height": 0.01}
     filter = Filter(Pendulum(), sigma, noise={"rate": density}, drift={"pull": drift}, method=method)
@@ -212,7 +212,7 @@ MORE = {"lag": 2, "noise": {"torque": 1e-24, "rate": 0.01}}
 
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [MORE, pytest.param({"lag": 20}, marks=pytest.mark.slow)])
-def test_the_present_does_not_depend_on_states_that_are_kept_nor_on_noise_that_is_negligible(options):
+def test_the_lag_and_negligible_noise_do_not_change_the_current_estimate(options):
     tolerance = 1e-10
     first, other = last_of(*of_pendulum()), last_of(*of_pendulum(**options))
     np.testing.assert_allclose(other.mean[0], first.mean[0], atol=tolerance)
@@ -220,7 +220,7 @@ def test_the_present_does_not_depend_on_states_that_are_kept_nor_on_noise_that_i
 
 
 @pytest.mark.slow
-def test_a_known_coordinate_and_units_change_no_unscented_estimate():
+def test_unscented_estimates_do_not_depend_on_the_covariance_root():
     """A covariance without full rank has no triangle of its own; its symmetric root does not depend on rounding."""
     filter, belief = of_pendulum(lag=1, drift={"pull": 0.0, "damping": 0.0})
     belief = dataclasses.replace(belief, root=belief.root.at[:, 2:].set(0.0))  # both parameters are known
@@ -260,7 +260,7 @@ def test_moments_of_a_function_have_exact_derivatives(rank):
 
 @pytest.mark.slow_cases("3")
 @pytest.mark.parametrize("rank", [3, 2])
-def test_moments_of_a_function_are_those_of_points(rank):
+def test_moments_of_a_function_equal_those_of_sigma_points(rank):
     rng, amplitude = np.random.default_rng(2), jnp.array([0.3, 0.2])
     m, S = rng.normal(size=3), rng.normal(size=(3, rank)) @ rng.normal(size=(rank, 5))
     S[2] *= 1e-6  # another unit
@@ -299,7 +299,7 @@ def test_derivatives_of_smoothed_and_late_states_are_exact(method):
 
 @pytest.mark.slow
 @ONE_QUICKLY
-def test_a_closed_loop_is_filtered_as_well_in_any_unit(method):
+def test_filtering_of_a_closed_loop_does_not_depend_on_units(method):
     """The slider's place in metres, in units of 3.3 cm, and in metres where the crank is 30 m long."""
     truth = jk.simulate(CrankAlone(), jk.State(jnp.array([0.52]), jnp.array([0.4])), np.arange(0.0, 1.45, 0.05))
     ys = np.asarray(truth["ratio"])[1:] + np.random.default_rng(0).normal(0.0, 0.02, 28)
@@ -332,7 +332,7 @@ def test_a_closed_loop_is_filtered_as_well_in_any_unit(method):
 
 
 @pytest.mark.slow
-def test_deviations_at_the_start_meet_the_constraints():
+def test_initial_standard_deviations_satisfy_the_constraints():
     """Of a point on a circle: y follows from x; if both are given, both are known independently of each other."""
     x, y, a, b = 0.6, 0.8, 0.1, 0.05
     filter, state = Filter(OnACircle(), {"x": 0.1}), jk.State(jnp.array([x, y]), jnp.array([0.0]))
@@ -344,7 +344,7 @@ def test_deviations_at_the_start_meet_the_constraints():
 
 
 @pytest.mark.slow
-def test_it_runs_in_loops_batches_and_derivatives():
+def test_the_filter_runs_in_scan_vmap_and_grad():
     filter = Filter(Pendulum(), {"rate": 0.05}, noise={"torque": 0.01}, drift={"pull": 0.0})
     belief = begin(filter, jk.State(jnp.array([0.8]), jnp.array([-0.3])), {"angle": 0.1, "pull": 1.0})
     ys = jnp.asarray(np.random.default_rng(1).normal(-0.5, 0.1, (2, 4, 1)))
@@ -367,7 +367,7 @@ def test_it_runs_in_loops_batches_and_derivatives():
 
 
 @pytest.mark.slow
-def test_nothing_happens_in_no_time_and_without_measurements():
+def test_zero_time_steps_and_missing_measurements_change_nothing():
     filter = Filter(Pendulum(), {"rate": 0.05}, noise={"rate": 0.01}, lag=1)
     belief = begin(filter, jk.State(jnp.array([0.8]), jnp.array([-0.3])), {"angle": 0.1})
     still = predict(filter, belief, 0.0)
@@ -414,7 +414,7 @@ def test_the_filter_is_consistent(method):
 
 @pytest.mark.slow
 @METHODS
-def test_a_parameter_is_found_on_the_way(method):
+def test_a_parameter_is_estimated_by_the_filter(method):
     system, ts = jk.catalog.DoublePendulum(mass=1.0, length=1.0), np.arange(0.0, 10.0, 0.02)
     start = jk.State(jnp.array([1.0, -0.5]), jnp.zeros(2))
     ride = jk.simulate(system, start, ts)
@@ -431,7 +431,7 @@ def test_a_parameter_is_found_on_the_way(method):
 
 
 @pytest.mark.slow
-def test_constraints_are_kept():
+def test_filter_estimates_satisfy_the_constraints():
     """The rear wheel's contact and the front's: roll, steer and pitch depend on one another."""
     bicycle = jk.catalog.WhippleBicycle.benchmark()
     start = jk.assemble(bicycle, {"roll": 0.05, "steer": 0.1}, {"roll_rate": 0.5, "rear_wheel_rate": -4.6 / 0.3})
@@ -472,12 +472,12 @@ def test_constraints_are_kept():
         ({"rate": 0.1}, {"substeps": 0}, "`substeps` must be an integer of at least 1"),
     ],
 )
-def test_what_is_no_filter_is_named(sensors, options, message):
+def test_invalid_filter_options_are_rejected(sensors, options, message):
     with pytest.raises(ValueError, match=message):
         Filter(Pendulum(), sensors, **options)
 
 
-def test_what_is_no_measurement_is_named():
+def test_invalid_sensors_and_measurements_are_rejected():
     with pytest.raises(TypeError, match=r"`sensors` must be a dict of numbers by name, got \['rate'\]"):
         Filter(Pendulum(), ["rate"])
     filter = Filter(Pendulum(), {"rate": 0.1})
@@ -497,7 +497,7 @@ def test_what_is_no_measurement_is_named():
         predict(filter, belief, 0.1, {"torqe": 1.0})
 
 
-def test_numbers_that_no_filter_can_use_are_named():
+def test_invalid_numbers_are_rejected():
     filter = Filter(Pendulum(), {"rate": 0.1})
     state = jk.State(jnp.array([0.8]), jnp.array([-0.3]))
     belief = begin(filter, state, {"angle": 0.1})
@@ -521,7 +521,7 @@ def test_numbers_that_no_filter_can_use_are_named():
         jax.jit(lambda x: Filter(Pendulum(), {"rate": x}).sigma)(1.0)
 
 
-def test_beliefs_and_truths_of_something_else_are_named():
+def test_beliefs_and_true_states_of_another_filter_are_rejected():
     filter, late = Filter(Pendulum(), {"rate": 0.1}), Filter(Pendulum(), {"rate": 0.1}, lag=2)
     state = jk.State(jnp.array([0.8]), jnp.array([-0.3]))
     belief, other = begin(filter, state, {"angle": 0.1}), begin(late, state, {"angle": 0.1})
@@ -543,7 +543,7 @@ def test_beliefs_and_truths_of_something_else_are_named():
             ask()
 
 
-def test_nees_counts_directions_of_any_unit():
+def test_nees_does_not_depend_on_units():
     """Among metres and nanometres: five deviations of the small one are 25, and a combination without variance is 0."""
     P = jnp.diag(jnp.array([1.0, 1e-18]))
     assert float(_of_rank(P, jnp.array([0.0, 5e-9]))) == pytest.approx(25.0)

@@ -117,7 +117,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*its description uses")
 @pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("name", [*SYSTEMS, *SLOW])
-def test_c_gives_the_numbers_and_derivatives_of_the_library(name, tmp_path):
+def test_values_and_derivatives_in_c_agree_with_the_library(name, tmp_path):
     rtol, of_derivatives = 1e-13, 1e-12
     system, t, q, u, w = case(name)
     files = jk.export.c(system, tmp_path / "generated" / f"{name}.c")
@@ -138,7 +138,7 @@ def test_c_gives_the_numbers_and_derivatives_of_the_library(name, tmp_path):
 @pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
-def test_the_test_program_passes_and_finds_what_is_wrong(dtype, tmp_path):
+def test_the_test_program_passes_and_detects_errors(dtype, tmp_path):
     files = jk.export.c(Odd(), tmp_path / "odd.c", dtype=dtype)
 
     def result():
@@ -173,7 +173,7 @@ class Balanced(jk.System):
 
 @pytest.mark.slow
 @needs_compiler
-def test_the_test_program_compares_with_the_size_of_all_entries(tmp_path):
+def test_the_test_program_uses_a_tolerance_relative_to_all_entries(tmp_path):
     """Rounding of 1e-17 beside an entry that is equal, and of a vector whose terms all cancel."""
     _, expected, sizes = _state_and_outputs(Formulas(Balanced(), "float64"), ("rates",))
     size = sizes["rates"]["u_dot"]
@@ -194,7 +194,7 @@ def test_the_test_program_compares_with_the_size_of_all_entries(tmp_path):
 
 @needs_compiler
 @pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler")
-def test_the_header_is_read_by_cpp_too(tmp_path):
+def test_the_header_compiles_as_cpp(tmp_path):
     files = jk.export.c(Odd(), tmp_path / "double.c", functions=("rates",))
     command = ["c++", "-x", "c++", "-Wall", "-Werror", "-fsyntax-only", files.header]
     subprocess.run(command, check=True)
@@ -207,7 +207,7 @@ def test_the_header_is_read_by_cpp_too(tmp_path):
     assert "void double__rates(" in header
 
 
-def test_two_parameters_keep_two_names(tmp_path):
+def test_parameters_with_similar_names_have_unique_identifiers(tmp_path):
     """ "extra[0].mass" and a field "extra_0_mass" would be one identifier."""
 
     class Cart(jk.System):
@@ -235,7 +235,7 @@ def test_two_parameters_keep_two_names(tmp_path):
     assert [float(x.squeeze()) for x in module["equations"](0.0, [0.0], [0.0])] == [32.0, 7500.0]
 
 
-def test_names_of_other_languages():
+def test_non_ascii_names_become_valid_identifiers():
     names = ["θ̈", "φ", "ϕ", "a.b", "a[b]", "int", "int_", "2x", "Δ", "é", "_", "车"]
     found = identifiers(names, {"int"})
     assert found == ["theta", "phi", "phi_", "a_b", "a_b_", "int_", "int_2", "n2x", "Delta", "e", "n", "u8f66"]
@@ -243,7 +243,7 @@ def test_names_of_other_languages():
 
 @pytest.mark.slow_cases(all_but=["Bob"])
 @pytest.mark.parametrize("name", [*SYSTEMS, *SLOW])
-def test_numpy_source_gives_the_numbers_of_the_library(name):
+def test_values_of_numpy_source_agree_with_the_library(name):
     rtol = 1e-13
     system, t, q, u, w = case(name)
     functions = ["rates", "equations", "partial_velocities", "kinetic_energy"]
@@ -263,7 +263,7 @@ def test_numpy_source_gives_the_numbers_of_the_library(name):
     )
 
 
-def test_names_with_dots_and_spaces_of_mechanisms_of_joints():
+def test_numpy_export_of_names_with_dots_and_spaces():
     bar = {"mass": 2.0, "center": (0.0, 0.0, -0.2), "inertia": (0.03, 0.03, 0.002)}
     hinge = jk.joints.hinge("shoulder", (0, 1, 0), damping=0.1)
     arm = jk.joints.mechanism([jk.joints.Link("upper arm", joints=hinge, **bar)])
@@ -276,7 +276,7 @@ def test_names_with_dots_and_spaces_of_mechanisms_of_joints():
 
 
 @pytest.mark.slow
-def test_numpy_source_in_float32_stays_there_and_is_written(tmp_path):
+def test_numpy_source_in_float32_is_written_and_returns_float32(tmp_path):
     rtol = 1e-5
     system, t, q, u, w = case("Odd")
     text = jk.export.numpy(system, tmp_path / "new" / "odd.py", ("rates", "state_jacobian"), dtype="float32")
@@ -290,7 +290,7 @@ def test_numpy_source_in_float32_stays_there_and_is_written(tmp_path):
 
 
 @pytest.mark.slow
-def test_derivatives_where_branches_meet():
+def test_derivatives_at_the_boundaries_of_branches():
     """Beside and on the edges of `where`, sqrt, sign, max and min: sides that are not taken have no derivative."""
     rtol = 1e-12
     system, t, q, u, w = case("Odd")
@@ -387,7 +387,7 @@ def test_every_operation_in_source(language, tmp_path):
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
-def test_no_number_and_signed_zeros_in_source(language, tmp_path):
+def test_nan_and_signed_zeros_in_exported_source(language, tmp_path):
     """Bit for bit, but for the sign of NaN, and for the zero that NumPy's maximum of two zeros is."""
     expected = np.concatenate([np.ravel(y) for y in jax.jit(odd)(X)])
     found = language(odd, X, tmp_path)
@@ -451,7 +451,7 @@ def test_four_coupled_constraints_are_exported():
 @pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("made", [steered, carrying, over_a_bump], ids=lambda made: made.__name__)
-def test_every_export_of_a_bicycle_from_parts_gives_the_numbers_of_the_library(made, tmp_path):
+def test_all_exports_of_a_bicycle_from_parts_agree_with_the_library(made, tmp_path):
     """At a state where nothing is zero, and with other parameters than those that were exported."""
     rtol = 1e-12
     bicycle, t, rng = made(), 0.7, np.random.default_rng(0)
@@ -498,7 +498,7 @@ def test_every_export_of_a_bicycle_from_parts_gives_the_numbers_of_the_library(m
 
 
 @pytest.mark.parametrize("name", [*SYSTEMS, *SLOW])
-def test_casadi_gives_the_numbers_and_derivatives_of_the_library(name):
+def test_values_and_derivatives_in_casadi_agree_with_the_library(name):
     rtol, of_derivatives = 1e-13, 1e-12
     pytest.importorskip("casadi")
     system, t, q, u, w = case(name)
@@ -563,7 +563,7 @@ np.savez(sys.argv[3], gradient=gradient, **found)
 
 
 @pytest.mark.slow
-def test_stablehlo_is_loaded_without_jaxkane_for_any_batch_and_gives_the_same_bits(on_cpu, tmp_path):
+def test_stablehlo_without_jaxkane_is_bit_identical_for_any_batch(on_cpu, tmp_path):
     rtol = 1e-13
     pytest.importorskip("flatbuffers")
     system, t, q, u, w = case("DoublePendulum")
@@ -599,7 +599,7 @@ def test_stablehlo_is_loaded_without_jaxkane_for_any_batch_and_gives_the_same_bi
     np.testing.assert_allclose(found["gradient"], gradient, rtol=1e-11)
 
 
-def test_stablehlo_of_many_parameters_and_of_what_formulas_cannot_hold(on_cpu):
+def test_stablehlo_with_batched_parameters(on_cpu):
     rtol = 1e-12
     system, t, q, u, w = case("Odd")
     exported = jk.export.stablehlo(system, function="equations", batch_parameters=True)
@@ -631,7 +631,7 @@ class Tower(jk.System):
 
 
 @pytest.mark.slow
-def test_many_speeds_are_exported_but_for_what_lapack_does(on_cpu):
+def test_many_speeds_are_exported_except_functions_that_use_lapack(on_cpu):
     tower, q, u = Tower(), np.linspace(0.1, 0.2, 13), np.linspace(-1.0, 1.0, 13)
     with pytest.raises(ValueError, match=r"Tower: 'rates' .* with 13 speeds .* by LAPACK.*functions=\('equations',\)"):
         jk.export.numpy(tower)
@@ -672,7 +672,7 @@ class Strange(jk.System):
         return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
 
 
-def test_what_cannot_be_exported_is_named(monkeypatch, tmp_path):
+def test_systems_and_functions_that_cannot_be_exported_are_rejected(monkeypatch, tmp_path):
     with pytest.raises(ValueError, match="no function rate; did you mean 'rates'"):
         jk.export.c(Strange(), tmp_path / "a.c", functions=("rate",))
     with pytest.raises(ValueError, match="no function nothing"):

@@ -153,7 +153,7 @@ def assert_same_steps(filter, belief, in_c, rtol, n=5, dt=0.02):
 @pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.slow)])
-def test_c_makes_the_steps_of_the_library(method, tmp_path):
+def test_filter_steps_in_c_agree_with_the_library(method, tmp_path):
     """Inputs, states of the first order, outputs, parameters that drift, gaps and late measurements."""
     filter, belief = of_servo(method=method)
     assert_same_steps(filter, belief, compiled(filter, belief, tmp_path), 1e-12)
@@ -165,14 +165,14 @@ def test_c_makes_the_steps_of_the_library(method, tmp_path):
     "of", [of_circle, *(pytest.param(of, marks=pytest.mark.slow) for of in (of_crank, of_bicycle))]
 )
 @pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.slow)])
-def test_constraints_are_kept_in_c(of, method, tmp_path):
+def test_filter_steps_in_c_satisfy_the_constraints(of, method, tmp_path):
     filter, belief = of(method=method)
     assert_same_steps(filter, belief, compiled(filter, belief, tmp_path), 1e-12)
 
 
 @needs_compiler
 @pytest.mark.slow
-def test_single_precision_old_states_and_impossible_times(tmp_path):
+def test_single_precision_smoothed_states_and_invalid_times_in_c(tmp_path):
     filter, belief = of_servo(lag=0)
     in_c = compiled(filter, belief, tmp_path, ctypes.c_float)
     assert_same_steps(filter, belief, in_c, 2e-5)
@@ -189,7 +189,7 @@ def test_single_precision_old_states_and_impossible_times(tmp_path):
 @pytest.mark.slow
 @needs_compiler
 @METHODS
-def test_the_program_beside_the_header_compares(method, tmp_path):
+def test_the_exported_test_program_passes(method, tmp_path):
     files = jk.export.c_filter(*(lambda f, b: (f, tmp_path / "servo.h", b))(*of_servo(method=method)))
     target = tmp_path / "test"
     for compiler, options in ((CC, STRICT), *([(CXX, ("-x", "c++", "-Wall"))] if CXX else [])):
@@ -206,7 +206,7 @@ def test_the_program_beside_the_header_compares(method, tmp_path):
 
 
 @needs_compiler
-def test_two_filters_stand_in_one_program(tmp_path):
+def test_two_filters_compile_into_one_program(tmp_path):
     """Names of their own, from names that C does not allow."""
     filter, belief = of_circle()
     names = [jk.export.c_filter(filter, tmp_path / name, belief).header for name in ("a.h", "b-é.h")]
@@ -217,7 +217,7 @@ def test_two_filters_stand_in_one_program(tmp_path):
     assert "b_e_belief b_e_start" in names[1].read_text()
 
 
-def test_what_cannot_be_exported_is_named(tmp_path):
+def test_filters_that_cannot_be_exported_are_rejected(tmp_path):
     filter, belief = of_servo()
     with pytest.raises(TypeError, match=r"needs a jaxkane\.estimate\.Filter, got"):
         jk.export.c_filter(Servo(), tmp_path / "f.h", belief)

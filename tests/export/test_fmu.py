@@ -180,7 +180,7 @@ class Unit:
 @pytest.mark.parametrize(
     "name", ["Driven", "Bob", "Ball", "Odd", *(pytest.param(n, marks=pytest.mark.slow) for n in CATALOG)]
 )
-def test_fmpy_finds_no_problem(name, fmi, fmu_of):
+def test_fmpy_validates_the_fmu(name, fmi, fmu_of):
     own = {"Driven": Driven, "Bob": Bob, "Ball": Ball, "Odd": Odd}
     system = own[name]() if name in own else CATALOG[name].example()
     if type(system).contacts is not jk.System.contacts:
@@ -198,7 +198,7 @@ def test_fmpy_finds_no_problem(name, fmi, fmu_of):
 @pytest.mark.parametrize(
     ("fmi", "kind"), [("2.0", "co-simulation"), ("3.0", "co-simulation"), ("3.0", "model exchange")]
 )
-def test_an_fmu_of_one_kind(fmi, kind, tmp_path):
+def test_an_fmu_for_co_simulation_or_model_exchange_only(fmi, kind, tmp_path):
     path = str(jk.export.fmu(Ball(), tmp_path / "ball.fmu", fmi=fmi, kind=kind, state=STATES["Ball"], sources=False))
     assert validate_fmu(path) == []
     description = fmpy.read_model_description(path)
@@ -267,7 +267,7 @@ def test_variables_have_units_bounds_and_dependencies(fmi, fmu_of):
 @needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_motion_is_that_of_the_formula(fmi, kind, fmu_of):
+def test_the_simulation_agrees_with_the_analytical_solution(fmi, kind, fmu_of):
     """A linear system with an input: the matrix exponential. A pendulum in Cartesian coordinates: SciPy."""
     atol = {"ModelExchange": 1e-7, "CoSimulation": 1e-9}[kind]
     options = {"fmi_type": kind, "stop_time": 1.0, "output_interval": 0.25, "relative_tolerance": 1e-11}
@@ -293,7 +293,7 @@ def test_the_motion_is_that_of_the_formula(fmi, kind, fmu_of):
 
 @needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
-def test_parameters_inputs_and_states_change_between_steps(fmi, fmu_of):
+def test_parameters_inputs_and_states_can_be_set_between_steps(fmi, fmu_of):
     """A changed parameter and input, a restored state, a serialized one, and a new start, by the matrix exponential."""
     atol = 1e-10
     names = ("x", "v", "force")
@@ -362,7 +362,7 @@ def test_directional_derivatives(fmi, fmu_of):
 @needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_events_jump_and_end_the_simulation(fmi, kind, fmu_of):
+def test_events_reset_states_and_end_the_simulation(fmi, kind, fmu_of):
     """A ball: parabolas between its bounces, until an event ends the simulation."""
     atol = {"ModelExchange": 1e-8, "CoSimulation": 1e-12}[kind]
     path = fmu_of(Ball(), fmi)
@@ -390,7 +390,7 @@ def test_events_jump_and_end_the_simulation(fmi, kind, fmu_of):
 
 @needs_compiler
 @pytest.mark.parametrize("kind", KINDS)
-def test_events_of_the_time_occur_once(kind, fmu_of):
+def test_time_events_occur_once(kind, fmu_of):
     """Also at the start, and at a communication point. The sine rises through zero at 0, 0.314, 0.628 and 0.942 s."""
     last = fmpy.simulate_fmu(fmu_of(Clock(), "3.0"), fmi_type=kind, stop_time=1.0, output_interval=0.1)[-1]
     assert [last[name] for name in ("waves", "at", "twice")] == [4.0, 1.0, 1.0]
@@ -411,7 +411,7 @@ def test_a_ball_does_not_fall_through_the_floor(kind, restitution, fmu_of):
 @pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
-def test_dependent_speeds_that_become_singular_end_the_simulation(fmi, fmu_of):
+def test_singular_dependent_speeds_end_the_simulation(fmi, fmu_of):
     """A bead on a circle, x = sin t: at pi/2 its vertical speed no longer follows from the horizontal one. Steps of
     fixed length would turn back there."""
     with Unit(fmu_of(Bead(ends=False), fmi)) as unit:
@@ -519,7 +519,7 @@ def many(n):
         (lambda: with_members(inputs=("command", "a\nb")), {}, ValueError, r"contains '\\n', which an FMU"),
     ],
 )
-def test_what_an_fmu_cannot_represent_is_refused(system, options, error, match, tmp_path):
+def test_systems_not_supported_by_fmi_are_rejected(system, options, error, match, tmp_path):
     path = tmp_path / options.pop("path", "driven.fmu")
     with pytest.raises(error, match=match):
         jk.export.fmu(system(), path, **options)

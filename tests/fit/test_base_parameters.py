@@ -16,7 +16,7 @@ from jaxkane.joints import Actuator, Link, Loop, Site, hinge, mechanism
 
 
 @pytest.mark.slow
-def test_double_pendulum_as_in_textbooks():
+def test_double_pendulum_has_the_base_parameters_of_khalil_and_dombre():
     """Khalil and Dombre: ZZ1 + L^2 M2, MX1 + L M2, MY1, ZZ2, MX2, MY2; with a free swing only their ratios."""
     found = base_parameters(Swing())
     assert found.texts == (
@@ -62,7 +62,7 @@ def test_free_swings_with_friction(n, numbers):
 
 
 @pytest.mark.slow
-def test_a_vertical_axis_tells_one_number_and_a_horizontal_one_three():
+def test_a_vertical_hinge_has_one_base_parameter_and_a_horizontal_hinge_three():
     whole = {"center": (0.1, 0.02, 0.03), "inertia": ((0.02, 0.001, 0.002), (0.001, 0.03, 0.003), (0.002, 0.003, 0.04))}
     for axis, expected in (((0, 0, 1), ("Izz",)), ((0, 1, 0), ("mx", "mz", "Iyy"))):
         one = mechanism([Link("bob", joints=hinge("q", axis), mass=1.0, **whole)], actuators=[Actuator("tau", "q")])
@@ -91,7 +91,7 @@ def test_base_parameters_in_other_units_of_time(second):
 
 
 @pytest.mark.slow
-def test_a_puma_has_36():
+def test_a_puma_robot_has_36_base_parameters():
     """Mayeda, Yoshida and Osuka, Base parameters of manipulator dynamic models, 1990; the sums are Khalil's."""
     quarter = np.pi / 2
     turns = (0.0, -quarter, 0.0, -quarter, quarter, -quarter)
@@ -121,7 +121,7 @@ def test_estimates_from_exact_data_are_exact():
     assert "Rank of these data: 8" in str(found)
 
 
-def test_a_regressor_of_many_instants_is_enough():
+def test_base_parameters_from_a_regressor_of_many_samples():
     truth, at = swings()
     rows = jax.vmap(lambda q, u, a: regressor(truth, 0.0, q, u, a, parameters=FRICTION))(
         *(jnp.asarray(x) for x in (at.q, at.u, at.u_dot))
@@ -151,7 +151,7 @@ def test_deviations_cover_the_truth():
 
 
 @pytest.mark.slow
-def test_what_data_do_not_tell_is_named_and_stays():
+def test_unidentifiable_base_parameters_are_reported_and_keep_their_values():
     """The second arm hangs still: its inertia is told by nothing."""
     truth, at = swings()
     rng = np.random.default_rng(1)
@@ -168,7 +168,7 @@ def test_what_data_do_not_tell_is_named_and_stays():
     assert np.isinf(found.deviations[list(found.texts).index("link2.Izz")])
 
 
-def test_bad_data_are_refused_by_name():
+def test_invalid_samples_are_rejected():
     truth, at = swings()
     first = lambda n: KinematicSamples(at.t[:n], at.q[:n], at.u[:n], at.u_dot[:n])  # noqa: E731
     with pytest.raises(ValueError, match="nothing remains to estimate the errors"):
@@ -220,7 +220,7 @@ class Lagging(Swing):
 
 
 @pytest.mark.slow
-def test_states_of_the_first_order_act_from_the_right_side():
+def test_loads_that_depend_on_first_order_states():
     truth, _ = swings()
     system = Lagging(**{name: getattr(truth, name) for name in FREE if name[0] != "k"})
     at = random_samples(system, 20)
@@ -232,7 +232,7 @@ def test_states_of_the_first_order_act_from_the_right_side():
 
 
 @pytest.mark.slow
-def test_a_simulated_motion_tells_of_the_system_that_made_it():
+def test_base_parameters_estimated_from_a_simulation():
     truth, at = swings()
     torque = {"torque1": lambda t, state: 0.3 * jnp.cos(9 * t)}
     ride = jk.simulate(truth, jk.State([0.5, -0.4], [1.0, 2.0]), jnp.linspace(0.0, 2.0, 401), inputs=torque)
@@ -245,7 +245,7 @@ def test_a_simulated_motion_tells_of_the_system_that_made_it():
 
 
 @pytest.mark.slow
-def test_a_closed_loop():
+def test_base_parameters_of_a_closed_loop():
     """A four-bar linkage tells 8 sums; those of another one with the same lengths, from its motion, exactly."""
 
     def link(name, parent, position, mass=1.0, y=0.03):
@@ -271,7 +271,7 @@ def test_a_closed_loop():
 
 
 @pytest.mark.slow
-def test_a_bicycle_tells_twenty():
+def test_a_bicycle_has_twenty_base_parameters():
     """Of frame, fork and wheels; the whole mass, the height and place of its centre, and both wheels' spin moments."""
     found = base_parameters(jk.catalog.WhippleBicycle.benchmark(), parameters="steer_damping")
     assert len(found.places) == 20

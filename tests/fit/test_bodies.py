@@ -32,7 +32,7 @@ def is_possible(values):
         ((0, 4, 5), (0, 2)),
     ],
 )
-def test_every_number_is_a_possible_body_and_back(moves, wheel):
+def test_every_parameter_vector_maps_to_a_possible_body_and_back(moves, wheel):
     tolerance = 1e-9
     values = [12.0, 0.3, 0.0, -0.6, 1.4, 2.0, 1.4, 0.0, 0.0, 0.0]
     body = PossibleBody.of(values, moves, wheel)
@@ -47,7 +47,7 @@ def test_every_number_is_a_possible_body_and_back(moves, wheel):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
-def test_values_of_numbers_and_of_bodies_are_one_program(jacobian):
+def test_scalar_and_body_parameters_are_mapped_in_one_compiled_program(jacobian):
     """Where they are not, a warning ends the test."""
     free = ("c", Free("zB", bounds=(None, -0.1)), frame_inertia("H"), frame_inertia("F", fixed=()))
     parameters = parameters_of(BICYCLE, free)
@@ -83,7 +83,7 @@ def test_intervals_and_their_inverse():
     assert float(parameters.log_determinant(x)) == pytest.approx(np.linalg.slogdet(slopes)[1], abs=1e-6)
 
 
-def test_what_is_no_body_is_refused():
+def test_impossible_inertias_and_invalid_names_are_rejected():
     with pytest.raises(ValueError, match=r"Inertia of I11, I22, I33: mass 2 kg .* is not physically possible"):
         parameters_of(RigidBody(2.0, I33=4.0), Inertia(MOMENTS, mass="mass"))
     with pytest.raises(ValueError, match="Name all three products"):
@@ -95,7 +95,7 @@ def test_what_is_no_body_is_refused():
 
 
 @pytest.mark.slow
-def test_a_free_rotation_is_identified_by_possible_bodies_only():
+def test_inertia_of_a_thin_plate_is_estimated_only_with_possible_bodies():
     # A thin plate turns freely under small known torques: its third moment is nearly the sum of the two others.
     truth, rng = RigidBody(1.0, I11=1.0, I22=2.0, I33=2.97), np.random.default_rng(2)
     guess = RigidBody(1.0, I11=2.0, I22=2.2, I33=2.4)

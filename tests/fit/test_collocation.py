@@ -134,7 +134,7 @@ def test_bounds_of_states_are_met():
     assert record(6).measured["x"].min() < -0.11  # the bound contradicts the data
 
 
-def test_a_gap_and_a_clock():
+def test_missing_samples_and_a_clock_offset_do_not_bias_estimates():
     """The same estimates, 1e-6, if the clock starts at 1.7e9 s; missing samples are not used."""
     trial = record(7)
     gap = {k: np.where((T > 1.0) & (T < 1.3), np.nan, v) for k, v in trial.measured.items()}
@@ -211,7 +211,7 @@ def test_wrong_options(change, words):
 
 
 @pytest.mark.parametrize("option", [{"window": 0.5}, {"noise": {"push": 1.0}}, {"zero_order_hold": ("push",)}])
-def test_options_that_collocation_does_not_have(option):
+def test_options_not_supported_by_collocation_are_rejected(option):
     with pytest.raises(ValueError, match=next(iter(option))):
         fit(GUESS, record(1), NAMES, transcription=Collocation(), **option)
     with pytest.raises(ValueError, match="steps"):

@@ -28,7 +28,7 @@ def blocks_in(units, n_z=1):
 
 
 @pytest.mark.parametrize("units", [(1.0, 1.0, 1.0), (1e-6, 1e3, 1.0)])
-def test_a_damped_step_is_that_of_dense_least_squares_in_any_units(units):
+def test_a_damped_step_equals_dense_least_squares_in_any_units(units):
     damping, rtol = 0.3, 1e-9
     A, blocks = blocks_in(units)
     x, least = eliminate(blocks, damping).step(damping)
@@ -41,7 +41,7 @@ def test_a_damped_step_is_that_of_dense_least_squares_in_any_units(units):
     np.testing.assert_allclose(least, np.sum((whole @ (solution / np.linalg.norm(dense, axis=0)) + r) ** 2), rtol=rtol)
 
 
-def test_a_limited_step_is_that_of_bounded_least_squares():
+def test_a_limited_step_equals_bounded_least_squares():
     _, blocks = blocks_in((1.0, 2.0, 0.5))
     free, _ = eliminate(blocks, 0.0).step(0.0)
     longest = np.array([np.inf, np.abs(free[1]) / 4, np.inf])
@@ -54,7 +54,7 @@ def test_a_limited_step_is_that_of_bounded_least_squares():
 
 @pytest.mark.slow_cases("Levenberg-Marquardt")
 @pytest.mark.parametrize("optimizer", [LeastSquares(), GradientDescent()], ids=lambda m: m.name)
-def test_a_fit_ends_where_a_step_gains_nothing_in_units_of_the_variance(optimizer):
+def test_a_fit_converges_when_the_cost_reduction_is_small_to_the_variance(optimizer):
     problem = Problem.of(Track(), TRIAL, FREE, **POSED)
     found = minimize(problem, optimizer)
     assert found.status == "converged"
@@ -77,7 +77,7 @@ def test_nanometres_with_a_sigma_of_one_are_fitted_like_metres():
 
 
 @pytest.mark.slow
-def test_a_parameter_rests_at_its_bound():
+def test_a_fit_with_a_parameter_at_its_bound():
     from test_parameters import Limited
 
     trials = [Trial(T, {"x": SEEN - 0.05 * np.sin(3.0 * T)}, {"push": -PUSH}, sigma=0.1, name=f"{k}") for k in range(3)]
@@ -95,7 +95,7 @@ def test_a_parameter_rests_at_its_bound():
     assert minimize(problem, GradientDescent()).status == "bound"
 
 
-def test_a_search_starts_again_where_three_steps_are_rejected_for_the_first_time():
+def test_the_search_restarts_after_three_rejected_steps_only_once():
     class Long:
         slices, model = ((0, 0, 100),), type("M", (), {"noise": None})
 
@@ -186,7 +186,7 @@ def assert_coverage(fits, truth):
 
 
 @pytest.mark.slow
-def test_intervals_of_2e5_residuals_from_a_start_within_a_standard_error():
+def test_interval_coverage_with_200000_residuals_and_a_close_initial_guess():
     # A fit that stops by a fraction of the cost does not move from the truth: its intervals would hold it in all sets.
     t, rng, truth = np.linspace(0.0, 4.0, 4001), np.random.default_rng(0), {"gain": 1.0, "drift": 0.3}
     push = np.sin(3.0 * t)
@@ -208,7 +208,7 @@ def test_intervals_of_2e5_residuals_from_a_start_within_a_standard_error():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.01, 100.0], ids=lambda f: f"sigma {f}")
-def test_intervals_where_steps_follow_the_residuals_and_not_sigma(factor):
+def test_interval_coverage_with_a_wrong_sigma(factor):
     from test_fit_steps import GUESS, NAMES, PUSH, SIGMA, exact, t
 
     rng, fits = np.random.default_rng(1), []
@@ -248,7 +248,7 @@ class Rejecting(Optimizer):
 
 
 @pytest.mark.parametrize("better", [True, False])
-def test_a_search_continues_from_the_better_of_two_starts(monkeypatch, better):
+def test_the_search_continues_from_the_better_of_two_iterates(monkeypatch, better):
     problem = Problem.of(Track(), TRIAL, FREE, **POSED)
     first = search._first(problem, Rejecting(), problem.start, 6)
     again = search._first(problem, LeastSquares(), minimize(problem, LeastSquares()).point, 6)
@@ -264,7 +264,7 @@ def test_a_search_continues_from_the_better_of_two_starts(monkeypatch, better):
 @pytest.mark.parametrize(
     ("lower", "upper", "nearest"), [(1.0, np.inf, 1.0), (-np.inf, 7.0, 7.0), (1.0, 7.0, 1.0), (1.0, 7.0, 7.0)]
 )
-def test_the_longest_step_towards_a_bound_leaves_a_twentieth(lower, upper, nearest):
+def test_the_longest_step_towards_a_bound_leaves_a_twentieth_of_the_distance(lower, upper, nearest):
     start, bounded = 2.0, (bool(np.isfinite(lower)), bool(np.isfinite(upper)))
     interval = Interval(*map(jnp.asarray, (start, lower, upper, 0.3)), bounded)
     x = interval.longest_step * np.sign(nearest - start)

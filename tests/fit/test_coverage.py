@@ -198,7 +198,7 @@ def covered(kind, n, seed=0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_intervals_hold_the_truth_as_often_as_they_say(kind):
+def test_interval_coverage_of_each_kind(kind):
     hits, finite = covered(kind, SETS)
     for which in hits:
         total, of = sum(finite[which].values()), len(hits[which]) * SETS
@@ -223,7 +223,7 @@ SLOWLY = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("T", "p", "spread"), [(6, 2, 0.5), *SLOWLY])
-def test_few_trials_scatter_more_than_a_sandwich_sees(T, p, spread):
+def test_interval_coverage_with_few_trials_and_correlated_residuals(T, p, spread):
     """Trials of unlike inputs, correlated residuals: intervals, and the test of several parameters that are zero."""
     rng, time, n = np.random.default_rng(1), np.linspace(0.0, 4.0, 20), 500
     root = np.linalg.cholesky(0.9 ** np.abs(np.subtract.outer(np.arange(20), np.arange(20))))
@@ -245,7 +245,7 @@ def test_few_trials_scatter_more_than_a_sandwich_sees(T, p, spread):
     assert 0.02 < false < 0.06
 
 
-def test_neighbours_are_measurements_that_follow_each_other():
+def test_autocorrelation_uses_consecutive_measurements():
     """Padded with NaN, or beside channels of the same kind, residuals are as correlated as they are."""
     rng = np.random.default_rng(2)
     walk = correlated(rng, 4000)
@@ -281,7 +281,7 @@ def rubbing(n, rng):
 
 
 @pytest.mark.slow
-def test_intervals_that_hold_where_friction_is_left_out():
+def test_interval_coverage_without_friction_in_the_model():
     """Of 50 sets of eight trials. The next run lies in the intervals by held-out scatter, and not in confidence
     intervals. These are about what all runs have in common: the estimates from very many."""
     rng, T, sets, sigma = np.random.default_rng(3), 8, 50, 0.003
@@ -318,7 +318,7 @@ def test_intervals_that_hold_where_friction_is_left_out():
     assert 0.8 <= hits["bootstrap"] <= high, hits
 
 
-def test_the_bootstrap_of_many_trials_scatters_as_the_jackknife():
+def test_the_bootstrap_of_many_trials_agrees_with_the_jackknife():
     rng = np.random.default_rng(5)
     trials = [trial(k, correlated, 1.0, rng) for k in range(60)]
     options = {"unknown": ("x_dot",), "simulation": Simulation(step=0.1)}
@@ -336,7 +336,7 @@ def test_the_bootstrap_of_many_trials_scatters_as_the_jackknife():
 
 
 @pytest.mark.slow
-def test_intervals_by_scatter_are_those_of_a_mean():
+def test_intervals_by_held_out_scatter_equal_those_of_a_mean():
     """With one parameter and trials alike, each trial has an estimate of its own, and that of all is their mean."""
     rng, T = np.random.default_rng(6), 5
     push = np.sin(2.0 * t)
@@ -352,7 +352,7 @@ def test_intervals_by_scatter_are_those_of_a_mean():
 
 
 @pytest.mark.slow
-def test_what_the_data_do_not_determine_has_no_narrow_interval():
+def test_an_undetermined_parameter_has_an_infinite_interval():
     """Without a push its gain has no influence: infinite, or as wide as its prior says."""
     rng = np.random.default_rng(7)
     trials = [
@@ -386,7 +386,7 @@ def kicked():
 
 
 @pytest.mark.slow
-def test_what_one_trial_determines_has_no_interval_by_trial(kicked):
+def test_a_parameter_determined_by_one_trial_has_no_clustered_error(kicked):
     """Left out, its estimate would stay where it is, and look exact."""
     found, folds = kicked, cross_validate(kicked)
     assert found.clustered_errors["other"] == np.inf
@@ -406,7 +406,7 @@ def test_what_one_trial_determines_has_no_interval_by_trial(kicked):
     assert np.isnan(found.held_out_cost)
 
 
-def test_one_trial_alone_is_no_confirmation(kicked):
+def test_the_score_test_of_a_parameter_determined_by_one_trial(kicked):
     """The score test of a parameter that one trial determines is formal if residuals are white; else it is 1."""
     rows = linearized_problem(kicked.problem, kicked.linearization, kicked.point)
     rows.data[..., -1] -= rows.data[..., 2]  # about a point where the parameter is one less
@@ -417,7 +417,7 @@ def test_one_trial_alone_is_no_confirmation(kicked):
     assert score_test(rows, [0, 2], [1], degrees_of_freedom=150).degrees_of_freedom[0] < 7
 
 
-def test_a_fold_that_has_not_converged_is_named(kicked, monkeypatch):
+def test_a_fold_that_has_not_converged_is_reported(kicked, monkeypatch):
     first = iter([{"status": "steps"}])
 
     def unlucky(*args, **options):
@@ -447,7 +447,7 @@ def test_few_trials_are_clustered_by_their_parts():
     assert "gain" in bootstrap(found, n=100).values
 
 
-def test_slow_errors_and_single_channels_are_seen():
+def test_correlation_of_slow_errors_and_single_channels_is_detected():
     """Of white residuals nothing is seen, of a slow error of 0.4 sigma and of one channel of four all that matters."""
     rng, n = np.random.default_rng(10), 400
 
@@ -466,7 +466,7 @@ def test_slow_errors_and_single_channels_are_seen():
     assert serial_correlation({"run": {"x": noise + 0.5 * np.sin(2.0 * times)}})["x"] > 0.0
 
 
-def test_degrees_of_freedom_are_those_of_a_simulation():
+def test_degrees_of_freedom_agree_with_a_monte_carlo_simulation():
     """Of Z / sqrt(sum w chi^2): equal clusters have as many as they are, unequal ones fewer."""
     rng = np.random.default_rng(11)
     for n in (1, 2, 5, 40):
@@ -478,7 +478,7 @@ def test_degrees_of_freedom_are_those_of_a_simulation():
     assert _freedom_of(np.full(400, 1 / 400)) == pytest.approx(400)
 
 
-def test_leverage_is_that_of_the_cluster_that_matters_most():
+def test_leverage_is_the_largest_share_of_a_cluster():
     """Of one unknown it is the largest share of the information."""
     information = np.array([6.0, 2.0, 1.0, 1.0])[:, None, None]
     scores, places = np.array([1.0, -2.0, 0.5, 0.5])[:, None], np.zeros((4, 1), int)
@@ -495,7 +495,7 @@ def test_leverage_is_that_of_the_cluster_that_matters_most():
 
 
 @pytest.mark.slow
-def test_four_trials_are_clusters():
+def test_four_trials_suffice_as_clusters():
     rng = np.random.default_rng(12)
     options = {"unknown": ("x_dot",), "simulation": Simulation(step=0.1)}
     trials = [trial(k, white, 1.0, rng) for k in range(4)]

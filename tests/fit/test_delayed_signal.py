@@ -16,7 +16,7 @@ T = jnp.linspace(0.0, 1.0, 41)
 
 @pytest.mark.slow_cases("False")
 @pytest.mark.parametrize("irregular", [False, True])
-def test_what_a_sensor_said_before(irregular):
+def test_a_delayed_signal_equals_the_earlier_signal(irregular):
     t = T + (0.004 * jnp.sin(40.0 * T) if irregular else 0.0)
     parabola = 1.0 + 2.0 * t - 3.0 * t**2
     for delay in (0.0, 0.013, 0.2, -0.05):
@@ -30,7 +30,7 @@ def test_what_a_sensor_said_before(irregular):
     np.testing.assert_allclose(slope[1:-1], -6.0 * jnp.cos(6.0 * t)[1:-1], atol=0.05)
 
 
-def test_a_last_time_that_is_repeated():
+def test_a_delayed_signal_with_a_repeated_last_time():
     """As in a window that is shorter than others."""
     t, n = jnp.concatenate([T[:20], jnp.full(5, T[19])]), 20
     y = jnp.concatenate([jnp.sin(5.0 * T[:20]), jnp.full(5, jnp.sin(5.0 * T[19]))])
@@ -43,7 +43,7 @@ def test_a_last_time_that_is_repeated():
     np.testing.assert_allclose(two, [0.0, 2.0], atol=1e-12)
 
 
-def test_a_low_pass_is_that_of_its_equation():
+def test_a_low_pass_filter_satisfies_its_differential_equation():
     t = T + 0.004 * jnp.sin(40.0 * T)
     y, time_constant = jnp.sin(6.0 * t), 0.08
     slope = (y[1] - y[0]) / (t[1] - t[0])
@@ -78,7 +78,7 @@ def tracks(order):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_low_pass_is_selected_and_found(order):
+def test_a_low_pass_filter_is_selected_and_its_time_constant_estimated(order):
     before = fit(Track(gain=1.0), tracks(order), "gain", simulation=Simulation(step=0.025))
     candidates = [Gain("x"), Offset("x"), Delay("x"), LowPass("x"), LowPass("x", order=2)][-3 if order == 1 else 0 :]
     search = forward_selection(before, candidates, refits=None)
@@ -93,7 +93,7 @@ def test_a_low_pass_is_selected_and_found(order):
 @pytest.mark.slow_cases(all_but=["Delay-2.5-1000.0"])
 @pytest.mark.parametrize("unit", [2e-6, 1e3])  # [s] between samples: 500 kHz, and three times an hour
 @pytest.mark.parametrize(("kind", "true"), [(LowPass, 4.0), (Delay, 2.5)])
-def test_times_in_any_unit(unit, kind, true):
+def test_delays_and_time_constants_in_any_unit_of_time(unit, kind, true):
     """A time constant and a delay of some samples, without a scale."""
     t = np.arange(60.0)
     push = np.sin(0.3 * t)
@@ -109,7 +109,7 @@ def test_times_in_any_unit(unit, kind, true):
     assert (gain * unit**2, time / unit) == pytest.approx((1.2, true), rel=0.02)
 
 
-def test_what_is_no_low_pass_is_refused():
+def test_invalid_low_pass_filters_are_rejected():
     trials = tracks(1)[:1]
     for item, said in (
         (LowPass("push"), "no channel 'push'"),

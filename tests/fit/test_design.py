@@ -39,7 +39,7 @@ def exact_errors(push):
     return np.sqrt(np.diag(np.linalg.inv(information))[:2]), motion
 
 
-def test_a_criterion_that_is_none_is_refused():
+def test_an_unknown_criterion_is_rejected():
     with pytest.raises(ValueError, match=r"`criterion` must be 'D' or 'A', got 'E'"):
         design(Track(), t, push, C, ("gain",), sigma=SIGMA, initial={"x": 0.1}, criterion="E")
 
@@ -57,7 +57,7 @@ def test_the_printed_correlation_is_the_largest_off_the_diagonal():
 
 
 @pytest.mark.slow
-def test_a_plan_is_about_parameters_and_not_about_offsets_of_each_trial():
+def test_a_design_optimizes_parameters_but_not_trial_offsets():
     free = ("gain", Offset("x", each="trial", prior=(0.0, 0.1)), "drift")
     plan = design(Track(), t[:11], push, C, free, sigma=SIGMA, initial={"x": 0.1}, steps=1)
     assert plan.names == ("gain", "drift")
@@ -65,7 +65,7 @@ def test_a_plan_is_about_parameters_and_not_about_offsets_of_each_trial():
 
 
 @pytest.mark.slow
-def test_a_designed_push_tells_more_and_as_much_as_it_says():
+def test_a_designed_input_reduces_the_standard_errors_as_predicted():
     names, limit = ("gain", "drift"), 0.6
     plan = design(
         Track(), t, push, C, names, sigma=SIGMA, initial={"x": 0.1}, steps=12, rms={"push": 1.0}, limits={"x": limit},
@@ -98,7 +98,7 @@ def test_the_gradient_of_a_plan_against_differences():
     np.testing.assert_allclose(both(C)[0], differences(both, C, 1e-5), rtol=1e-5)
 
 
-def test_what_a_plan_does_not_tell_has_an_infinite_error():
+def test_an_unidentifiable_parameter_has_an_infinite_standard_error():
     # Of the first two only their sum is known.
     rows = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 1.0], [0.0, 0.0, 3.0]])
     covariance = covariance_of(rows.T @ rows)

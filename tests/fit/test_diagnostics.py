@@ -21,7 +21,7 @@ def trial(measured, inputs=None, t=t, name="run"):
     return Trial(t, measured, inputs, sigma=1.0, name=name)
 
 
-def test_good_records_are_not_suspected():
+def test_valid_records_give_no_notes():
     coarse = np.round(x / 0.02) * 0.02
     slow = np.round(0.01 * x / 0.001) * 0.001
     switched = np.sign(np.sin(9.0 * t))
@@ -48,13 +48,13 @@ def test_good_records_are_not_suspected():
         (trial({"x": x[::2]}, {"push": x[::2]}, np.where(t < 2, t, t + 1)[::2]), "the times have a gap"),
     ],
 )
-def test_each_suspicion_is_named(record, words):
+def test_each_suspicious_record_is_reported(record, words):
     (note,) = told(record)
     assert note.startswith("run: ")
     assert words in note
 
 
-def test_one_line_for_all_trials():
+def test_notes_of_several_trials_are_combined():
     stale = np.repeat(x[::4], 4)[:201]
     (note,) = told(*(trial({"x": stale + 0.001 * i}, name=f"run {i}") for i in range(5)))
     assert note.startswith("run 0, run 1, run 2 and 2 more: x repeats")
@@ -69,7 +69,7 @@ class Sensed(Cart):
 @pytest.mark.parametrize(
     ("factor", "words"), [(57.3, "seems to be recorded in degrees"), (-1.0, "have opposite signs")]
 )
-def test_a_sensor_in_degrees_or_upside_down(factor, words):
+def test_a_sensor_in_degrees_or_with_a_wrong_sign_is_reported(factor, words):
     system = Sensed(mass=1.0, stiffness=4.0, damping=0.2)
     ride = jk.simulate(system, jk.assemble(system, {"x": 0.5}), t[::4])
     gyro = factor * np.asarray(ride["gyro"])
@@ -79,7 +79,7 @@ def test_a_sensor_in_degrees_or_upside_down(factor, words):
 
 
 @pytest.mark.slow
-def test_a_trial_that_no_parameters_explain_is_named():
+def test_a_trial_with_large_residuals_is_reported():
     system = Cart(mass=1.0, stiffness=4.0, damping=0.2)
     rng, trials = np.random.default_rng(0), []
     for i in range(5):

@@ -209,7 +209,7 @@ def test_huber_against_statsmodels(of_huber):
 
 
 @pytest.mark.slow
-def test_the_gradient_of_scoring_is_that_of_the_likelihood(of_two_channels, of_huber):
+def test_the_gradient_used_for_scoring_equals_that_of_the_likelihood(of_two_channels, of_huber):
     for found in (of_two_channels, of_huber):
         density, point = found.problem.log_density(), found.problem.at({"gain": 1.25})
         with_x = lambda x, p=point: dataclasses.replace(p, parameters=x)  # noqa: E731
@@ -221,7 +221,7 @@ def test_the_gradient_of_scoring_is_that_of_the_likelihood(of_two_channels, of_h
 
 
 @pytest.mark.slow
-def test_scales_of_all_channels_are_estimated(of_two_channels):
+def test_estimates_do_not_depend_on_sigma_if_scales_are_estimated(of_two_channels):
     """A `sigma` that is wrong by another factor in each channel changes nothing."""
     found = of_two_channels
     sigma = {"x": 100 * SIGMA, "x_dot": 0.01 * SIGMA}
@@ -235,7 +235,7 @@ def test_scales_of_all_channels_are_estimated(of_two_channels):
 
 
 @pytest.mark.slow
-def test_without_a_model_scales_alone(of_second_order):
+def test_without_error_models_only_scales_are_estimated(of_second_order):
     problem = of_second_order.problem
     found = fit(Track(), problem.trials, FREE, errors={}, **STEP)
     X = np.concatenate([columns(trial.inputs["push"])[0] for trial in problem.trials])
@@ -257,7 +257,7 @@ def test_without_a_model_scales_alone(of_second_order):
 
 
 @pytest.mark.slow
-def test_tests_and_notes_are_of_innovations(of_second_order):
+def test_residual_tests_and_notes_use_innovations(of_second_order):
     found = of_second_order
     plain = fit(Track(), found.problem.trials, FREE, **STEP)
     assert plain.autocorrelation > 0.6
@@ -276,7 +276,7 @@ def test_tests_and_notes_are_of_innovations(of_second_order):
 
 
 @pytest.mark.slow
-def test_evidence_is_the_density_of_the_measurements():
+def test_the_evidence_equals_the_marginal_density_of_the_measurements():
     """Linear in the start, with a Gaussian prior: the dense marginal density, given the estimated numbers."""
     rng = np.random.default_rng(5)
     data = trials({"x": lambda k: autoregression(rng, PHI_1)}, T=2)
@@ -317,7 +317,7 @@ def test_save_load_and_resume(of_two_channels, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_fit_goes_on_from_its_numbers(of_two_channels):
+def test_a_fit_continues_from_its_error_model_parameters(of_two_channels):
     found = of_two_channels
     again = minimize(found.problem, LeastSquares(), start=found.point)
     assert len(again.history) <= 3
@@ -328,7 +328,7 @@ def test_a_fit_goes_on_from_its_numbers(of_two_channels):
 
 
 @pytest.mark.slow
-def test_held_out_trials_by_the_likelihood_of_the_training(of_two_channels):
+def test_held_out_trials_use_the_error_models_of_the_training_trials(of_two_channels):
     found = of_two_channels
     one = found.problem.trials[0]
     turned = Trial(t, dict(reversed(one.measured.items())), one.inputs, sigma=SIGMA, initial=REST)
@@ -343,7 +343,7 @@ def test_held_out_trials_by_the_likelihood_of_the_training(of_two_channels):
 
 
 @pytest.mark.slow
-def test_an_estimated_scale_is_not_called_wrong():
+def test_an_estimated_scale_is_not_reported_as_wrong():
     """With nearly as many unknown starts as residuals the ratio of residuals to degrees of freedom is far from one."""
     noise = np.random.default_rng(8).normal(size=(3, t.size))
     starts = {"window": 0.5, "unknown": ("x", "x_dot")}
@@ -352,7 +352,7 @@ def test_an_estimated_scale_is_not_called_wrong():
     assert not any("as large as `sigma` says" in note for note in found.notes)
 
 
-def test_simulated_measurements_have_no_likelihood_without_bound():
+def test_the_likelihood_of_exact_measurements_is_bounded():
     data = trials({"x": lambda k: np.zeros(t.size)})
     found = fit(Track(), data, FREE, errors=Huber(), **STEP)
     assert found.estimates == pytest.approx(dict(zip(FREE, TRUTH, strict=True)), rel=1e-6)
@@ -360,7 +360,7 @@ def test_simulated_measurements_have_no_likelihood_without_bound():
     assert 0 < found.measurement_errors["x"]["scale"] < 1e-6
 
 
-def test_ctrl_c_keeps_the_last_round(of_two_channels, monkeypatch):
+def test_ctrl_c_keeps_the_last_iterate(of_two_channels, monkeypatch):
     """The search with the first numbers has converged when the key comes."""
     problem, rounds = of_two_channels.problem.with_errors_of(None), []
     whole = Problem.linearize
@@ -392,7 +392,7 @@ def test_ctrl_c_keeps_the_last_round(of_two_channels, monkeypatch):
         ),
     ],
 )
-def test_what_cannot_be_estimated_is_refused(errors, more, words):
+def test_invalid_error_models_are_rejected(errors, more, words):
     data = trials({"x": lambda k: np.zeros(t.size)}, T=1)
     with pytest.raises((TypeError, ValueError), match=words):
         Problem.of(Track(), data, FREE, errors=errors, **STEP, **more)
@@ -423,7 +423,7 @@ def test_numbers_of_models_are_checked(make):
 
 
 @pytest.mark.slow
-def test_numbers_of_known_residuals():
+def test_error_model_parameters_estimated_from_known_residuals():
     """Of one channel each: given degrees of freedom, normal residuals, a random walk, and a channel without samples."""
     rng = np.random.default_rng(9)
     walk = np.cumsum(rng.normal(size=(2, 150)), axis=1)
@@ -442,14 +442,14 @@ def test_numbers_of_known_residuals():
     assert found.n_estimated == 1 + 2 + 2 + 2
 
 
-def test_a_search_that_has_not_converged_is_not_continued(of_two_channels):
+def test_the_search_does_not_continue_if_it_has_not_converged(of_two_channels):
     found = minimize(of_two_channels.problem.with_errors_of(None), LeastSquares(), steps=1)
     assert found.status == "steps"
     assert len(found.history) == 3
     assert found.measurement_errors["x"]["phi_1"] > 0.5
 
 
-def test_before_anything_is_estimated_scales_are_those_given(of_huber, monkeypatch):
+def test_scales_equal_the_given_ones_if_interrupted_before_estimation(of_huber, monkeypatch):
     def interrupted(self, *arguments):
         raise KeyboardInterrupt
 
@@ -481,7 +481,7 @@ KINDS = {  # models by channel, and what makes their errors
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_intervals_hold_the_truth_as_often_as_they_say(kind):
+def test_interval_coverage_with_error_models(kind):
     models, T = KINDS[kind], 6
     rng, hits = np.random.default_rng(7), 0.0
     posed = trials({c: lambda _: np.zeros(t.size) for c in models}, T=T)

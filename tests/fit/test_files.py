@@ -57,7 +57,7 @@ OPTIMIZERS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", OPTIMIZERS)
-def test_a_descent_goes_on_with_its_own_optimizer_only(name, problem, tmp_path):
+def test_gradient_descent_is_resumed_only_with_the_same_optimizer(name, problem, tmp_path):
     path = kept(problem, tmp_path / "fit.npz", GradientDescent(OPTIMIZERS[name]()))
     for other in OPTIMIZERS.values():
         for optimizer in (other(0.2), *([other()] if other is not OPTIMIZERS[name] else [None])):
@@ -71,7 +71,7 @@ def test_a_descent_goes_on_with_its_own_optimizer_only(name, problem, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_checkpoint_says_in_what_another_fit_differs(problem, tmp_path):
+def test_a_checkpoint_of_a_different_fit_is_rejected_with_the_differences(problem, tmp_path):
     path = kept(problem, tmp_path / "fit.npz")
     others = {
         r"method \(gradient descent there, Levenberg-Marquardt here\)": lambda: minimize(
@@ -101,7 +101,7 @@ def test_a_checkpoint_says_in_what_another_fit_differs(problem, tmp_path):
 
 
 @pytest.mark.parametrize("how", ["empty", "zeros", "cut", "text", "older"])
-def test_a_checkpoint_that_cannot_be_read_is_named(how, problem, tmp_path):
+def test_an_unreadable_checkpoint_is_rejected(how, problem, tmp_path):
     path = kept(problem, tmp_path / "fit.npz", LeastSquares())
     data = path.read_bytes()
     path.write_bytes({"empty": b"", "zeros": bytes(500), "cut": data[:-40], "text": b"thesis"}.get(how, data))
@@ -114,7 +114,7 @@ def test_a_checkpoint_that_cannot_be_read_is_named(how, problem, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["fit.npz"]
 
 
-def test_many_starts_end_with_ctrl_c(problem):
+def test_multi_start_stops_with_ctrl_c(problem):
     once = after(3)
     found = multi_start(problem, 4, callback=once, steps=20)
     assert [f.status for f in found.fits].count("interrupted") == 1
@@ -123,7 +123,7 @@ def test_many_starts_end_with_ctrl_c(problem):
     assert f"Interrupted: {found.untried} more initial guesses were not tried" in str(found)
 
 
-def test_studies_of_fits_end_with_ctrl_c(problem, monkeypatch):
+def test_a_profile_stops_with_ctrl_c(problem, monkeypatch):
     import jaxkane.fit.result.studies as module
 
     fit = minimize(problem, LeastSquares())
@@ -133,7 +133,7 @@ def test_studies_of_fits_end_with_ctrl_c(problem, monkeypatch):
         profile(fit, "gain")
 
 
-def test_lack_of_memory_is_not_taken_for_a_bad_start(problem, monkeypatch):
+def test_an_out_of_memory_error_is_raised(problem, monkeypatch):
     def exhausted(*_):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 bytes.")
 
@@ -148,7 +148,7 @@ def masked(values, *places):
     return np.ma.array(values, mask=mask)
 
 
-def test_what_is_masked_was_not_measured():
+def test_masked_samples_are_missing_values():
     for values in (SEEN, SEEN.astype(np.float32), np.arange(11)):
         trial = Trial(t, {"x": masked(values, 2, 3)}, sigma=0.1)
         np.testing.assert_array_equal(np.isnan(trial.measured["x"]), np.isin(np.arange(11), (2, 3)))
@@ -170,12 +170,12 @@ def test_what_is_masked_was_not_measured():
     [{"push": lambda t, state: -state["x"]}, lambda t, state: {"push": 0.0}, {"push": jnp.sin}],
     ids=["function", "controller", "jax"],
 )
-def test_feedback_belongs_into_loads(inputs):
+def test_an_input_function_is_rejected_in_favour_of_loads(inputs):
     with pytest.raises(ValueError, match=r"got a function.*feedback.* into the system's `loads`"):
         Trial(t, {"x": SEEN}, inputs, sigma=0.1)
 
 
-def test_entries_are_compared_without_code_of_python(problem):
+def test_parameter_entries_are_compared_without_python_code(problem):
     """Ctrl-C in an `__eq__` of Python comes out of JAX as a ValueError."""
     entry = problem.parameters.entries[0]
     assert type(entry).__eq__ is tuple.__eq__

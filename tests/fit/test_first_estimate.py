@@ -55,7 +55,7 @@ def test_first_guess_of_a_measured_double_pendulum():
 
 
 @pytest.mark.slow
-def test_bodies_that_can_be():
+def test_estimated_bodies_are_physically_consistent():
     """Torques that ask for a negative moment of inertia: what is returned has a positive pseudo-inertia."""
     ball = mechanism(
         [
@@ -89,7 +89,7 @@ def test_bodies_that_can_be():
 
 
 @pytest.mark.slow
-def test_a_first_guess_may_start_with_a_centre_at_the_joint():
+def test_first_estimate_with_an_initial_mass_centre_at_the_joint():
     """There the moment of inertia about the joint does not change with it, and elsewhere it does."""
     truth, at = swings()
     start = dataclasses.replace(truth, a2=0.0)
@@ -99,7 +99,7 @@ def test_a_first_guess_may_start_with_a_centre_at_the_joint():
 
 
 @pytest.mark.slow
-def test_what_a_first_guess_refuses():
+def test_first_estimate_rejects_parameters_that_are_not_linear_or_unknown():
     _, at = swings()
     for free, said in (
         ("L1", "linear in L1, which changes lengths"),
@@ -110,7 +110,7 @@ def test_what_a_first_guess_refuses():
             first_estimate(Swing(), at, free)
 
 
-def test_no_knots_are_tried_that_are_closer_than_samples():
+def test_spline_knots_are_not_closer_than_samples():
     """Each finer spacing explains more of a blow, down to one at which every interval would be a gap."""
     t = np.linspace(0.0, 1.0, 101)
     torque, rate = np.where((t > 0.5) & (t < 0.52), 16.0, 0.0), np.where(t < 0.51, 0.0, 6.3)
@@ -129,7 +129,7 @@ def test_inertia_of_a_body_by_its_name():
         Inertia.of(jk.catalog.DoublePendulum(), "link7")
 
 
-def test_what_was_freed_as_an_inertia_is_told_as_a_whole():
+def test_a_free_inertia_is_reported_as_one_body():
     bicycle = jk.catalog.WhippleBicycle.benchmark()
     parameters = parameters_of(bicycle, (jk.fit.frame_inertia("H"), "mB", jk.fit.frame_inertia("F", fixed=())))
     fork, wheel = describe_bodies(parameters, parameters.start * 0.0)

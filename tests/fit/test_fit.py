@@ -85,7 +85,7 @@ def test_jacobian_against_central_differences(swings):
     np.testing.assert_allclose(R.T @ R, A.T @ A, rtol=1e-8, atol=1e-8 * float(jnp.max(A.T @ A)))
 
 
-def test_elimination_is_the_dense_solution():
+def test_elimination_equals_the_dense_solution():
     tolerance = 1e-9
     rng = np.random.default_rng(0)
     W, n_z, n_b, n_x = 5, 3, 2, 2
@@ -141,13 +141,13 @@ def test_any_optax_optimizer(problem):
     check(minimize(problem, GradientDescent(optax.adam(optax.cosine_decay_schedule(0.2, 100)), rtol=0.03)))
 
 
-def test_plain_coordinates_go_down(problem):
+def test_gradient_descent_without_preconditioning_reduces_the_cost(problem):
     result = minimize(problem, GradientDescent(refresh=None), steps=5)
     assert result.status == "steps"
     assert result.cost < result.history[0]
 
 
-def test_an_interrupted_fit_keeps_the_best(problem, monkeypatch):
+def test_an_interrupted_fit_returns_the_best_iterate(problem, monkeypatch):
     calls, step = [], optimizers._guarded
 
     def interrupted(*arguments):
@@ -164,7 +164,7 @@ def test_an_interrupted_fit_keeps_the_best(problem, monkeypatch):
     assert result.cost == min(result.history) < result.history[0]
 
 
-def test_steps_into_nowhere_are_halved(problem):
+def test_steps_to_infinite_costs_are_halved(problem):
     leap = optax.sgd(1e6)
     result = minimize(problem, GradientDescent(leap), steps=2)
     assert np.all(np.isfinite(result.history))
@@ -172,7 +172,7 @@ def test_steps_into_nowhere_are_halved(problem):
 
 
 @pytest.mark.slow
-def test_a_parameter_without_influence_is_named(swings):
+def test_a_parameter_without_influence_is_reported(swings):
     # Without inputs only the ratio of gravity and length matters, and the mass not at all.
     quiet = [Trial(s.t, s.measured, sigma=SIGMA, name=s.name) for s in swings]
     seen = identifiability(Problem.of(GUESS, quiet, ("mass", "length", "gravity"), **OPTIONS))
@@ -190,7 +190,7 @@ def test_a_parameter_without_influence_is_named(swings):
 
 
 @pytest.mark.slow
-def test_a_start_that_cannot_be_simulated_is_named(swings):
+def test_an_initial_guess_that_cannot_be_simulated_is_reported(swings):
     with pytest.raises(
         ValueError, match=r"1\.5 s: with the initial guess the residuals from 0 to 0\.68 s are not finite"
     ):

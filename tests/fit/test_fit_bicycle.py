@@ -78,7 +78,7 @@ def test_an_unstable_bicycle_from_five_initial_guesses(unstable):
 
 
 @pytest.mark.slow
-def test_bodies_of_a_bicycle_stay_possible(unstable):
+def test_estimated_bodies_of_a_bicycle_are_physically_possible(unstable):
     truth, trial, offsets, options = unstable
     rear = frame_inertia("B", fixed=("mB", "xB"))
     result = minimize(Problem.of(truth, trial, (rear, *offsets), window=1.0, **options), LeastSquares(), steps=6)
@@ -122,7 +122,7 @@ def test_steer_damping_of_a_measured_bicycle_by_descent(measured):
     assert any("not white noise" in note for note in result.notes)
 
 
-def test_what_noise_asks_for_is_taken_of_bicycles_too():
+def test_noise_parameters_are_accepted_in_bicycle_problems():
     t = np.linspace(0.0, 1.0, 11)
     ride = Trial(t, {"roll": 0.1 * t, "steer": 0.1 * t}, sigma=1.0, initial={"speed": 5.0})
     free = ("c", SpectralDensity("roll_rate"), NoiseScale("steer", start=0.02))
@@ -133,7 +133,7 @@ def test_what_noise_asks_for_is_taken_of_bicycles_too():
         bicycle_problem(ride, WhippleBicycle.benchmark(), free)
 
 
-def test_a_ride_needs_its_speed():
+def test_a_bicycle_trial_requires_a_speed():
     t = np.linspace(0.0, 1.0, 11)
     ride = Trial(t, {"roll": 0.1 * t}, sigma=SIGMA, name="ride 7")
     with pytest.raises(ValueError, match="ride 7: the speed is missing"):

@@ -59,7 +59,7 @@ def by_exact_motion(trial):
 
 
 @pytest.mark.slow
-def test_few_samples_a_period_have_no_bias(trial, by_exact_motion):
+def test_few_samples_per_period_do_not_bias_the_estimates(trial, by_exact_motion):
     best, errors = by_exact_motion
     found = fit(GUESS, trial, NAMES, optimizer=LeastSquares())
     assert found.ok, found.message
@@ -70,7 +70,7 @@ def test_few_samples_a_period_have_no_bias(trial, by_exact_motion):
 
 @pytest.mark.slow
 @pytest.mark.many_steps
-def test_steps_too_coarse_are_told_or_halved(trial):
+def test_too_coarse_steps_are_reported_or_halved(trial):
     # Slow where it starts: the steps that are chosen there are too coarse where it ends.
     slow = Cart(mass=1.0, stiffness=350.0, damping=40.0)
     problem = Problem.of(slow, trial, NAMES)
@@ -90,7 +90,7 @@ def test_steps_too_coarse_are_told_or_halved(trial):
 
 
 @pytest.mark.slow
-def test_steps_are_halved_where_that_changes_anything(trial):
+def test_steps_are_halved_only_in_windows_where_the_error_is_large(trial):
     at_rest = Trial(
         t, {"x": np.zeros(t.size)}, {"push": np.zeros(t.size)}, sigma=SIGMA, initial={"x": 0.0, "x_dot": 0.0}
     )
@@ -99,7 +99,7 @@ def test_steps_are_halved_where_that_changes_anything(trial):
     assert steps[1] == H
 
 
-def test_a_step_longer_than_a_window_is_one_that_halving_shortens(trial):
+def test_a_step_longer_than_a_window_has_the_error_of_the_window_length(trial):
     posed = [Problem.of(GUESS, trial, NAMES, simulation=Simulation(step=x)) for x in (t[-1], 100.0 * t[-1])]
     errors = [step_errors(problem, problem.start) for problem in posed]
     np.testing.assert_array_equal(errors[0], errors[1])
@@ -107,7 +107,7 @@ def test_a_step_longer_than_a_window_is_one_that_halving_shortens(trial):
 
 
 @pytest.mark.slow
-def test_what_says_how_to_integrate(trial):
+def test_simulation_options_are_applied_and_checked(trial):
     assert Problem.of(GUESS, trial, NAMES, simulation=Simulation(atol=1e-9)).model.settings.step is None
     assert Problem.of(GUESS, trial, NAMES, simulation=Simulation(step=1e-3)).model.settings.max_steps is None
     for options, message in (
@@ -160,7 +160,7 @@ def beyond():
     [GradientDescent(), *(pytest.param(m, marks=pytest.mark.slow) for m in (LeastSquares(),))],
     ids=lambda m: m.name,
 )
-def test_no_method_converges_where_nothing_can_be_simulated(beyond, method):
+def test_no_method_reports_convergence_if_the_optimum_cannot_be_simulated(beyond, method):
     found = minimize(beyond, method)
     assert found.status in ("stuck", "steps"), found
     assert not found.ok
@@ -212,7 +212,7 @@ def test_stiff_motions_are_fitted(stiff, how):
 
 @pytest.mark.slow
 @pytest.mark.many_steps
-def test_what_falls_from_the_guess_is_fitted_with_the_steps_of_others(stiff):
+def test_a_window_that_fails_at_the_guess_uses_the_step_of_the_others(stiff):
     """One start is far off, so that the step finds no end there whatever it is; it is as short as those of others."""
     guess, trials, _ = stiff
     problem = Problem.of(guess, trials, "stiffness")

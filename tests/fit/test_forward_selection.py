@@ -102,7 +102,7 @@ def found(rubbing):
 
 
 @pytest.mark.slow
-def test_dry_friction_is_found_among_five(rubbing, found):
+def test_dry_friction_is_selected_from_five_candidates(rubbing, found):
     assert found.selected == ("dry",)
     assert found.best is found.rounds[0][0]
     assert len(found.rounds[0]) == 5
@@ -118,7 +118,7 @@ def test_dry_friction_is_found_among_five(rubbing, found):
 
 
 @pytest.mark.slow
-def test_the_promise_is_that_of_a_fit(rubbing):
+def test_predicted_cost_agrees_with_a_new_fit(rubbing):
     """Beside a fit that is posed anew with one more parameter, and trials left out of it by refits."""
     found = forward_selection(rubbing, FIVE[:3], depth=3, refits=3)
     # Beside dry friction nothing stands: the search ends by itself.
@@ -156,7 +156,7 @@ def beams():
 
 
 @pytest.mark.slow
-def test_a_beam_finds_what_an_impostor_hides(beams):
+def test_beam_search_selects_terms_that_greedy_selection_misses(beams):
     greedy, beam = beams
     assert greedy.selected[0] == "both"
     assert not greedy.alternatives or all("both" in one.names or len(one.names) == 1 for one in greedy.alternatives)
@@ -172,7 +172,7 @@ def test_a_beam_finds_what_an_impostor_hides(beams):
 
 
 @pytest.mark.slow
-def test_what_is_not_there_is_not_taken():
+def test_absent_terms_are_rarely_selected():
     taken = 0
     for seed in range(10):
         without = fitted(record(seed))
@@ -181,7 +181,7 @@ def test_what_is_not_there_is_not_taken():
 
 
 @pytest.mark.slow
-def test_negative_friction_is_not_believed(rubbing):
+def test_implausible_negative_friction_is_not_accepted(rubbing):
     asked = ("quadratic", Free("spring", bounds=(0.0, None)))
     found = forward_selection(
         rubbing, asked, refits=None, level=0.9, plausible={"damping": (0.0, 0.6), "quadratic": (0.0, None)}
@@ -198,7 +198,7 @@ def test_negative_friction_is_not_believed(rubbing):
 
 
 @pytest.mark.slow
-def test_one_sensor_is_off_in_all_trials():
+def test_a_common_sensor_offset_is_selected():
     trials = record(3, angle=0.05)
     kinds = (Offset("angle", scale=0.1), Offset("rate"), Gain("rate"), Delay("torque"), Delay("rate"), "dry")
     found = forward_selection(fitted(trials), kinds, refits=2)
@@ -207,7 +207,7 @@ def test_one_sensor_is_off_in_all_trials():
 
 
 @pytest.mark.slow
-def test_a_known_start_is_off_in_all_trials():
+def test_a_common_offset_of_known_initial_states_is_selected():
     trials = [trial.with_initial_state({"rate": 0.5 * (i % 3) + 0.1}) for i, trial in enumerate(record(4))]
     found = forward_selection(fitted(trials, unknown="angle"), [Offset("rate", of="start"), "dry", "quadratic"])
     assert found.selected == ("offset of start of rate",)
@@ -216,7 +216,7 @@ def test_a_known_start_is_off_in_all_trials():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hold", [(), ("torque",)], ids=["linear", "held"])
-def test_a_torque_that_acts_late(hold):
+def test_an_input_delay_is_selected(hold):
     """By two samples of 0.05 s; of a held one the delay is found to where its mean is taken for it."""
     trials = record(5, late=2)
     asked = (Delay("torque"), Gain("torque"), "dry")
@@ -240,7 +240,7 @@ class Lagging(Pendulum):
 
 
 @pytest.mark.slow
-def test_another_system_with_a_state():
+def test_a_candidate_system_with_an_additional_state_is_selected():
     """What is not neutral anywhere is fitted; what its system begins with is not what is plausible."""
     trials = record(6, system=Lagging(lag=0.08))
     lag = Candidate("motor lag", system=Lagging(stiffness=3.0), free="lag", unknown="acting")
@@ -252,7 +252,7 @@ def test_another_system_with_a_state():
 
 
 @pytest.mark.slow
-def test_what_data_cannot_tell_is_said(rubbing):
+def test_unidentifiable_candidates_are_reported(rubbing):
     posed = fitted(rubbing.problem.trials, Offset("torque", each="trial"))
     found = forward_selection(posed, ["unused", Offset("torque")])
     with pytest.raises(ValueError, match="own: a candidate with `each` is not supported"):
@@ -265,7 +265,7 @@ def test_what_data_cannot_tell_is_said(rubbing):
 
 
 @pytest.mark.slow
-def test_one_trial_alone(rubbing):
+def test_selection_with_one_trial(rubbing):
     alone = fitted(rubbing.problem.trials[:1])
     found = forward_selection(alone, ["dry", "spring"])
     assert "there is no held-out cost" in found.tables[0][0]
@@ -304,12 +304,12 @@ def test_one_trial_alone(rubbing):
         ((Delay("angle", of="start"),), {}, "`of` must be 'input', 'sensor' or None"),
     ],
 )
-def test_what_cannot_be_asked_is_named(rubbing, asked, options, message):
+def test_invalid_candidates_and_options_are_rejected(rubbing, asked, options, message):
     with pytest.raises(ValueError, match=message):
         forward_selection(rubbing, asked, **options)
 
 
-def test_what_is_asked_of_a_fit_at_a_minimum(rubbing):
+def test_forward_selection_requires_a_converged_fit(rubbing):
     with pytest.raises(TypeError, match="forward_selection requires a Fit"):
         forward_selection(rubbing.problem, "dry")
     with pytest.raises(ValueError, match="has not converged"):
@@ -317,7 +317,7 @@ def test_what_is_asked_of_a_fit_at_a_minimum(rubbing):
 
 
 @pytest.mark.slow
-def test_fits_beside_each_other(rubbing, found):
+def test_fits_are_compared_in_a_table(rubbing, found):
     held = record(9, system=Pendulum(dry=0.4))
     table = compare({"viscous": rubbing, "with friction": found.fit}, held, plausible={"damping": 0.5})
     assert table.held_out["with friction"].cost < 0.3 * table.held_out["viscous"].cost
@@ -349,7 +349,7 @@ def test_fits_beside_each_other(rubbing, found):
 
 
 @pytest.mark.slow
-def test_a_fit_of_one_candidate_runs_the_program_of_all(rubbing, monkeypatch):
+def test_a_fit_of_one_candidate_reuses_the_compiled_program_of_all(rubbing, monkeypatch):
     """Nothing is compiled for it, and it has the derivatives of a program of its own."""
     asked = checked_terms(rubbing, ["dry", Gain("torque"), "spring"])
     problem, point = augmented_problem(asked.base, (rubbing.problem, rubbing.point, rubbing.names), asked.candidates)
@@ -375,7 +375,7 @@ def test_a_fit_of_one_candidate_runs_the_program_of_all(rubbing, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_page_of_the_report(found, tmp_path):
+def test_the_report_contains_the_forward_selection(found, tmp_path):
     page = save_report(found.fit, tmp_path / "fit.html", forward_selection=found).read_text(encoding="utf-8")
     assert "Model extensions" in page
     assert "no more than chance" in page
@@ -386,7 +386,7 @@ def test_a_page_of_the_report(found, tmp_path):
 
 
 @pytest.mark.parametrize("held", [("push",), ()])
-def test_a_delay_of_what_is_held_is_asked_by_itself(held):
+def test_a_delay_of_a_zero_order_hold_input_is_a_group_of_its_own(held):
     """Its jumps are ramps: beside it no other candidate would be compared with the fit as it stands."""
     problem = types.SimpleNamespace(system=None, model=types.SimpleNamespace(zero_order_hold=held))
     asked = [Candidate("a", "mass"), Candidate("late", Delay("push")), Candidate("b", "stiffness")]
@@ -402,7 +402,7 @@ class Squared(Track):
 
 
 @pytest.mark.slow
-def test_a_candidate_that_is_not_nested():
+def test_a_candidate_that_is_not_nested_is_compared_by_held_out_cost():
     """Another system without one parameter more, beside what is promising, with one refit: trials left out decide."""
     rng, times, trials = np.random.default_rng(7), np.linspace(0.0, 3.0, 31), []
     for i in range(4):
@@ -475,7 +475,7 @@ def row_of(found, name):
 
 
 @pytest.mark.slow
-def test_units_do_not_matter():
+def test_selection_does_not_depend_on_units():
     """Masses of 1e-12 and 1e12 kg: a candidate that starts at zero has a scale of its own."""
     rows = []
     for mass in (1.0, 1e-12, 1e12):
@@ -492,7 +492,7 @@ def test_units_do_not_matter():
 
 
 @pytest.mark.slow
-def test_refits_that_were_asked_for_are_made():
+def test_the_requested_number_of_refits_is_made():
     """However little a score test says of a candidate: the linearization may hardly see a damper."""
     found = forward_selection(
         loaded(carts(lambda x, v: 0.3 * v, n=3)), ["drag", "cubic", "other", Gain("x")], level=1e-9
@@ -525,7 +525,7 @@ def test_a_term_is_replaced():
 
 
 @pytest.mark.slow
-def test_a_pair_of_which_neither_is_accepted_alone():
+def test_a_pair_is_selected_if_neither_term_is_accepted_alone():
     """Two forces that are nearly alike, with opposite signs: only their difference acts."""
     trials = carts(lambda x, v: v - 1.6 * np.sin(3.0 * v) / 3.0, sigma=0.02, size=lambda i: 0.25)
     before = loaded(trials)
@@ -540,7 +540,7 @@ def test_a_pair_of_which_neither_is_accepted_alone():
 
 
 @pytest.mark.slow
-def test_what_cannot_be_negative_is_tested_on_one_side():
+def test_a_parameter_with_a_lower_bound_has_a_one_sided_test():
     before = loaded(carts(lambda x, v: 0.006 * v, sigma=0.02))
     both = row_of(forward_selection(before, "damping", refits=0), "damping")
     one = row_of(forward_selection(before, Free("damping", bounds=(0.0, None)), refits=0), "damping")
@@ -551,7 +551,7 @@ def test_what_cannot_be_negative_is_tested_on_one_side():
     assert other.bound_violations
 
 
-def test_trials_of_another_kind_are_held_out():
+def test_trials_are_held_out_by_label():
     """A cubic spring stands in for drag as long as all amplitudes are alike."""
     trials = carts(lambda x, v: 0.5 * v, n=6, size=lambda i: 1.0 + i % 2, amplitude=lambda i: 1 + i % 2)
     found = forward_selection(loaded(trials), "damping", folds="amplitude")
@@ -568,7 +568,7 @@ def test_trials_of_another_kind_are_held_out():
 
 
 @pytest.mark.slow
-def test_estimates_that_were_free_before_are_judged_too():
+def test_implausible_estimates_of_the_initial_model_are_reported():
     """A negative damping makes up for an offset: it is named, and it is no reason against what is found."""
     trials = carts(lambda x, v: -0.1 * v + 0.3)
     before = loaded(trials, ("stiffness", "damping"))
@@ -586,7 +586,7 @@ def test_estimates_that_were_free_before_are_judged_too():
 
 
 @pytest.mark.slow
-def test_a_parameter_rests_at_its_bound():
+def test_selection_from_a_fit_with_a_parameter_at_its_bound():
     """Predictions do not move it beyond the bound. The fit of a candidate may take it off the bound."""
     trials = carts(lambda x, v: 0.1 * v - 0.2 * np.sin(3.0 * v), n=4, sigma=0.02, size=lambda i: 0.25)
     before = loaded(trials, ("stiffness", Free("damping", start=0.1, bounds=(0.0, None))))
@@ -600,7 +600,7 @@ def test_a_parameter_rests_at_its_bound():
 
 
 @pytest.mark.slow
-def test_a_thrust_is_no_negative_damping():
+def test_a_thrust_is_not_reported_as_an_energy_source():
     """It adds energy as long as the cart moves forward, but not if the same motion is run backwards."""
     forward = Trial(T, {"x": 0.4 * T**2}, {"push": 0.0 * T}, sigma=0.1)
     assert energy_sources(fit(Track(), forward, "drift", simulation=Simulation(step=0.1))) == {}

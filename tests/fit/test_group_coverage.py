@@ -41,6 +41,6 @@ def covered(prior, deviation, noise=0.05, sets=SETS):
     [(None, 0.3, 0.95), ("normal", 0.3, 0.95), ("normal", 0.03, 0.80)],  # a note warns of the last case
     ids=["free", "wide", "narrow"],
 )
-def test_intervals_of_groups_contain_the_truth(prior, deviation, least):
+def test_interval_coverage_with_groups(prior, deviation, least):
     for name, share in covered(prior, deviation).items():
         assert least - SLACK < share, (name, share)

@@ -68,7 +68,7 @@ def mixed():
 
 
 @pytest.mark.slow
-def test_a_distribution_over_groups_is_that_of_the_restricted_likelihood(mixed):
+def test_a_distribution_over_groups_maximizes_the_restricted_likelihood(mixed):
     trials, found = mixed
     best = optimize.minimize_scalar(
         lambda x: restricted(columns(trials), x)[0], bracket=(0.0, 3.0), options={"xtol": 1e-12}
@@ -115,7 +115,7 @@ def test_few_groups_give_few_degrees_of_freedom(mixed):
 
 
 @pytest.mark.filterwarnings("ignore")  # of statsmodels
-def test_a_distribution_over_groups_is_that_of_statsmodels(mixed):
+def test_a_distribution_over_groups_agrees_with_statsmodels(mixed):
     models = pytest.importorskip("statsmodels.regression.mixed_linear_model")
     trials, found = mixed
     y, rider, X = columns(trials)
@@ -127,7 +127,7 @@ def test_a_distribution_over_groups_is_that_of_statsmodels(mixed):
 
 
 @pytest.mark.slow
-def test_groups_without_a_distribution_are_fits_of_each_group_alone():
+def test_groups_without_a_distribution_equal_separate_fits():
     trials = recorded(1)
     found = fit(Track(), trials, Free("gain", each="rider"), **EXACT)
     assert found.names == tuple(f"gain [{rider}]" for rider in RIDERS)
@@ -144,7 +144,7 @@ def test_groups_without_a_distribution_are_fits_of_each_group_alone():
     assert alone.names == ("gain [run 0]", "gain [run 1]", "gain [run 2]", "drift")
 
 
-def test_the_mean_stands_for_other_groups_and_a_file_keeps_the_deviation(mixed, tmp_path):
+def test_new_groups_use_the_mean_and_a_file_keeps_the_deviation(mixed, tmp_path):
     trials, found = mixed
     new = Trial(T, trials[0].measured, trials[0].inputs, sigma=0.025, initial={"x": 0.0, "x_dot": 0.0},
                 labels={"rider": "fay"}, name="new")  # fmt: skip
@@ -158,7 +158,7 @@ def test_the_mean_stands_for_other_groups_and_a_file_keeps_the_deviation(mixed, 
     assert again.standard_errors == found.standard_errors
 
 
-def test_groups_that_do_not_differ():
+def test_groups_without_differences_have_a_deviation_near_zero():
     trials = recorded(2, deviation=0.0)
     found = fit(Track(), trials, (Free("gain", each="rider", prior="normal"), "drift"), **EXACT)
     y, _, X = columns(trials)
@@ -171,7 +171,7 @@ def test_groups_that_do_not_differ():
 
 
 @pytest.mark.slow
-def test_a_log_normal_distribution_is_that_of_the_linearized_model():
+def test_a_log_normal_distribution_equals_that_of_the_linearized_model():
     trials = recorded(5, deviation=0.2)
     free = (Free("gain", bounds=(0.0, None), each="rider", prior="lognormal"), "drift")
     found = fit(Track(), trials, free, **EXACT)
@@ -186,7 +186,7 @@ def test_a_log_normal_distribution_is_that_of_the_linearized_model():
 
 
 @pytest.mark.slow
-def test_one_offset_of_two_channels():
+def test_one_offset_is_shared_by_two_channels():
     rng = np.random.default_rng(3)
     trials = []
     for k in range(3):
@@ -202,7 +202,7 @@ def test_one_offset_of_two_channels():
     assert [v["offset of x, x_dot"] for v in found.nuisance.values()] == pytest.approx(best[1:], rel=TIGHT, abs=1e-7)
 
 
-def test_a_trial_has_its_own_factor_beside_the_common_one():
+def test_gains_and_offsets_of_a_trial_combine_with_the_common_ones():
     free = ("gain", Gain("x"), Gain("x", each="trial", prior=(1.0, 0.1)), Offset("x", each="trial", prior=(0.2, 0.1)))
     problem = Problem.of(Track(), recorded()[:1], free, simulation=EXACT["simulation"])
     common = {("gain of sensor", "x"): 2.0}
@@ -213,7 +213,7 @@ def test_a_trial_has_its_own_factor_beside_the_common_one():
 
 
 @pytest.mark.slow
-def test_offsets_of_windows_are_those_of_trials_that_are_one_window_long():
+def test_offsets_per_window_equal_offsets_of_trials_of_one_window():
     tolerance = 1e-6  # the end of the iterations differs by 1e-8 between processors
     rng, trials = np.random.default_rng(5), []
     for push, A in zip(PUSHES[:2], RESPONSES, strict=False):
@@ -255,7 +255,7 @@ def test_offsets_of_windows_are_those_of_trials_that_are_one_window_long():
         (Free("gain", bounds=(0.0, None), prior=("lognormal", 1.0, -0.1)), "`prior` must be"),
     ],
 )
-def test_bad_groups_are_named(item, message):
+def test_invalid_groups_are_rejected(item, message):
     with pytest.raises(ValueError, match=message):
         Problem.of(Track(), recorded(), item, simulation=EXACT["simulation"])
     with pytest.raises(ValueError, match="a distribution needs at least three groups, but 'rider' has 2"):

@@ -233,7 +233,7 @@ def test_errors_by_window():
 
 
 @pytest.mark.slow
-def test_intervals_and_profiles_have_the_same_freedom(case):
+def test_intervals_and_profiles_have_the_same_degrees_of_freedom(case):
     records, found, *_, best = case
     C, freedom = errors_by_trial(records)
     half = stats.t.ppf(0.95, freedom) * np.sqrt(C.diagonal())
@@ -244,7 +244,7 @@ def test_intervals_and_profiles_have_the_same_freedom(case):
         assert profile(found, name, n=5, level=0.9).interval == pytest.approx((low, high), abs=1e-3 * half[i])
 
 
-def test_what_a_plan_will_determine_follows_from_sigma():
+def test_identifiability_of_a_planned_experiment_depends_on_sigma():
     """Simulated measurements are met exactly: what the plan determines depends on `sigma` alone."""
     records = [C @ [1.0, 0.0, 0.1, -0.2, 0.0] for C in COLUMNS]
     seen = identifiability(Problem.of(Track(), trials_of(records), (*FREE, OWN), **OPTIONS))
@@ -256,7 +256,7 @@ def test_what_a_plan_will_determine_follows_from_sigma():
 
 
 @pytest.mark.slow
-def test_trials_left_out(case):
+def test_cross_validation_equals_refits_without_each_trial(case):
     records, found, *_, best = case
     left_out = cross_validate(found)
     pieces = list(by_trial(records))
@@ -274,7 +274,7 @@ def test_trials_left_out(case):
 
 
 @pytest.mark.slow_cases("noise")
-def test_the_held_out_cost_is_that_of_fits_of_the_others(case):
+def test_the_held_out_cost_equals_that_of_cross_validation(case):
     rtol = 1e-5  # of starts and offsets that are searched for
     free = ("gain", "drift", Offset("x_dot", each="trial", prior=(0.0, 0.5)))  # which starts cannot stand for
     found = fit(Track(), trials_of(recorded(3)), free, **OPTIONS)
@@ -293,7 +293,7 @@ def test_the_held_out_cost_is_that_of_fits_of_the_others(case):
     assert row.split()[-1] == told
 
 
-def test_the_evidence_is_the_density_of_the_data():
+def test_the_evidence_equals_the_gaussian_density_of_the_data():
     # All unknowns have Gaussian priors, so the data are Gaussian: their density needs no integral.
     records = recorded(2)
     at_rest = trials_of(records, initial={"x": 0.0, "x_dot": 0.0})
@@ -329,7 +329,7 @@ def evidence():
 
 
 @pytest.mark.slow
-def test_the_evidence_knows_priors_and_no_scales(evidence):
+def test_the_evidence_depends_on_priors_but_not_on_scales(evidence):
     prior = (1.0, 0.5)
     drift = Free("drift", prior=(0.0, 2.0))
     first = evidence(Free("gain", prior=prior), drift).log_evidence
@@ -361,7 +361,7 @@ def test_the_evidence_knows_priors_and_no_scales(evidence):
 
 
 @pytest.mark.slow
-def test_a_wider_prior_pays_for_itself(evidence):
+def test_a_wider_prior_reduces_the_evidence(evidence):
     drift = Free("drift", prior=(0.0, 2.0))
     wide = [evidence(Free("gain", prior=(1.2, width)), drift).log_evidence for width in (10.0, 1000.0)]
     assert wide[1] - wide[0] == pytest.approx(-np.log(100.0), abs=1e-3)
@@ -376,7 +376,7 @@ def test_a_wider_prior_pays_for_itself(evidence):
 
 
 @pytest.mark.slow
-def test_what_has_no_influence_takes_no_error_from_the_others():
+def test_a_parameter_without_influence_does_not_change_the_other_errors():
     """Without a push its gain is free: infinite errors of both kinds, and those of the drift as without it."""
     trials = [Trial(t, x.measured, {"push": 0.0 * t}, sigma=SIGMA[0]) for x in trials_of(recorded(5, wander=0.2))]
     both, alone = (
@@ -391,7 +391,7 @@ def test_what_has_no_influence_takes_no_error_from_the_others():
 
 
 @pytest.mark.slow
-def test_the_verdict_does_not_know_units():
+def test_identifiability_does_not_depend_on_units():
     # A push in mN with a gain in 1/g is the same experiment: so is what the data tell.
     def told(unit, noise):
         records = [y + noise * SIGMA * np.random.default_rng(9).normal(size=y.size) for y in recorded(3)]
@@ -410,7 +410,7 @@ def test_the_verdict_does_not_know_units():
 
 
 @pytest.mark.slow
-def test_the_verdict_does_not_know_the_start():
+def test_identifiability_does_not_depend_on_the_initial_guess():
     """A small initial guess is a small scale; the estimate is known to a hundredth of itself all the same."""
     trials = trials_of(recorded(3))
     for start in (1.0, 1e-6):
@@ -441,7 +441,7 @@ class Doubled(Track):
 
 
 @pytest.mark.slow
-def test_outputs_are_channels_of_their_own():
+def test_outputs_of_a_system_are_fitted_as_channels():
     x, push = 0.4 * t**2, {"push": np.sin(3.0 * t)}
     fixed = {"simulation": Simulation(step=0.1), "optimizer": LeastSquares(rtol=1e-14, damping=1e-7)}
     column = responses(push["push"])[: t.size, 0]
@@ -472,7 +472,7 @@ def test_errors_by_part():
 
 
 @pytest.mark.slow
-def test_the_held_out_cost_beside_a_bound():
+def test_the_held_out_cost_with_a_parameter_at_its_bound():
     """A parameter at its bound is fixed: as in a fit that does not free it."""
     records, bounded = trials_of(recorded(3)), Free("gain", start=0.5, bounds=(0.0, 1.0))  # it is 1.2
     at_bound = fit(Track(), records, (bounded, "drift"), **OPTIONS)
@@ -484,7 +484,7 @@ def test_the_held_out_cost_beside_a_bound():
 
 
 @pytest.mark.slow
-def test_the_priors_of_a_subset_are_its_own():
+def test_a_subset_of_parameters_has_only_its_own_priors():
     """Of three parameters, the last alone with its prior: as one that was never posed with the others."""
     records = trials_of(recorded(3))
     priors = (Free("gain", prior=(1.0, 0.5), bounds=(0.0, 9.0)), Free("drift", prior=(0.1, 0.01)))

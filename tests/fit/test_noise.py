@@ -115,7 +115,7 @@ def found(case):
 
 
 @pytest.mark.slow
-def test_the_likelihood_is_that_of_the_linear_motion(case):
+def test_the_likelihood_equals_that_of_the_linear_gaussian_model(case):
     _, y, problem = case
     there = problem.linearize(problem.start)
     assert there.cost == pytest.approx(minus_twice_log_likelihood(y), rel=EXACT)
@@ -133,7 +133,7 @@ def test_the_likelihood_is_that_of_the_linear_motion(case):
 
 
 @pytest.mark.slow
-def test_the_information_is_fishers_on_average(case):
+def test_the_information_matrix_is_the_fisher_information_on_average(case):
     """1/2 tr (C^-1 dC C^-1 dC) + dm^T C^-1 dm, of all measurements at once."""
     _, y, problem = case
     seen = np.isfinite(np.stack([y["x"], y["x_dot"]], axis=1).ravel())
@@ -161,7 +161,7 @@ def test_the_information_is_fishers_on_average(case):
 
 
 @pytest.mark.slow
-def test_the_fit_is_the_maximum(case, found):
+def test_the_fit_maximizes_the_likelihood(case, found):
     _, y, _ = case
     assert found.status == "converged"
     values = lambda p: (np.exp(p[0]), p[1], np.exp(p[2]), np.exp(p[3]))  # noqa: E731
@@ -188,7 +188,7 @@ def test_the_fit_is_the_maximum(case, found):
 
 
 @pytest.mark.slow
-def test_gradient_descent_ends_there_too(case, found):
+def test_gradient_descent_converges_to_the_same_maximum(case, found):
     problem = case[2]
     assert minimize(problem, GradientDescent()).cost == pytest.approx(found.cost, abs=1e-3)
     slope = jax.jit(jax.grad(of_x(problem)))(problem.start).parameters
@@ -196,7 +196,7 @@ def test_gradient_descent_ends_there_too(case, found):
 
 
 @pytest.mark.slow
-def test_a_fit_is_saved(case, found, tmp_path):
+def test_a_fit_with_process_noise_is_saved_and_loaded(case, found, tmp_path):
     again = load(found.save(tmp_path / "fit.npz"), case[2])
     assert again.estimates == found.estimates
     assert again.cost == found.cost
@@ -219,7 +219,7 @@ def applied(problem, point):
     return Fit(problem, point, problem.linearize(point), np.zeros(1), (0.0,), "validated", "none")
 
 
-def test_the_smoother_knows_all_measurements(case):
+def test_the_smoother_is_conditioned_on_all_measurements(case):
     _, y, problem = case
     mean, P = conditioned(y)
     motion = applied(problem, problem.start).smoothed()["trial"]
@@ -238,7 +238,7 @@ def test_the_smoother_knows_all_measurements(case):
 
 
 @pytest.mark.slow
-def test_a_start_without_a_deviation_may_be_anywhere(case):
+def test_an_initial_state_without_a_standard_deviation_has_a_diffuse_prior(case):
     """Found with the parameters, it is the mean of the smoother that began with any start, whose band is its own."""
     _, y, _ = case
     options = OPTIONS | {"unknown": ("x", "x_dot")}
@@ -253,7 +253,7 @@ def test_a_start_without_a_deviation_may_be_anywhere(case):
 
 
 @pytest.mark.slow
-def test_without_noise_it_is_least_squares(case):
+def test_zero_process_noise_reduces_the_fit_to_least_squares(case):
     """A start that is found and no intensity: the same numbers as a plain fit, but for the residuals' variance."""
     _, y, _ = case
     free, options = ("stiffness", "damping"), {"unknown": ("x", "x_dot"), "simulation": TIGHT}
@@ -270,7 +270,7 @@ def test_without_noise_it_is_least_squares(case):
 
 
 @pytest.mark.slow
-def test_what_cannot_be_noise():
+def test_invalid_process_noise_is_rejected():
     _, y = drawn(1)
     trial = trial_of(y)
 
@@ -357,7 +357,7 @@ def linked(y, t, values, jump, factor=1.0):
 
 
 @pytest.mark.slow
-def test_windows_with_their_log_determinant_are_a_filter():
+def test_linked_windows_with_log_determinant_equal_the_kalman_filter():
     """As short as the samples, linked by what disturbs them."""
     t, jump = np.arange(0.0, 3.0, 0.1), np.array([0.01, 0.15])
     rng, state, rows = np.random.default_rng(8), START + DEVIATION * np.random.default_rng(7).normal(size=2), []
@@ -398,7 +398,7 @@ class Dragged(Cart):
 
 
 @pytest.mark.slow
-def test_states_are_disturbed_too():
+def test_likelihood_with_process_noise_on_first_order_states():
     """A motor's force that wanders, by the matrix exponential of the three equations."""
     t, rng, q_force = np.arange(0.0, 1.5, 0.1), np.random.default_rng(5), 0.8
     A = np.array([[0.0, 1.0, 0.0], [-STIFFNESS, -DAMPING, 1.0], [0.0, 0.0, -2.0]])
@@ -470,7 +470,7 @@ class Bound(jk.System):
 
 
 @pytest.mark.slow
-def test_coordinates_that_constraints_bind():
+def test_likelihood_with_dependent_coordinates():
     """A pendulum by its angle and by its place: the same likelihood, but for the order of the noise squared."""
     rng, t, length, begun = np.random.default_rng(3), np.arange(0.0, 1.0, 0.05), 1.5, 0.5
     ride = jk.simulate(Swing(), jk.State([begun], [0.2]), jnp.asarray(t))
@@ -528,14 +528,14 @@ def many():
 
 
 @pytest.mark.slow
-def test_intervals_cover_where_motions_start_at_measured_samples():
+def test_interval_coverage_with_measured_initial_states():
     covered, (low, high) = np.mean(many_fits(SETS, 7, None)[2], axis=0), coverage_band(SETS)
     print(f"of {SETS}:", covered)
     assert np.all((covered >= low) & (covered <= high)), covered
 
 
 @pytest.mark.slow
-def test_intensity_and_sigma_are_found(many):
+def test_spectral_density_and_noise_scale_estimates_are_unbiased(many):
     truth, estimates, _ = many
     error = estimates[:50].std(axis=0, ddof=1) / 50**0.5
     print("bias in standard errors:", (estimates[:50].mean(axis=0) - truth) / error)
@@ -555,7 +555,7 @@ class Fenced(Cart):
 
 
 @pytest.mark.slow
-def test_a_motion_that_an_event_ends_is_told():
+def test_a_simulation_ended_by_an_event_is_reported():
     """Also where a measurement, and no step, takes the mean over it."""
     _, y = drawn(1)
     with pytest.raises(ValueError, match=r"are not finite \(fence\)"):
@@ -580,7 +580,7 @@ def test_an_implicit_solver_and_xla_give_the_same_filter(by_xla):
 
 
 @pytest.mark.slow
-def test_a_step_longer_than_between_samples_is_told():
+def test_a_step_longer_than_the_sample_interval_is_reported_as_too_coarse():
     t = np.arange(0.0, 6.0, 0.5)
     _, y = drawn(1, t)
     told = fit(Cart(), trial_of(y, t), "stiffness", simulation=Simulation(step=5.0), **OPTIONS)
@@ -590,7 +590,7 @@ def test_a_step_longer_than_between_samples_is_told():
 
 
 @pytest.mark.slow
-def test_a_measured_start_is_known_as_well_as_its_sample():
+def test_a_measured_initial_state_has_the_uncertainty_of_its_sample():
     """As a start of which nothing is known before, but that its sample is no measurement any more."""
     _, y = drawn(1)
     y["x"][0] = 0.37
@@ -629,7 +629,7 @@ def test_a_measured_start_is_known_as_well_as_its_sample():
 
 
 @pytest.mark.slow
-def test_a_closed_loop_has_the_same_likelihood_in_any_unit():
+def test_the_likelihood_of_a_closed_loop_does_not_depend_on_units():
     """The place of a slider in metres, in units of 3.3 cm, and in metres where the crank is 30 m long."""
     t = np.arange(0.0, 2.0, 0.05)
     ride = jk.simulate(CrankAlone(), jk.State([0.5], [0.4]), jnp.asarray(t))

@@ -50,7 +50,7 @@ class Part(Optimizer):
 
 
 @pytest.mark.slow
-def test_an_optimizer_is_one_class(tmp_path):
+def test_a_custom_optimizer_is_fitted_interrupted_and_resumed(tmp_path):
     problem = Problem.of(Track(), TRIAL, ["gain", "drift"], **POSED)
     least = minimize(problem, LeastSquares(rtol=1e-13)).cost
     found = fit(Track(), TRIAL, ["gain", "drift"], optimizer=Part(), **POSED)
@@ -71,7 +71,7 @@ def test_an_optimizer_is_one_class(tmp_path):
     assert resumed.history == pytest.approx(found.history, rel=1e-12)
 
 
-def test_options_that_are_none():
+def test_invalid_optimizer_options_are_rejected():
     problem = Problem.of(Track(), TRIAL, ["gain"], **POSED)
     for optimizer in (LeastSquares, GradientDescent):
         with pytest.raises(ValueError, match=rf"{optimizer.__name__}: `rtol`.*-1"):
@@ -94,7 +94,7 @@ def test_options_that_are_none():
         minimize(Track(), LeastSquares())
 
 
-def test_the_best_is_kept_where_the_last_is_worse():
+def test_the_best_iterate_is_returned_if_the_last_is_worse():
     problem = Problem.of(Track(), TRIAL, ["gain", "drift"], **POSED)
     away = minimize(problem, Part(part=2.5))
     np.testing.assert_allclose(away.history[-1] / away.history[-2], 2.25, rtol=0.05)  # (1 - 2.5)^2
@@ -120,7 +120,7 @@ class Dial(jk.System):
 
 
 @pytest.mark.slow
-def test_a_trial_in_which_a_step_leads_too_far_holds_up_no_other():
+def test_a_rejected_step_in_one_trial_does_not_stop_the_other_trials():
     near, far = (Trial(TRIAL.t, {"needle": np.sin(3 * a + 0 * TRIAL.t)}, sigma=0.1) for a in (0.2, 0.25))
     problem = Problem.of(Dial(), [near, far], "inertia", unknown=("angle",), simulation=POSED["simulation"])
     # From here Gauss-Newton solves the first at once, and steps with the second beyond where it began.
@@ -135,7 +135,7 @@ def test_a_trial_in_which_a_step_leads_too_far_holds_up_no_other():
     assert problem.linearize(point).cost == pytest.approx(at.cost, abs=1e-12)
 
 
-def test_least_squares_by_default_and_every_option_in_the_signature():
+def test_least_squares_is_the_default_and_signatures_contain_all_options():
     found = fit(Track(), TRIAL, ["gain", "drift"], **POSED)
     assert found.method == "Levenberg-Marquardt"
     options = [f.name for f in dataclasses.fields(ProblemSpec)][2:]

@@ -67,7 +67,7 @@ def test_an_exact_sum(trial, free):
 
 
 @pytest.mark.slow
-def test_a_measured_sum_and_a_joint_prior_are_rows_of_least_squares(trial):
+def test_a_measured_sum_and_a_joint_prior_equal_least_squares_rows(trial):
     found = fit(Track(), trial, ("gain", "drift"), constraints=[Linear({"gain": 1, "drift": 2}, 1.5, 0.01)], **EXACT)
     best = solved(trial, [[[100.0, 200.0]]], [150.0])
     assert [*found.estimates.values()] == pytest.approx(best, rel=TIGHT)
@@ -87,7 +87,7 @@ def test_a_measured_sum_and_a_joint_prior_are_rows_of_least_squares(trial):
 
 
 @pytest.mark.slow
-def test_rows_of_constraints_are_part_of_every_cost(trial):
+def test_the_cost_and_the_log_density_include_constraint_residuals(trial):
     """Of the likelihood of a filter, and of the density for samplers with its gradient."""
     known = [Linear({"gain": 1.0, "drift": 2.0}, 1.5, 0.1)]
     for options in ({"noise": {}}, {}):
@@ -127,7 +127,7 @@ def test_an_inequality(trial, side, bound, tmp_path):
     assert load(found.save(tmp_path / "fit.npz"), problem).estimates == found.estimates
 
 
-def test_a_prior_of_a_dependent_parameter_counts(trial):
+def test_the_prior_of_a_dependent_parameter_is_used(trial):
     free = (Free("gain", prior=(1.0, 0.01)), Free("drift", prior=(0.3, 0.01)))
     found = fit(Track(), trial, free, constraints=[Linear({"gain": 1.0, "drift": 2.0}, equals=1.9)], **EXACT)
     rows = np.vstack([A, [[100.0, 0.0], [0.0, 100.0]]])
@@ -138,7 +138,7 @@ def test_a_prior_of_a_dependent_parameter_counts(trial):
 
 
 @pytest.mark.slow
-def test_what_depends_keeps_its_own_bounds(trial):
+def test_a_dependent_parameter_keeps_its_bounds(trial):
     """The gain would be negative: the sum alone would allow it."""
     sums = [Linear({"gain": 1.0, "drift": 1.0}, equals=0.3)]
     free = (Free("gain", start=0.2, scale=10.0, bounds=(0.0, None)), Free("drift", start=0.1))
@@ -170,7 +170,7 @@ def test_what_depends_keeps_its_own_bounds(trial):
         (lambda: posed(Linear({"gain": 1.0, "drift": 1.0}, at_most=0.5)), ValueError, "not inside its bounds"),
     ],
 )
-def test_a_bad_constraint_is_named(ask, error, message):
+def test_an_invalid_constraint_is_rejected(ask, error, message):
     with pytest.raises(error, match=message):
         ask()
 

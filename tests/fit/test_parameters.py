@@ -43,7 +43,7 @@ SYSTEM = Springs(others=jnp.array([1.0, 2.0, 3.0]), matrix=jnp.zeros((2, 2)))
 
 
 @pytest.mark.slow
-def test_all_entries_of_a_vector_follow():
+def test_a_tied_vector_follows_in_all_entries():
     free = Free("stiffness", tied={"others": 0.5, "matrix": -2.0})
     parameters = parameters_of(SYSTEM, free)
     system, _ = parameters.apply(SYSTEM, parameters.inverse(jnp.array([8.0])))
@@ -51,7 +51,7 @@ def test_all_entries_of_a_vector_follow():
     np.testing.assert_allclose(system.matrix, np.full((2, 2), -16.0), rtol=1e-12)
 
 
-def test_entries_of_a_vector_are_parameters_of_their_own():
+def test_each_entry_of_a_free_vector_is_a_parameter():
     parameters = parameters_of(SYSTEM, (Free("others", prior=(2.0, 0.5)), "stiffness"))
     assert parameters.names == ("others[0]", "others[1]", "others[2]", "stiffness")
     system, _ = parameters.apply(SYSTEM, parameters.inverse(jnp.array([3.0, 2.0, 1.0, 7.0])))
@@ -84,19 +84,19 @@ def test_entries_of_a_vector_are_parameters_of_their_own():
         (Free("stiffness", prior=4.0), "`prior` must be"),
     ],
 )
-def test_what_contradicts_itself_is_refused(free, message):
+def test_contradictory_free_parameters_are_rejected(free, message):
     with pytest.raises(ValueError, match=message):
         parameters_of(SYSTEM, free)
 
 
-def test_infinite_bounds_are_none():
+def test_infinite_bounds_equal_no_bounds():
     for bounds, bounded in (((0.0, np.inf), (True, False)), ((-np.inf, np.inf), (False, False))):
         parameters = parameters_of(SYSTEM, Free("stiffness", bounds=bounds))
         assert parameters.bijections[0].bounded == bounded
         assert float(parameters.values(jnp.array([0.5]))[0]) > 4.0
 
 
-def test_what_a_lot_is():
+def test_default_scale_of_a_parameter():
     scale = lambda *free: parameters_of(SYSTEM, free).scale.tolist()  # noqa: E731
     assert scale("stiffness", "offset") == [4.0, 1.0]
     assert scale(Free("offset", prior=(0.0, 0.01))) == [0.01]
@@ -120,13 +120,13 @@ def test_priors_integrate_to_one():
 
 
 @pytest.mark.parametrize(("bounds", "begins"), [((0.0, None), 0.05), ((None, 0.0), -0.05), ((0.0, 0.2), 0.02)])
-def test_a_start_on_a_given_bound_is_searched_from_inside(bounds, begins):
+def test_an_initial_guess_at_a_given_bound_is_moved_inside(bounds, begins):
     parameters = parameters_of(SYSTEM, Free("offset", bounds=bounds, scale=0.5))
     assert float(parameters.start[0]) == 0.0
     assert float(parameters.values(jnp.zeros(1))[0]) == pytest.approx(begins)
 
 
-def test_what_is_plausible_does_not_follow_from_where_a_search_starts():
+def test_plausible_ranges_do_not_depend_on_initial_guesses():
     free = (
         "gain",
         SpectralDensity("x_dot"),
@@ -142,7 +142,7 @@ def test_what_is_plausible_does_not_follow_from_where_a_search_starts():
 
 
 @pytest.mark.slow
-def test_friction_that_starts_at_its_bound_is_found():
+def test_drift_with_initial_guess_at_its_bound_is_estimated():
     rtol = 1e-4
     free, bounded = (fit(Track(), TRIAL, ["gain", drift], optimizer=LeastSquares(rtol=1e-12), **POSED)
                      for drift in ("drift", Free("drift", bounds=(0.0, None))))  # fmt: skip
@@ -152,7 +152,7 @@ def test_friction_that_starts_at_its_bound_is_found():
     assert not any("initial guess" in note for note in bounded.notes)
 
 
-def test_what_is_posed_again_keeps_its_priors_and_the_trials_that_count():
+def test_a_respecified_problem_keeps_its_priors_and_active_trials():
     problem = Problem.of(Track(), [TRIAL, TRIAL], ["gain", "drift"], priors={"drift": (0.0, 2.0)}, **POSED)
     known = problem.with_priors({"gain": (1.0, 0.1)})
     for again in (known.with_trials(TRIAL), known.with_specification(known.specification)):
@@ -162,7 +162,7 @@ def test_what_is_posed_again_keeps_its_priors_and_the_trials_that_count():
     assert Problem.of(Track(), TRIAL, iter(["gain"]), **POSED).with_trials(TRIAL).parameters.names == ("gain",)
 
 
-def test_a_specification_does_not_follow_what_its_caller_changes():
+def test_a_specification_does_not_change_with_the_arguments_of_the_caller():
     free, priors = ["gain"], {"gain": (1.0, 0.1)}
     problem = Problem.of(Track(), TRIAL, free, priors=priors, **POSED)
     free.append("drift")
@@ -185,7 +185,7 @@ def test_a_specification_does_not_follow_what_its_caller_changes():
         (Free("offset", start=0.2, tied={"stiffness": 1.0}), (0.0, np.inf)),
     ],
 )
-def test_a_search_stays_inside_what_was_declared(free, bounds):
+def test_free_parameters_stay_within_their_declared_bounds(free, bounds):
     interval = parameters_of(SYSTEM, free).bijections[0]
     assert (float(interval.lower), float(interval.upper)) == pytest.approx(bounds)
     # What was declared is no prior: only two bounds that were given are.
@@ -193,7 +193,7 @@ def test_a_search_stays_inside_what_was_declared(free, bounds):
     assert np.isfinite(interval.log_prior_constants(np.zeros(1), np.full(1, np.inf))[0]) == given
 
 
-def test_a_start_outside_what_was_declared_is_refused():
+def test_an_initial_guess_outside_the_declared_bounds_is_rejected():
     with pytest.raises(ValueError, match=r"tilt: the initial guess 3 is not inside its bounds \(-1.5, 1.5\)"):
         parameters_of(SYSTEM, Free("tilt", start=3.0))
     with pytest.raises(ValueError, match="of the parameters tied to it"):
@@ -207,17 +207,17 @@ def test_a_start_outside_what_was_declared_is_refused():
         (Gain("push", name=3), "must be a string, got 3"),
     ],
 )
-def test_what_is_no_dict_and_no_name_is_refused(free, message):
+def test_wrong_types_of_tied_and_name_are_rejected(free, message):
     with pytest.raises(TypeError, match=message):
         parameters_of(SYSTEM, free)
 
 
-def test_the_start_of_what_has_no_zero_of_its_own_says_nothing_of_its_size():
+def test_initial_guesses_of_offsets_and_delays_do_not_set_a_scale():
     entries = parameters_of(Track(), ("gain", Gain("push"), Offset("push"), Delay("push"))).entries
     assert [entry.start_means_something for entry in entries] == [True, True, False, False]
 
 
-def test_a_start_on_what_was_declared_is_searched_from_inside():
+def test_an_initial_guess_at_a_declared_bound_is_moved_inside():
     assert float(parameters_of(SYSTEM, "dry").values(jnp.zeros(1))[0]) == pytest.approx(0.1)
 
 
@@ -228,7 +228,7 @@ class Limited(Track):
 
 
 @pytest.mark.slow
-def test_a_fit_whose_data_want_more_ends_at_what_was_declared():
+def test_a_fit_ends_at_a_declared_bound_if_the_optimum_is_outside():
     T = np.linspace(0.0, 1.0, 11)
     of_drift, of_gain = T**2 / 2, T**3 / 6  # x, of a drift and of a push that grows by one a second
     trial = Trial(T, {"x": 0.3 * of_drift + of_gain}, {"push": T}, sigma=0.001, initial={"x": 0.0, "x_dot": 0.0})
@@ -248,7 +248,7 @@ def asked(parameters, x):
 
 
 @pytest.mark.slow
-def test_numbers_are_mapped_as_under_a_trace():
+def test_parameters_are_mapped_equally_with_and_without_tracing():
     """And while something else is traced: values, slopes, their inverse, and what priors say; of a subset, too."""
     whole = parameters_of(Track(), ("gain", Free("drift", start=0.2, bounds=(0.0, 1.0), prior=(0.3, 0.1))))
     for parameters, x in (

@@ -25,7 +25,7 @@ def drifting():
 
 
 @pytest.mark.slow
-def test_errors_have_the_variance_of_a_regression_on_the_past(drifting):
+def test_prediction_errors_have_the_variance_of_a_linear_regression(drifting):
     """A line through the 11 samples of the past second, extrapolated; the mean square within four deviations."""
     result, trial = drifting
     errors = predict(result, trial, AHEAD, past=PAST)
@@ -42,7 +42,7 @@ def test_errors_have_the_variance_of_a_regression_on_the_past(drifting):
     np.testing.assert_allclose(np.diff(errors[errors.ahead == 0.5].t), 0.5, atol=1e-9)
 
 
-def test_what_is_measured_later_does_not_count_and_gaps_are_left_out(drifting):
+def test_predictions_ignore_later_samples_and_omit_gaps(drifting):
     result, trial = drifting
     short = trial.between(0.0, 2.0)
     y = short.measured["x"].copy()
@@ -75,7 +75,7 @@ def test_predictions_of_a_filter():
         (0.5, 100.0, "no trial is longer than 100 s for the initial state plus 0.5 s to predict"),
     ],
 )
-def test_a_prediction_that_cannot_be_is_refused(ahead, past, message, drifting):
+def test_invalid_arguments_of_a_prediction_are_rejected(ahead, past, message, drifting):
     with pytest.raises(ValueError, match=message):
         predict(*drifting, ahead, past=past)
 

@@ -28,7 +28,7 @@ from jaxkane.fit import base_parameters, regressor
 @pytest.mark.parametrize(
     "name", ["DoublePendulum", "SliderWithPinnedBar", pytest.param("ColumnFrameAndDisk", marks=pytest.mark.slow)]
 )
-def test_matrix_times_parameters_is_what_kanes_equations_hold(name):
+def test_matrix_times_parameters_equals_kanes_equations(name):
     """At any accelerations; `ColumnFrameAndDisk` has a body that spins in its frame."""
     tolerance = 1e-12
     entry = CATALOG[name]
@@ -43,7 +43,7 @@ def test_matrix_times_parameters_is_what_kanes_equations_hold(name):
 
 
 @pytest.mark.slow_cases("XLA")
-def test_the_matrix_does_not_depend_on_what_is_to_be_found(kernels):
+def test_the_matrix_does_not_depend_on_unknown_parameters(kernels):
     """Y of a guess, times the parameters of the truth, is what acts on the truth as it moves."""
     tolerance = 1e-12
     truth, at = swings()
@@ -61,7 +61,7 @@ def test_the_matrix_does_not_depend_on_what_is_to_be_found(kernels):
 
 
 @pytest.mark.slow
-def test_weights_that_are_written_by_hand_are_found_or_refused():
+def test_weights_coded_by_hand_are_detected_or_rejected():
     _truth, at = swings()
     i = (0.0, at.q[3], at.u[3], at.u_dot[3])
     same = [regressor(kind(), *i).matrix for kind in (Swing, SwingByHand)]
@@ -88,7 +88,7 @@ def test_dependent_speeds():
 
 
 @pytest.mark.slow
-def test_batches_derivatives_and_traces():
+def test_regressor_in_batches_derivatives_and_jit():
     tolerance = 1e-10
     truth, at = swings()
     here = lambda q, u, u_dot: regressor(truth, 0.0, q, u, u_dot, parameters=FRICTION)  # noqa: E731
@@ -107,7 +107,7 @@ def test_batches_derivatives_and_traces():
 
 
 @pytest.mark.slow
-def test_what_is_not_linear_is_refused():
+def test_nonlinear_and_invalid_parameters_are_rejected():
     _truth, at = swings()
     i = (0.0, at.q[3], at.u[3], at.u_dot[3])
     for kwargs, said in (
@@ -142,7 +142,7 @@ def test_what_is_not_linear_is_refused():
 
 
 @pytest.mark.slow
-def test_known_bodies_stay_on_the_right_side():
+def test_known_bodies_are_included_in_the_forces():
     tolerance = 1e-12
     truth, at = swings()
     i = (0.0, at.q[3], at.u[3], at.u_dot[3], {"torque1": at.inputs["torque1"][3]})

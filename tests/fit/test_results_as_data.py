@@ -44,7 +44,7 @@ def test_costs_by_trial_and_channel_add_up(fit):
     assert sum(fit.costs[name]["x"] for name in ("trial", "short")) == pytest.approx(fit.cost)
 
 
-def test_json_has_the_report_and_no_nan(fit):
+def test_json_contains_the_report_without_nan(fit):
     def refuse(constant):
         raise AssertionError(f"{constant} is not JSON")
 
@@ -58,7 +58,7 @@ def test_json_has_the_report_and_no_nan(fit):
 
 
 @pytest.mark.slow
-def test_json_of_what_the_data_do_not_determine(fit):
+def test_json_of_a_parameter_that_is_not_identifiable(fit):
     still = Trial(t, {"x": SEEN}, sigma=0.1)
     told = json.loads(minimize(Problem.of(Track(), still, ["gain", "drift"], **POSED), LeastSquares()).to_json())
     assert told["held_out_cost"] is None

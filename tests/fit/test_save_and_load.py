@@ -42,7 +42,7 @@ def path(result, tmp_path):
     return tmp_path / "fits" / "a.npz"
 
 
-def test_a_fit_comes_back_as_it_was(result, path):
+def test_a_loaded_fit_equals_the_saved_fit(result, path):
     again = load(path, pose())
     assert str(again) == str(result)
     assert report(again).split("versions")[0] == report(result).split("versions")[0]
@@ -57,7 +57,7 @@ def test_a_fit_comes_back_as_it_was(result, path):
 
 
 @pytest.mark.slow
-def test_to_look_at_a_fit_simulates_nothing(path, monkeypatch):
+def test_printing_a_loaded_fit_does_not_simulate(path, monkeypatch):
     from jaxkane.fit.problem import problem
 
     again = load(path, pose())
@@ -93,7 +93,7 @@ class Rewritten(Track):
 
 
 @pytest.mark.slow
-def test_a_fit_of_changed_code_comes_back_only_where_its_cost_is_the_same(result, path):
+def test_a_fit_of_changed_code_is_loaded_only_if_its_cost_is_unchanged(result, path):
     for kind in (Slow, Rewritten):
         kind.__name__ = "Track"
     assert load(path, pose(Rewritten())).estimates == result.estimates
@@ -121,20 +121,20 @@ def test_a_fit_of_another_problem_is_refused(path):
 
 
 @pytest.mark.slow
-def test_a_fixed_parameter_that_differs_is_named():
+def test_a_difference_in_a_fixed_parameter_is_reported():
     there, here = (
         described(pose(Track(gain=gain), free=["drift"], simulation=Simulation(step=0.1))) for gain in (1.0, 2.5)
     )
     assert differences(there, here) == "fixed parameter gain (1.0 there, 2.5 here)"
 
 
-def test_what_only_one_has_is_a_difference():
+def test_an_option_of_only_one_problem_is_reported_as_a_difference():
     fewer, more = {"trials": 2}, {"trials": 2, "option": {"step": 0.1}}
     assert differences(fewer, more) == "option step (nothing there, 0.1 here)"
     assert differences(more, fewer) == "option step (0.1 there, nothing here)"
 
 
-def test_a_file_that_is_no_fit_is_named(path, tmp_path):
+def test_a_file_without_a_fit_is_rejected(path, tmp_path):
     problem, data = pose(), path.read_bytes()
     for damaged in (b"", bytes(500), data[:-40], b"thesis"):
         path.write_bytes(damaged)
@@ -151,7 +151,7 @@ def test_a_file_that_is_no_fit_is_named(path, tmp_path):
         load(tmp_path / "nothing.npz", problem)
 
 
-def test_a_problem_before_a_fit_and_a_fit_after_it(result):
+def test_functions_reject_a_fit_for_a_problem_and_vice_versa(result):
     for ask in (identifiability, multi_start):
         with pytest.raises(TypeError, match=rf"{ask.__name__} requires a Problem, as in .*fit.problem"):
             ask(result)
@@ -163,7 +163,7 @@ def test_a_problem_before_a_fit_and_a_fit_after_it(result):
 
 
 @pytest.mark.slow
-def test_options_of_the_optimizer_and_of_the_simulation_are_two(result):
+def test_tolerances_of_optimizer_and_simulation_are_separate(result):
     coarse = fit(Track(gain=3.0), TRIALS, FREE, unknown=("x",), optimizer=LeastSquares(rtol=0.5, damping=3.0))
     assert coarse.status == "converged"
     assert coarse.cost > (1 + 1e-6) * result.cost
@@ -189,7 +189,7 @@ def test_options_of_the_optimizer_and_of_the_simulation_are_two(result):
     assert tight.step_error < 1e-6  # with tolerances too
 
 
-def test_true_values_are_known_by_name(result):
+def test_true_values_are_given_by_name(result):
     assert "truth" in result.table({"gain": 1.0})
     assert "truth" in result.table(Track(gain=1.5))
     with pytest.raises(ValueError, match=r"truth.* gian; did you mean 'gain'\?"):

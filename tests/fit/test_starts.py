@@ -59,7 +59,7 @@ def posed(system, free, *trials, **options):
 
 
 @pytest.mark.slow
-def test_a_start_that_is_measured_later_is_no_start():
+def test_an_initial_value_that_is_not_measured_at_the_start_is_rejected():
     wire = Wire(follows=("y",))
     gap = {"x": [np.nan, 0.3, 0.4]}
     late = Trial(np.arange(5.0), {"x": [0.1, 0.2, np.nan, 0.4, 0.5]}, sigma=0.1, name="late")
@@ -90,7 +90,7 @@ def bead(initial, **measured):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("follows", [(), ("y",)])
-def test_what_a_trial_says_is_held(follows):
+def test_known_initial_coordinates_are_kept_in_assembly(follows):
     system = Wire(follows=follows)
     np.testing.assert_allclose(starts(posed(system, "mass", bead({"x": 0.3}))), [[0.3, 0.7]], atol=1e-9)
     np.testing.assert_allclose(jk.assemble(system, {"x": 0.3}).q, [0.3, 0.7], atol=1e-9)
@@ -101,13 +101,13 @@ def test_what_a_trial_says_is_held(follows):
 
 
 @pytest.mark.slow
-def test_what_contradicts_itself_is_moved_to_the_nearest():
+def test_inconsistent_initial_coordinates_are_moved_to_the_nearest():
     both = {"x": 0.3, "y": 0.5}
     np.testing.assert_allclose(starts(posed(Wire(), "mass", bead(both))), [[0.4, 0.6]], atol=1e-9)
 
 
 @pytest.mark.slow
-def test_a_trial_that_does_not_say_what_others_do_is_named():
+def test_a_trial_without_the_initial_values_of_the_others_is_reported():
     reason = r"bead \['x'\]: there are no data for y, whose initial value .* Add it to `initial`"
     with pytest.raises(ValueError, match=reason):
         posed(Wire(), "mass", bead({"x": 0.3}), bead({"y": 0.3}))
@@ -117,7 +117,7 @@ def test_a_trial_that_does_not_say_what_others_do_is_named():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("follows", [(), ("e4",)])
-def test_euler_parameters_that_nobody_names_are_no_rotation(follows):
+def test_missing_euler_parameters_default_to_no_rotation(follows):
     turned = Trial(t, {"w1": np.zeros(3)}, sigma=0.1)
     np.testing.assert_allclose(starts(posed(Spun(follows=follows), "inertia", turned)), [[0, 0, 0, 1]], atol=1e-9)
     axis = {"e1": 0.6, "e2": 0.0, "e3": 0.0}
@@ -209,7 +209,7 @@ def test_four_unknown_euler_parameters_are_three_degrees_of_freedom(system, wind
 
 
 @SLOW
-def test_the_recorded_tosses_begin_where_they_were_measured():
+def test_recorded_tosses_start_at_the_measured_poses():
     """Their quaternions have the norm 1 but for 1e-4."""
     cube = {"mass": 0.37, "inertia": (0.0006167,) * 3}
     other = jk.joints.Link("other", parent="cube", joints=jk.joints.hinge("hinge", (0, 1, 0)), **cube)
@@ -232,7 +232,7 @@ TURNS = {"omega": ("w1", "w2", "w3"), "v": ("vx", "vy", "vz")}
 
 
 @pytest.mark.slow
-def test_a_speed_that_nobody_states_is_named():
+def test_an_initial_speed_that_is_not_given_is_reported():
     def notes_of(*trials, **options):
         problem = posed(Wire(follows=("y",)), "mass", *trials, **options)
         return [note for note in minimize(problem, LeastSquares(), steps=0).notes if "starts at zero" in note]

@@ -50,7 +50,7 @@ def near(result, truth=TRUTH, names=("mass", "stiffness", "damping"), within=3.5
         assert abs(error) < within * result.standard_errors[name], (name, error, result.standard_errors[name])
 
 
-def test_a_chain_is_the_dense_solution():
+def test_elimination_of_chained_windows_equals_the_dense_solution():
     tolerance = 1e-9
     rng = np.random.default_rng(4)
     W, n_z, n_b, n_x = 5, 2, 1, 2
@@ -81,7 +81,7 @@ def test_a_chain_is_the_dense_solution():
 
 
 @pytest.mark.slow
-def test_short_chained_windows_are_a_kalman_filter():
+def test_short_chained_windows_equal_a_kalman_filter():
     tolerance = 1e-6
     t = np.arange(0.0, 2.0, 0.05)
     trial = record(t, 1)
@@ -162,7 +162,7 @@ def test_delays_gains_rates_and_gaps(result):
 
 
 @pytest.mark.slow
-def test_other_data_and_guesses_compile_nothing(result, runs, problem):
+def test_new_data_and_initial_guesses_do_not_recompile(result, runs, problem):
     before = programs()
     again = [Trial(r.t, r.measured, r.inputs, sigma=0.02, name="again") for r in runs]
     other = Problem.of(TRUTH, again, (*FREE, *own(0.2)), **UNKNOWN)
@@ -172,7 +172,7 @@ def test_other_data_and_guesses_compile_nothing(result, runs, problem):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [LeastSquares(damping=0.0), GradientDescent()], ids=lambda m: m.name)
-def test_other_methods_find_the_same(problem, result, method):
+def test_other_methods_converge_to_the_same_estimates(problem, result, method):
     found = minimize(problem, method)
     assert found.status == "converged"
     assert found.cost == pytest.approx(result.cost, rel=1e-4)
@@ -181,7 +181,7 @@ def test_other_methods_find_the_same(problem, result, method):
 
 
 @pytest.mark.parametrize("method", [LeastSquares(), GradientDescent()], ids=lambda m: m.name)
-def test_an_interrupted_fit_goes_on_from_its_file(problem, method, tmp_path):
+def test_an_interrupted_fit_is_resumed_from_its_file(problem, method, tmp_path):
     whole = minimize(problem, method, steps=6)
     calls = []
 
@@ -200,7 +200,7 @@ def test_an_interrupted_fit_goes_on_from_its_file(problem, method, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_start_from_which_the_end_is_out_of_reach():
+def test_growing_horizons_converge_from_a_distant_initial_guess():
     # With a stiffness sixteen times too large a single shoot ends in another minimum; growing horizons do not.
     t = np.arange(0.0, 8.0, 0.05)
     far = Cart(mass=1.3, stiffness=80.0, damping=0.4)
@@ -212,7 +212,7 @@ def test_a_start_from_which_the_end_is_out_of_reach():
 
 
 @pytest.mark.slow
-def test_process_noise_is_taken_for_what_it_is():
+def test_chained_windows_account_for_process_noise():
     # A hidden force shakes the cart: what it does in a window is what the motion may jump by at its end.
     t = np.arange(0.0, 8.0, 0.05)
     rng = np.random.default_rng(8)
@@ -232,7 +232,7 @@ def test_process_noise_is_taken_for_what_it_is():
 
 
 @pytest.mark.slow
-def test_the_delay_of_what_is_held():
+def test_the_delay_of_a_zero_order_hold_input_is_estimated():
     t = np.arange(0.0, 4.0, 0.1)
     push = {"push": np.round(np.sin(2.0 * t))}
     held = {"push": jk.Samples(t + 0.033, push["push"], zero_order_hold=True)}
@@ -257,7 +257,7 @@ def late_push(delay):
 @pytest.mark.slow
 @pytest.mark.parametrize("free", [[Delay("push")], ["mass", Delay("push", each="trial")]])
 @pytest.mark.parametrize("delay", [1.3, -0.7])
-def test_windows_receive_what_acted_long_before(free, delay):
+def test_windows_contain_the_delayed_part_of_an_input(free, delay):
     tolerance = 1e-12
     trial, acted = late_push(delay)
     problem = Problem.of(TRUTH, trial, free, unknown=("x", "x_dot"), window=1.0)
@@ -275,7 +275,7 @@ def _windows(problem):
 
 
 @pytest.mark.slow
-def test_windows_keep_what_the_bounds_of_a_delay_ask_for():
+def test_windows_contain_the_inputs_required_by_the_bounds_of_a_delay():
     trial, acted = late_push(0.4)
     sizes = []
     for bounds in ((-0.1, 0.5), (0.0, 4.0), None):
@@ -296,7 +296,7 @@ def test_a_delay_longer_than_a_trial_is_refused():
 
 
 @pytest.mark.slow
-def test_a_long_delay_is_found_in_windows():
+def test_a_long_delay_is_estimated_with_windows():
     trial, _ = late_push(0.8)
     free = ("mass", "stiffness", "damping", Delay("push", bounds=(0.0, 2.0), start=0.6))
     found = minimize(Problem.of(GUESS, trial, free, unknown=("x", "x_dot"), window=2.0), LeastSquares())
@@ -336,7 +336,7 @@ class Pulled(jk.System):
 @pytest.mark.parametrize(
     ("own", "kinks", "restart"), [((), 11, False), ((Delay("left", each="trial"),), 2 * 11, True)], ids=str
 )
-def test_inputs_that_share_their_times_share_their_kinks(own, kinks, restart, monkeypatch):
+def test_inputs_with_shared_times_share_discontinuities(own, kinks, restart, monkeypatch):
     from jaxkane._integrate import integrate
 
     seen, original = [], integrate.discontinuities_of
@@ -359,7 +359,7 @@ def test_inputs_that_share_their_times_share_their_kinks(own, kinks, restart, mo
 
 
 @pytest.mark.slow
-def test_kinks_that_are_shared_move_together():
+def test_gradients_by_a_delay_with_shared_and_separate_sample_times():
     # x(1) = int (1 - t) f(t - s) dt for a delay s; by parts, its slope at s = 0 is -int (1 - t) f'(t) dt.
     t = np.linspace(0.0, 1.0, 5)
     left, right = np.sin(5.0 * t), np.cos(3.0 * t)
@@ -389,7 +389,7 @@ def late_records(delay, n=3):
 
 
 @pytest.mark.slow
-def test_what_acted_before_a_record_is_left_out_or_named():
+def test_samples_without_recorded_delayed_inputs_are_excluded_or_reported():
     """The input is delayed by 0.8 s; its first sample is a wrong guess of what it was before."""
     trials, options = late_records(0.8), {"unknown": ("x", "x_dot")}
     guess = lambda **more: ["stiffness", "damping", Delay("push", start=0.7, **more)]  # noqa: E731
@@ -409,7 +409,7 @@ def test_what_acted_before_a_record_is_left_out_or_named():
 
 
 @pytest.mark.slow
-def test_an_input_has_the_value_that_is_given_before_its_first_sample():
+def test_a_delayed_input_has_the_given_value_before_its_first_sample():
     t = np.arange(0.0, 3.0, 0.1)
     trial = Trial(t, {"x": np.cos(t)}, {"push": 1.0 + t}, sigma=0.1)
     for more, hold in (({"each": "trial"}, ()), ({"bounds": (0.0, 1.0)}, ()), ({}, ("push",))):

@@ -55,12 +55,12 @@ def trial(**changes):
         ({"sigma": 0.0}, r"swing 3: sigma\['theta1'\] must be positive"),
     ],
 )
-def test_a_bad_trial_is_named(changes, message):
+def test_an_invalid_trial_is_rejected(changes, message):
     with pytest.raises(ValueError, match=message):
         trial(**changes)
 
 
-def test_a_stretch():
+def test_a_trial_is_cut_between_two_times():
     cut = trial(inputs={"torque1": 2.0}).between(0.25, 0.55)
     np.testing.assert_allclose(cut.t, [0.3, 0.4, 0.5])
     assert cut.inputs["torque1"].shape == (3,)
@@ -84,7 +84,7 @@ def test_trials_from_a_data_frame_with_gaps():
     np.testing.assert_array_equal(b.initial["rate1"], [0.5] * 3)
 
 
-def test_the_index_may_be_the_time_and_types_may_have_missing_values():
+def test_data_frame_with_time_index_and_nullable_dtypes():
     frame = FRAME[2:].convert_dtypes().set_index("t")  # Float64 and Int64, with pandas.NA
     trial = Trial.from_dataframe(frame, ["angle"], ["T"], sigma=0.1)
     np.testing.assert_array_equal(trial.t, [0.0, 0.1, 0.2])
@@ -105,12 +105,12 @@ def test_the_index_may_be_the_time_and_types_may_have_missing_values():
         ("t,angle\n0,1\n0,2\n", "the times are repeated"),
     ],
 )
-def test_a_bad_column_is_named(text, message):
+def test_an_invalid_column_is_rejected(text, message):
     with pytest.raises(ValueError, match=message):
         Trial.from_dataframe(pd.read_csv(io.StringIO(text)), {"theta1": "angle"}, sigma=0.1)
 
 
-def test_columns_of_one_name_and_dates_are_refused():
+def test_duplicate_column_names_and_dates_are_rejected():
     twice = pd.DataFrame([[0.0, 1.0, 2.0]], columns=["t", "angle", "angle"])
     with pytest.raises(ValueError, match="more than one column has the name 'angle'"):
         Trial.from_dataframe(twice, ["angle"], sigma=0.1)
@@ -146,7 +146,7 @@ pendulum = DoublePendulum(mass=1.0, length=0.5)
         ([trial()], "mass", {"window": 0.0}, "`window` must be a positive duration"),
     ],
 )
-def test_a_bad_problem_is_named(trials, free, options, message):
+def test_an_invalid_problem_is_rejected(trials, free, options, message):
     with pytest.raises(ValueError, match=message):
         Problem.of(pendulum, trials, free, **options)
 
@@ -230,7 +230,7 @@ def bicycle_ride(**more):
 
 @pytest.mark.slow_cases(all_but=["NoiseScale"])
 @pytest.mark.parametrize("kind", ENTRIES)
-def test_what_is_no_number_is_refused_where_something_is_freed(kind):
+def test_start_scale_bounds_and_prior_must_be_real_numbers(kind):
     for bad in NO_NUMBERS:
         for more in ({"start": bad}, {"scale": bad}, {"bounds": (bad, 50.0)}, {"bounds": (0.0, bad)}):
             with pytest.raises(ValueError, match=r"(`start`|`scale`|a bound) must be a real number, got"):
@@ -287,7 +287,7 @@ def test_what_is_no_number_is_refused_where_something_is_freed(kind):
         (lambda x: bicycle_problem(bicycle_ride(), BICYCLE, "c", priors={"c": (1.0, x)}), "c: `prior` must be"),
     ],
 )
-def test_what_is_no_number_is_refused_by_the_name_of_the_argument(ask, named, bad):
+def test_errors_for_non_numeric_values_state_the_argument(ask, named, bad):
     with pytest.raises(ValueError, match=named) as error:
         ask(bad)
     assert "\n" not in str(error.value)
@@ -321,12 +321,12 @@ def test_known_values_of_a_trial_are_real_numbers(group, bad):
         (lambda x: cross_validate(x), "cross_validate"),
     ],
 )
-def test_what_is_another_kind_of_thing_is_refused_by_the_name_of_the_argument(ask, named):
+def test_errors_for_wrong_types_state_the_argument(ask, named):
     with pytest.raises(TypeError, match=named):
         ask(3.5)
 
 
-def test_no_trials_and_other_systems_names_are_refused():
+def test_empty_trials_and_unknown_names_are_rejected():
     for ask in (lambda: pose(trials=[]), lambda: fit_bicycle([], BICYCLE, "c")):
         with pytest.raises(ValueError, match="`trials` is empty"):
             ask()
@@ -348,7 +348,7 @@ def test_no_trials_and_other_systems_names_are_refused():
         (Free("mass", name="a"), Free("length", name="a")),
     ],
 )
-def test_what_is_freed_twice_is_refused(twice):
+def test_duplicate_free_parameters_are_rejected(twice):
     with pytest.raises(ValueError, match=r"`free` sets .* more than once"):
         pose(twice)
     assert pose([Gain("theta1"), Gain("theta1", of="start")]).parameters.names == (

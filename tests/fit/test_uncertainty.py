@@ -64,7 +64,7 @@ def again(problem, trials):
 
 
 @pytest.mark.slow
-def test_intervals_hold_the_truth_as_often_as_they_say(problem):
+def test_interval_coverage_equals_the_level(problem):
     level, hits, n = 0.8, np.zeros(3), 40
     rng = np.random.default_rng(11)
     clean = [record(T, seed, noise=0.0) for seed in range(6)]
@@ -80,7 +80,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(problem):
 
 
 @pytest.mark.slow
-def test_intervals_beside_a_bound_hold_the_truth():
+def test_interval_coverage_near_a_bound():
     """They are those of a fit without the bound, and end there."""
     rng, hits, beside = np.random.default_rng(5), 0, 0
     for _ in range(40):
@@ -101,7 +101,7 @@ def test_intervals_beside_a_bound_hold_the_truth():
 
 
 @pytest.mark.slow
-def test_white_residuals_are_called_white(result):
+def test_white_residuals_pass_the_whiteness_tests(result):
     tests = [t["x"] for t in result.tests.values()]
     assert sum(t.is_white for t in tests) >= 5
     assert result.variance_accounted_for["x"] > 0.99
@@ -109,7 +109,7 @@ def test_white_residuals_are_called_white(result):
     assert not any("noise" in note for note in result.notes)
 
 
-def test_correlated_residuals_are_called_so():
+def test_correlated_residuals_fail_the_whiteness_tests():
     rng = np.random.default_rng(0)
     t = np.arange(300.0)
     white = rng.normal(size=t.size)
@@ -123,7 +123,7 @@ def test_correlated_residuals_are_called_so():
 
 
 @pytest.mark.slow
-def test_clustered_errors_see_what_differs_from_trial_to_trial(problem, result):
+def test_clustered_errors_include_variation_between_trials(problem, result):
     # Every trial has its own stiffness: that is no noise of samples, and the formal error does not know it.
     rng = np.random.default_rng(5)
     varied = [
@@ -137,7 +137,7 @@ def test_clustered_errors_see_what_differs_from_trial_to_trial(problem, result):
     assert any("not white noise" in note for note in found.notes)
 
 
-def test_the_profile_of_a_nearly_linear_problem_is_its_interval(result):
+def test_the_profile_interval_of_a_nearly_linear_problem(result):
     likelihood = profile(result, "stiffness", n=7)
     low, high = result.intervals()["stiffness"]
     width = high - low
@@ -154,7 +154,7 @@ def test_residuals_are_not_written_to(result):
 
 
 @pytest.mark.slow
-def test_trials_left_out(result):
+def test_cross_validation_has_a_slightly_larger_cost(result):
     left_out = cross_validate(result, folds=3)
     assert np.all(np.isfinite(left_out.held_out))
     # What was not fitted is worse, but hardly.
@@ -164,7 +164,7 @@ def test_trials_left_out(result):
     assert "held-out score" in str(left_out)
 
 
-def test_other_trials_are_looked_at_with_the_parameters_held(result):
+def test_validation_keeps_the_parameters_fixed(result):
     others = [record(T, seed) for seed in range(20, 26)]
     held = validate(result, others)
     assert held.status == "validated"
@@ -176,7 +176,7 @@ def test_other_trials_are_looked_at_with_the_parameters_held(result):
     assert "not fitted" in str(held)
 
 
-def test_many_first_guesses(problem, result):
+def test_multi_start_converges_to_one_minimum(problem, result):
     found = multi_start(problem, 4, candidates=8, spread=0.6, seed=1)
     assert len(found.fits) == found.agreeing == 4
     assert found.best.cost == pytest.approx(result.cost, rel=1e-4)
@@ -185,7 +185,7 @@ def test_many_first_guesses(problem, result):
 
 
 @pytest.mark.slow
-def test_the_density_is_that_of_the_residuals(problem, result):
+def test_the_log_density_is_minus_half_the_cost(problem, result):
     density = of_x(problem)
     both, there = jax.jit(jax.value_and_grad(density)), result.point
     assert float(both(there)[0]) == pytest.approx(-result.cost / 2, rel=1e-9)
@@ -205,7 +205,7 @@ def test_the_density_is_that_of_the_residuals(problem, result):
 
 
 @pytest.mark.slow
-def test_laplace_has_the_errors_of_given_sigma(problem, result):
+def test_laplace_approximation_has_the_standard_errors_of_given_sigma(problem, result):
     gaussian = result.laplace()
     draws = gaussian.sample(4000)
     for name, error in result.standard_errors.items():
@@ -227,7 +227,7 @@ def test_laplace_has_the_errors_of_given_sigma(problem, result):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("package", ["numpyro", "blackjax"])
-def test_samplers_find_the_laplace_approximation(package):
+def test_samplers_agree_with_the_laplace_approximation(package):
     sampler, key = pytest.importorskip(package), jax.random.key(0)
     begun = record(T, 0, initial={"x": 0.2, "x_dot": 0.0})
     mode = minimize(Problem.of(GUESS, begun, ("mass", "stiffness"), simulation=Simulation(step=0.1)), LeastSquares())
@@ -251,7 +251,7 @@ def test_samplers_find_the_laplace_approximation(package):
     np.testing.assert_allclose(np.std(np.asarray(x), axis=0), deviation, rtol=0.25)
 
 
-def test_priors_are_weighed_and_told(problem, result):
+def test_priors_are_weighted_and_reported(problem, result):
     told = minimize(problem.with_priors({"mass": (1.0, 1e-4), "other": (0.0, 1.0)}), LeastSquares(), start=result.point)
     assert told.estimates["mass"] == pytest.approx(1.0, abs=5e-4)
     # A prior is a measurement of its own, of the deviation that it was given, however large residuals are.
@@ -269,7 +269,7 @@ def test_priors_are_weighed_and_told(problem, result):
 
 
 @pytest.mark.slow
-def test_a_wrong_sign_of_an_input(trials, monkeypatch):
+def test_a_wrong_sign_of_an_input_is_reported(trials, monkeypatch):
     wrong = [Trial(t.t, t.measured, {"push": -t.inputs["push"]}, sigma=0.01, name=t.name) for t in trials]
     # With the mass free, an infinite one takes the wrong push out of the model.
     found, fits = minimize(Problem.of(GUESS, wrong, ("stiffness", "damping"), **UNKNOWN), LeastSquares()), []
@@ -283,7 +283,7 @@ def test_a_wrong_sign_of_an_input(trials, monkeypatch):
     assert note in report(found)
 
 
-def test_a_rate_against_its_coordinate_and_a_column_of_zeros(trials):
+def test_inconsistent_rates_and_zero_columns_are_reported(trials):
     rated = [
         Trial(
             t.t, {"x": t.measured["x"], "x_dot": -np.gradient(t.measured["x"], t.t)}, t.inputs, sigma=0.1, name=t.name
@@ -299,7 +299,7 @@ def test_a_rate_against_its_coordinate_and_a_column_of_zeros(trials):
 
 
 @pytest.mark.slow
-def test_what_runs_to_its_bound_is_told_so(trials):
+def test_a_parameter_at_its_bound_is_reported(trials):
     bounds = (Free("damping", start=1.0, bounds=(0.8, None)), "stiffness")  # it is 0.4
     found = minimize(Problem.of(GUESS, trials, bounds, **UNKNOWN), LeastSquares())
     assert found.estimates["damping"] == pytest.approx(0.8, abs=1e-3)
@@ -313,7 +313,7 @@ def test_what_runs_to_its_bound_is_told_so(trials):
 
 
 @pytest.mark.slow
-def test_what_trades_off_is_told_in_units(trials):
+def test_a_trade_off_between_parameters_is_reported_with_units(trials):
     # Without a push only the ratios of mass, stiffness and damping show.
     quiet = [Trial(t.t, t.measured, sigma=0.01, name=t.name) for t in trials]
     free = (Free("mass", unit="kg"), Free("stiffness", unit="N/m"), Free("damping", unit="N s/m"))
@@ -337,7 +337,7 @@ class Twice(Cart):
 
 
 @pytest.mark.slow
-def test_of_what_changes_nothing_the_simplest_is_told(trials):
+def test_undetermined_directions_are_reported_in_the_simplest_form(trials):
     free = ("stiffness", "more_damping", "damping", "more_stiffness")
     seen = identifiability(Problem.of(Twice(), trials, free, **UNKNOWN))
     assert seen.rank == 2
@@ -365,7 +365,7 @@ class _Page(html.parser.HTMLParser):
         self.outside += [v for v in places if not v.startswith(("#", "data:"))]
 
 
-def test_the_report_is_one_page_that_says_it_all(result, tmp_path):
+def test_the_report_is_one_complete_page(result, tmp_path):
     left_out, likelihood = cross_validate(result, folds=2), profile(result, "mass", n=3)
     with pytest.raises(TypeError, match="`cross_validation=` requires a CrossValidation"):
         save_report(result, tmp_path / "none.html", cross_validation="yes")
@@ -407,7 +407,7 @@ def test_a_narrow_report_shows_all_columns_of_the_estimates(result, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fitted", [False, True])
-def test_undetermined_is_half_of_the_scale(fitted):
+def test_a_parameter_is_undetermined_if_its_error_exceeds_half_the_scale(fitted):
     """A parameter is determined if its standard deviation is less than half of the larger of scale and estimate. Here
     the data are noise, and the estimate is smaller than its deviation."""
     noise = np.random.default_rng(1).normal(0.0, 0.3, len(SAMPLED))
@@ -422,7 +422,7 @@ def test_undetermined_is_half_of_the_scale(fitted):
     assert seen(error / 0.3).ok
 
 
-def test_agreeing_is_by_the_variance_of_a_residual():
+def test_agreeing_fits_are_counted_by_the_variance_of_a_residual():
     """Of 1e5 residuals, 0.1 % of the cost is a parameter ten standard errors away."""
 
     def found(cost):
@@ -433,14 +433,14 @@ def test_agreeing_is_by_the_variance_of_a_residual():
     assert several.agreeing == 2
 
 
-def test_the_sign_of_a_parameter():
+def test_a_wrong_sign_of_a_parameter_is_reported():
     trials = [Trial(SAMPLED, {"x": 0.3 * PUSH}, {"push": PUSH}, sigma=0.001)]
     problem = Problem.of(Track(gain=-20.0), trials, ["gain"], **POSED)
     (note,) = check_signs(minimize(problem, LeastSquares(), steps=0))[-1:]
     assert note.startswith("the parameter gain seems to have the wrong sign")
 
 
-def test_an_input_that_is_zero_in_many_trials_is_planned(trials):
+def test_an_input_that_is_zero_in_only_one_trial_is_reported(trials):
     def told(n):
         some = [Trial(x.t, x.measured, {"push": (k >= n) * x.inputs["push"]}, sigma=0.01) for k, x in enumerate(trials)]
         return [*check_records(some)]
@@ -450,7 +450,7 @@ def test_an_input_that_is_zero_in_many_trials_is_planned(trials):
 
 
 @pytest.mark.slow
-def test_the_printed_interval_is_named(result):
+def test_the_printed_interval_has_its_level_and_kind(result):
     head, row = (line.split() for line in str(result).splitlines()[1:3])
     low, high = result.intervals()["mass"]
     assert " ".join(head[-6:]) == "std. error 95 % interval by"

@@ -52,7 +52,7 @@ def falling():
 
 
 @pytest.mark.slow
-def test_trials_that_cannot_be_simulated_are_told_and_the_rest_is_kept(falling, tmp_path):
+def test_validation_reports_trials_that_fail_and_keeps_the_others(falling, tmp_path):
     held = validate(falling, [FAR[0], *NEAR, FAR[1]])
     alone = validate(falling, NEAR)
     assert held.trial_names == ("near a", "near b", "near c")
@@ -73,7 +73,7 @@ def test_trials_that_cannot_be_simulated_are_told_and_the_rest_is_kept(falling, 
 
 
 @pytest.mark.slow
-def test_trials_go_one_by_one_through_one_program():
+def test_validation_simulates_one_trial_at_a_time_with_one_compiled_program():
     """Of one, two and three windows, with priors: as all of them together; and nothing is compiled for more trials."""
     long = np.linspace(0.0, 3.0, 31)
     lengths = (31, 11, 21, 15)
@@ -137,7 +137,7 @@ def test_shorter_trials_run_the_program_of_the_fit(options, monkeypatch):
     assert programs() - compiled
 
 
-def test_windows_that_do_not_count_are_linked_to_none():
+def test_shortened_and_excluded_windows_are_not_linked():
     """A window that is shortened ends before its next one starts, and trials left out count nothing."""
     t = np.linspace(0.0, 3.0, 31)
     trial = Trial(t, {"x": t}, {"push": np.sin(t)}, sigma=0.1)
@@ -150,7 +150,7 @@ def test_windows_that_do_not_count_are_linked_to_none():
 
 
 @pytest.mark.slow
-def test_a_trial_that_cannot_be_simulated_does_not_end_a_fit(falling, tmp_path):
+def test_a_fit_continues_without_a_trial_that_cannot_be_simulated(falling, tmp_path):
     found = fit(Falling(), [FAR[0], *NEAR, FAR[1]], FREE, simulation=STEP, optimizer=LeastSquares())
     assert found.trial_names == ("near a", "near b", "near c")
     assert found.estimates == pytest.approx(falling.estimates, rel=1e-6)
@@ -172,7 +172,7 @@ def test_a_trial_that_cannot_be_simulated_does_not_end_a_fit(falling, tmp_path):
 
 
 @pytest.mark.slow
-def test_shorter_horizons_leave_no_trial_out_with_a_checkpoint_either(falling, tmp_path):
+def test_growing_horizons_exclude_no_trial_with_or_without_a_checkpoint(falling, tmp_path):
     """By them the fit comes to parameters that simulate all, from a guess that simulates none."""
     guess = Falling(drift=30.0)
     with pytest.raises(ValueError, match="3 of 3 windows"):
@@ -184,7 +184,7 @@ def test_shorter_horizons_leave_no_trial_out_with_a_checkpoint_either(falling, t
         assert found.cost == pytest.approx(falling.cost, rel=1e-4)
 
 
-def test_a_trial_that_the_others_cannot_simulate_costs_infinity(falling):
+def test_a_held_out_trial_that_cannot_be_simulated_has_infinite_cost(falling):
     both = falling.problem.with_trials([*NEAR, FAR[0]])
     costs = costs_by_trial(both, dataclasses.replace(both.start, parameters=falling.point.parameters))
     assert np.isinf(costs[3])
@@ -195,7 +195,7 @@ def test_a_trial_that_the_others_cannot_simulate_costs_infinity(falling):
 
 
 @pytest.mark.slow
-def test_the_score_is_relative_to_the_data_and_not_to_the_first_guess():
+def test_the_held_out_score_is_independent_of_the_initial_guess():
     rtol = 1e-6
     trials = [Trial(T, {"x": y}, {"push": PUSH}, sigma=0.1) for y in (TRIAL.measured["x"], 0.7 * T**2, 0.5 * T**2)]
     fits = [fit(Track(gain=gain), trials, FREE, optimizer=LeastSquares(rtol=1e-12), **POSED) for gain in (1.0, 60.0)]
@@ -209,7 +209,7 @@ def test_the_score_is_relative_to_the_data_and_not_to_the_first_guess():
 
 
 @pytest.mark.slow
-def test_off_the_cpu_windows_are_one_batch(monkeypatch):
+def test_windows_are_simulated_as_one_batch_on_a_gpu(monkeypatch):
     """Without states of its own the system has trajectories with arrays of size zero, which a batch must permit."""
     rtol = 1e-12
     problem = Problem.of(Track(), [TRIAL, TRIAL.with_initial_state({"x": 0.5, "x_dot": 0.2})], FREE, simulation=STEP)
@@ -224,7 +224,7 @@ def test_off_the_cpu_windows_are_one_batch(monkeypatch):
 
 
 @pytest.mark.slow
-def test_reported_starts_are_those_of_the_motion():
+def test_reported_initial_states_equal_those_of_the_trajectory():
     """With a gain and an offset of what is known of the starts."""
     trial = TRIAL.with_initial_state({"x": 0.5, "x_dot": 0.2})
     free = (Gain("x_dot", of="start"), Offset("x", of="start", prior=(0.3, 0.05)))
@@ -236,7 +236,7 @@ def test_reported_starts_are_those_of_the_motion():
 
 
 @pytest.mark.slow
-def test_a_noisy_start_that_is_held_is_told():
+def test_a_note_reports_a_fixed_initial_state_that_is_noisy():
     """The first sample is off by three of its deviations, and the whole motion with it."""
     y = 0.5 * T**2 + np.append(0.3, np.zeros(10))
     told = fit(Track(), Trial(T, {"x": y}, {"push": PUSH}, sigma=0.02), FREE, simulation=STEP, optimizer=LeastSquares())
@@ -251,14 +251,14 @@ def test_a_noisy_start_that_is_held_is_told():
     assert not any("start" in note for note in fine.notes if "chi^2" in note)
 
 
-def test_a_fit_that_has_not_converged_says_so_in_its_notes():
+def test_notes_report_a_fit_that_has_not_converged():
     ended = fit(Track(), TRIAL, FREE, steps=0, optimizer=LeastSquares(), **POSED)
     assert ended.status == "steps"
     assert ended.notes[0].startswith("The fit has not converged (stopped after the last step")
 
 
 @pytest.mark.slow
-def test_given_values_are_validated():
+def test_validation_of_a_system_with_given_parameter_values():
     """Of a system as of a fit with the same values: nothing but the starts is estimated."""
     posed = {"unknown": ("x", "x_dot"), "simulation": STEP}
     found = fit(Track(), NEAR[:2], FREE, optimizer=LeastSquares(), **posed)
@@ -275,7 +275,7 @@ def test_given_values_are_validated():
 
 
 @pytest.mark.slow
-def test_held_out_trials_cost_few_simulations(monkeypatch):
+def test_validation_needs_few_simulations(monkeypatch):
     """Trials are simulated together, as many windows at once as the fit has."""
     found = fit(Track(), NEAR, FREE, unknown=("x", "x_dot"), simulation=STEP, optimizer=LeastSquares())
     simulated = []

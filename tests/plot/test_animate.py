@@ -81,7 +81,7 @@ def shapes(animation, kind):
 
 
 @pytest.mark.slow
-def test_bodies_and_points_are_where_the_description_says(swing):
+def test_bodies_and_points_have_the_positions_of_the_system(swing):
     """1e-12, at a time of the trajectory. N.y is up, so it is the page's z."""
     system, trajectory, animation = swing
     x, _ = animation.scene.at(trajectory.t[40])
@@ -98,13 +98,13 @@ def test_bodies_and_points_are_where_the_description_says(swing):
     assert {shape.label for shape in shapes(animation, "center")} == {"link1", "link2"}
 
 
-def test_quaternions_of_neighbours_are_close():
+def test_consecutive_quaternions_are_continuous():
     turns = Rotation.from_rotvec(np.linspace(0.0, 30.0, 200)[:, None] * [0.0, 0.0, 1.0]).as_matrix()
     e = _quaternions(turns)
     np.testing.assert_allclose(np.linalg.norm(np.diff(e, axis=0), axis=1), 2.0 * np.sin(30.0 / 199 / 4), rtol=1e-10)
 
 
-def test_a_body_is_the_uniform_solid_of_its_inertia(swing):
+def test_a_body_is_drawn_as_the_uniform_solid_with_its_inertia(swing):
     """1e-12: a slender link of 1 m; a cylinder with I = m r^2 / 2 along its axis; a box from its three moments."""
     rods = [s for s in shapes(swing[2], "line") if s.color != "grey"]
     vertex = swing[2].scene.vertex
@@ -129,7 +129,7 @@ def test_a_body_is_the_uniform_solid_of_its_inertia(swing):
     np.testing.assert_allclose(np.sort(np.ptp(corners, axis=0)), sides, rtol=1e-12)
 
 
-def test_points_are_joined_where_nothing_moves_between_them(swing):
+def test_points_at_fixed_distance_are_connected_by_lines(swing):
     """From the origin through the first link to the joint, and on to the second link's middle."""
     scene = swing[2].scene
     x, _ = scene.at(scene.t)
@@ -141,7 +141,7 @@ def test_points_are_joined_where_nothing_moves_between_them(swing):
 
 
 @pytest.mark.slow
-def test_wheels_turn_although_their_frames_do_not(ride, weaving):
+def test_spokes_rotate_with_the_wheel_angle(ride, weaving):
     """0.03 rad: the spokes turn by the wheel's angle, which the pose of its frame does not hold."""
     scene, system = weaving.scene, ride[0]
     spokes = [s for s in scene.shapes if s.kind == "pairs"]
@@ -157,7 +157,7 @@ def test_wheels_turn_although_their_frames_do_not(ride, weaving):
         assert turned == pytest.approx(0.1 * SPEED / float(radius) % (2 * np.pi), abs=0.03)
 
 
-def test_the_bicycle_stands_on_the_ground_and_is_followed(weaving):
+def test_the_bicycle_is_drawn_on_the_ground_and_followed_by_the_camera(weaving):
     scene = weaving.scene
     x, center_of_mass = scene.at(np.linspace(0.0, 10.0, 50))
     tracks = [s.first for s in scene.shapes if s.kind == "trace"]
@@ -177,7 +177,7 @@ def test_up_is_opposite_to_the_weights(swing):
     assert swing[2].scene.view.elevation == 0.0  # what moves in a plane is seen from the front
 
 
-def test_ten_seconds_of_riding_are_small_and_quick(ride, weaving):
+def test_size_and_time_of_an_animation_of_ten_seconds(ride, weaving):
     """At most 300 kB, and 2 s once the program of the poses is compiled."""
     assert len(weaving.html().encode()) < 300e3
     started = time.perf_counter()
@@ -199,7 +199,7 @@ def test_single_precision_far_from_the_origin(ride):
     np.testing.assert_allclose(x - [1000.0, 0.0, 0.0], expected, atol=3e-3)
 
 
-def test_a_figure_of_ones_own(swing):
+def test_custom_figure_has_the_correct_positions(swing):
     """Lines keep their places whatever they are fixed in: a body, the ground, or nothing (1e-9 m)."""
     system, trajectory, _ = swing
 
@@ -224,7 +224,7 @@ def test_a_figure_of_ones_own(swing):
     assert [s.color for s in scene.shapes[4:7]] == ["red", "green", "blue"]
 
 
-def test_the_page_needs_nothing_from_elsewhere(weaving):
+def test_the_page_has_no_external_resources(weaving):
     page = weaving.html()
     assert not re.search(r"https?:|\bsrc=|@import|<link", page)
     scene = json.loads(re.search(r'application/json">(.*?)</script>', page, re.DOTALL).group(1))
@@ -236,7 +236,7 @@ def test_the_page_needs_nothing_from_elsewhere(weaving):
 
 
 @pytest.mark.slow
-def test_a_figure_lives_no_longer_than_its_user_wants(swing):
+def test_a_custom_figure_is_garbage_collected(swing):
     system, trajectory, _ = swing
     size = np.ones(1000)
 
@@ -251,7 +251,7 @@ def test_a_figure_lives_no_longer_than_its_user_wants(swing):
     assert alive() is None
 
 
-def test_what_cannot_be_animated_is_refused(ride, swing, tmp_path):
+def test_invalid_arguments_of_animate_are_rejected(ride, swing, tmp_path):
     system, trajectory, animation = swing
     two = jax.tree.map(lambda x: jnp.stack([x, x]), trajectory)
     with pytest.raises(ValueError, match="is a batch of shape"):
@@ -279,7 +279,7 @@ def test_what_cannot_be_animated_is_refused(ride, swing, tmp_path):
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_a_gif_shows_every_colour_on_its_paper(swing, tmp_path, theme):
+def test_a_gif_contains_every_colour_of_its_theme(swing, tmp_path, theme):
     path = jk.animate(*swing[:2], theme=theme).save(tmp_path / "swing.gif", size=(200, 160), seconds=1.0, fps=10)
     with Image.open(path) as image:
         assert image.n_frames == 10
@@ -296,7 +296,7 @@ def test_a_gif_shows_every_colour_on_its_paper(swing, tmp_path, theme):
     assert cold.sum() > 40
 
 
-def test_a_track_in_a_gif_ends_where_the_point_is(swing):
+def test_a_trace_in_a_gif_ends_at_the_current_position(swing):
     """At the i-th of the drawn times a track has i + 1 points, the last of them that of the present."""
 
     class Paper:
@@ -365,7 +365,7 @@ def test_corners_of_a_spring_lie_on_both_sides_of_its_axis():
 
 @pytest.mark.slow
 @pytest.mark.skipif(NODE is None, reason="no node on the PATH")
-def test_the_pages_script_draws_without_a_browser(weaving, tmp_path):
+def test_the_script_of_the_page_runs_in_node(weaving, tmp_path):
     """In node, on a canvas that only notes what is asked of it: all finite, and keys do what they say."""
     (tmp_path / "page.html").write_text(weaving.html())
     run = subprocess.run(
@@ -404,7 +404,7 @@ def pixels(page, tmp_path):
 
 @needs_a_browser
 @pytest.mark.parametrize("dark", [False, True])
-def test_a_browser_shows_it_on_light_and_dark_pages(weaving, page, tmp_path, dark):
+def test_a_browser_draws_the_animation_on_light_and_dark_pages(weaving, page, tmp_path, dark):
     page.show(weaving.save(tmp_path / "ride.html"), dark)
     page.wait(LOOKED)
     seen = pixels(page, tmp_path)
@@ -416,7 +416,7 @@ def test_a_browser_shows_it_on_light_and_dark_pages(weaving, page, tmp_path, dar
 
 
 @needs_a_browser
-def test_a_phone_shows_all_of_its_controls(weaving, page, tmp_path):
+def test_all_controls_are_visible_on_a_phone(weaving, page, tmp_path):
     page("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=False)
     page.show(weaving.save(tmp_path / "ride.html"))
     page.wait(LOOKED)
@@ -429,7 +429,7 @@ def test_a_phone_shows_all_of_its_controls(weaving, page, tmp_path):
 
 
 @needs_a_browser
-def test_a_browser_projects_as_the_library_does(weaving, page, tmp_path):
+def test_the_projection_in_a_browser_equals_that_of_the_library(weaving, page, tmp_path):
     """Within 0.05 pixels: places are kept in 32 bits and orientations in 16."""
     page.show(weaving.save(tmp_path / "ride.html"))
     page.wait(LOOKED)
@@ -444,7 +444,7 @@ def test_a_browser_projects_as_the_library_does(weaving, page, tmp_path):
 
 
 @needs_a_browser
-def test_a_browsers_mouse_and_keys_move_it(weaving, page, tmp_path):
+def test_mouse_and_keys_control_the_view_in_a_browser(weaving, page, tmp_path):
     page.show(weaving.save(tmp_path / "ride.html"))
     page.wait(LOOKED)
     state = lambda: page.value("canvas.viewer.state")  # noqa: E731
@@ -468,7 +468,7 @@ def test_a_browsers_mouse_and_keys_move_it(weaving, page, tmp_path):
 
 
 @needs_a_browser
-def test_nothing_is_drawn_until_someone_looks(weaving, page, tmp_path):
+def test_the_animation_is_drawn_only_when_visible(weaving, page, tmp_path):
     """In a notebook's frame far down a page: drawn only when it is scrolled to."""
     path = tmp_path / "notebook.html"
     path.write_text(
@@ -502,7 +502,7 @@ class Pushed(jk.System):
 
 
 @pytest.mark.slow
-def test_loads_that_read_states_are_drawn():
+def test_forces_are_recorded_for_loads_that_depend_on_states():
     system, ts = Pushed(), np.linspace(0.0, 1.0, 3)
     ride = moved(system, ts, ts[:, None], np.ones((3, 1)))
     np.testing.assert_allclose(record(system, ride, None).forces, [[[0.0, -9.81, 0.0], [0.0, 0.0, 0.0]]] * 3)

@@ -67,7 +67,7 @@ def trajectory(status=0, t_end=2.0, batch=()):
     )
 
 
-def test_units_are_those_declared_and_of_their_rates():
+def test_units_of_rates_follow_from_declared_units():
     declared = {"roll": "rad", "x": "m", "push": "N"}
     told = declared | {"roll_rate": "rad/s", "x_dot": "m/s", "yaw": "", "yaw_rate": "", "y_dot": "", "rate": ""}
     assert {name: unit_of(name, declared) for name in told} == told
@@ -83,7 +83,7 @@ def test_the_catalogue_declares_its_units(name):
     assert all(info.unit for info in parameter_info(system).values())
 
 
-def test_trajectories_have_names_units_and_an_end(style):
+def test_plots_of_trajectories_show_names_units_and_the_end(style):
     ride = trajectory(status=jk.Status.EVENT, t_end=1.01)
     axes = jk.plot.trajectories(ride, ["roll", ("yaw_rate", "steer_torque"), "x"], degrees=True)
     assert is_legible(axes, style)
@@ -129,7 +129,7 @@ ODD = ("a$_{b$", "$c")
 
 
 @pytest.mark.slow
-def test_names_are_no_mathematics():
+def test_names_are_not_interpreted_as_mathematics():
     """Dollars in names are written as they stand."""
     ride = dataclasses.replace(
         trajectory(status=jk.Status.EVENT, t_end=1.01),
@@ -152,7 +152,7 @@ def test_names_are_no_mathematics():
     plt.close("all")
 
 
-def test_units_may_be_said():
+def test_units_passed_as_an_argument():
     axes = jk.plot.trajectories(trajectory(), ["x"], units={"x": "rad"}, degrees=True)
     assert axes[0].get_ylabel() == "x\n[deg]"
     with pytest.raises(KeyError, match="no 'pitch' in this trajectory"):
@@ -161,7 +161,7 @@ def test_units_may_be_said():
         jk.plot.trajectories(trajectory(), ["roll", "x"], axes=axes)
 
 
-def test_a_batch_is_drawn_as_a_whole(style):
+def test_all_members_of_a_batch_are_drawn(style):
     rides = trajectory(status=np.array([0, 1, 10]), t_end=np.array([2.0, 1.0, 1.0]), batch=(3,))
     (ax,) = jk.plot.trajectories(rides, ["roll"])
     assert is_legible(ax, style)
@@ -196,7 +196,7 @@ def test_eigenvalues_and_the_stable_range(style):
 
 
 @pytest.mark.slow
-def test_an_axis_is_called_after_what_varies():
+def test_the_axis_label_is_the_name_of_the_varied_quantity():
     """A parameter or a speed of the system with its unit, anything else by its name alone."""
     pendulum = jk.catalog.DoublePendulum()
     hanging = lambda length: (dataclasses.replace(pendulum, length=length), jk.State(jnp.zeros(2), jnp.zeros(2)))  # noqa: E731
@@ -210,7 +210,7 @@ def test_an_axis_is_called_after_what_varies():
         assert jk.plot.eigenvalues(found).get_xlabel() == label
 
 
-def test_stable_ranges_end_where_the_values_end():
+def test_stable_ranges_end_at_the_last_finite_value():
     x = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
     assert stable_ranges(x, np.array([-1.0, -1.0, 1.0, -1.0, -2.0])[:, None] + 0j) == [(0.0, 1.5), (2.5, 4.0)]
     assert stable_ranges(x, np.array([-1.0, np.nan, -1.0, -1.0, 0.0])[:, None] + 0j) == [(0.0, 0.0), (2.0, 3.0)]
@@ -218,7 +218,7 @@ def test_stable_ranges_end_where_the_values_end():
 
 
 @pytest.mark.slow
-def test_results_of_stability_are_taken_as_they_are(style):
+def test_results_of_the_stability_module_are_plotted_directly(style):
     """Columns of one name share a colour; the number of names is checked."""
     bicycle = jk.catalog.WhippleBicycle.benchmark()
     found = jk.stability.eigenvalues(bicycle, jnp.linspace(0.0, 10.0, 101))
@@ -252,7 +252,7 @@ def test_root_locus_follows_the_columns(style):
     assert ax.get_xlim()[0] < -1.0 < 0.3 < ax.get_xlim()[1]
 
 
-def test_mode_shapes_are_turned_to_their_largest_state():
+def test_mode_shapes_are_normalized_to_their_largest_state():
     """A pair and a real mode: two panels; the arrows' ends to 1e-12."""
     vectors = np.array([[2.0j, -2.0j, 1.0], [1.0, 1.0, -0.5]])
     axes = jk.plot.mode_shapes(np.array([-1 + 2j, -1 - 2j, -3.0]), vectors, ["roll", "steer"])

@@ -31,7 +31,7 @@ def rides():
 
 
 @pytest.mark.slow
-def test_members_move_as_if_alone(rides):
+def test_members_equal_separate_simulations(rides):
     state = starts(6)
     assert rides.q.shape == (6, 6, 2)
     assert rides["x"].shape == (6, 6)
@@ -45,7 +45,7 @@ def test_members_move_as_if_alone(rides):
 
 
 @pytest.mark.slow
-def test_off_the_cpu_chunks_are_larger_and_one_batch(monkeypatch):
+def test_chunks_on_a_gpu_are_larger_and_one_batch(monkeypatch):
     sizes, solve = [], Task.solve
 
     def counted(task, members, size):
@@ -64,7 +64,7 @@ def test_off_the_cpu_chunks_are_larger_and_one_batch(monkeypatch):
 
 
 @pytest.mark.slow
-def test_samples_whose_times_differ_and_a_recording_with_a_gap():
+def test_input_samples_with_different_times_and_missing_values():
     ts, values = np.array([0.1, 0.4, 0.8]), np.array([1.0, -2.0, 0.5])
     names = {"shoulder_torque": np.outer([1.0, np.nan], np.ones(6))}
     shifted = jk.Samples(np.stack([ts, ts + 0.05]), np.stack([values, -values]))
@@ -82,7 +82,7 @@ def test_samples_whose_times_differ_and_a_recording_with_a_gap():
 
 
 @pytest.mark.slow
-def test_a_member_with_a_body_that_cannot_be_is_invalid():
+def test_a_member_with_an_impossible_body_is_invalid():
     swept = jk.sweep.sweep(Slider(inertia=np.array([0.1, -0.1])), jk.State(np.array([0.0, 0.3]), np.ones(2)), TS)
     np.testing.assert_array_equal(swept.status, [jk.Status.COMPLETED, jk.Status.INVALID])
     assert np.isfinite(swept.q[0]).all()
@@ -112,7 +112,7 @@ def test_parameters_states_and_inputs_together_and_in_chunks():
     np.testing.assert_allclose(whole.q[i], alone.q, atol=1e-12)
 
 
-def test_bad_members_keep_to_themselves(rides):
+def test_invalid_members_do_not_affect_the_others(rides):
     levels, (q, u) = np.full(6, 0.3), (np.array(x) for x in (starts(6).q, starts(6).u))
     levels[1], levels[3] = np.nan, -0.3
     u[4] = 3.0  # this one is soon below
@@ -126,7 +126,7 @@ def test_bad_members_keep_to_themselves(rides):
     assert int(mixed.stats["steps"][1]) < 40  # nor does it keep anybody waiting
 
 
-def test_what_is_refused():
+def test_invalid_arguments_are_rejected():
     with pytest.raises(ValueError, match="no argument is a batch"):
         jk.sweep.sweep(Ring(), jk.State(np.array([0.0, 1.0]), np.zeros(1)), TS)
     with pytest.raises(ValueError, match=r"differ in length: level \(3\), state.q \(5\)"):
@@ -138,7 +138,7 @@ def test_what_is_refused():
 
 
 @pytest.mark.slow
-def test_a_member_knows_where_its_input_jumps():
+def test_a_member_has_the_discontinuities_of_its_input():
     """So that its audit integrates the work from jump to jump."""
     rtol, ts = 1e-6, np.linspace(0.0, 1.0, 41)
     torque = jk.Samples(np.linspace(0.0, 1.0, 6), np.random.default_rng(2).normal(size=6), zero_order_hold=True)

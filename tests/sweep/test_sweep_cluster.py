@@ -61,7 +61,7 @@ def fallen(module, client):
 
 
 @pytest.mark.slow
-def test_a_worker_with_another_global_is_refused(module, client, monkeypatch):
+def test_a_worker_with_a_different_global_value_is_rejected(module, client, monkeypatch):
     assert cloudpickle.loads(cloudpickle.dumps(module.Drop)) is module.Drop  # travels by its name
     np.testing.assert_allclose(fallen(module, client), 9.81 / 2, rtol=1e-7)
     submit = client.submit
@@ -78,7 +78,7 @@ def test_a_worker_with_another_global_is_refused(module, client, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_program_is_the_same_wherever_it_was_traced_first(module):
+def test_the_digest_does_not_depend_on_where_a_program_was_first_traced(module):
     t = jnp.zeros(())
 
     def program():

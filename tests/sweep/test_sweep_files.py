@@ -83,7 +83,7 @@ CHANGES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHANGES)
-def test_numbers_that_the_description_reads_belong_to_the_sweep(name, copy, monkeypatch, rides):
+def test_values_read_by_the_system_are_part_of_the_digest(name, copy, monkeypatch, rides):
     CHANGES[name](monkeypatch)
     with pytest.raises(ValueError, match=r"belongs to another sweep. It differs in program \("):
         run(copy)
@@ -92,7 +92,7 @@ def test_numbers_that_the_description_reads_belong_to_the_sweep(name, copy, monk
 
 
 @pytest.mark.slow
-def test_numbers_that_inputs_and_reduce_read_belong_to_the_sweep(tmp_path):
+def test_values_read_by_inputs_and_reduce_are_part_of_the_digest(tmp_path):
     held = {"push": np.array([1.0]), "scale": [1.0]}
     inputs = {"push": lambda t, state: held["push"][0]}
     reduce = lambda ride: held["scale"][0] * ride["x"][-1]  # noqa: E731
@@ -107,7 +107,7 @@ def test_numbers_that_inputs_and_reduce_read_belong_to_the_sweep(tmp_path):
 
 
 @pytest.mark.slow
-def test_numbers_in_the_closure_of_a_callback_belong_to_the_sweep(tmp_path):
+def test_values_in_the_closure_of_a_callback_are_part_of_the_digest(tmp_path):
     """A function that the program calls back is part of it, with all that it reads."""
 
     def inputs(push):
@@ -123,7 +123,7 @@ def test_numbers_in_the_closure_of_a_callback_belong_to_the_sweep(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_digest_outlives_the_process_and_tells_programs_apart():
+def test_a_digest_is_equal_in_another_process_and_differs_between_programs():
     code = """
 import jax, jax.numpy as jnp, numpy as np, dataclasses, jaxkane as jk
 from jaxkane._scalarjit.digest import digest
@@ -177,7 +177,7 @@ def root_of(k):
 
 
 @pytest.mark.parametrize("made", [callback_of, root_of])
-def test_digests_of_programs_that_stand_within_an_operation(made):
+def test_digests_depend_on_programs_nested_in_an_operation(made):
     program = lambda k: digest_of(jax.make_jaxpr(made(k))(1.0))  # noqa: E731
     assert program(1.0) == program(1.0) != program(2.0)
 
@@ -195,7 +195,7 @@ def test_digests_of_programs():
 
 
 @pytest.mark.parametrize("name", ["sweep.json.4711.tmp", "chunk-00000000.npz.4711-ab.tmp"])
-def test_what_a_killed_writer_left_behind_blocks_nothing(name, tmp_path, rides):
+def test_temporary_files_of_a_killed_writer_are_removed(name, tmp_path, rides):
     (tmp_path / name).write_bytes(b"{")
     np.testing.assert_array_equal(run(tmp_path).q, rides.q)
     assert not list(tmp_path.glob("*.tmp"))
@@ -213,7 +213,7 @@ def test_what_a_killed_writer_left_behind_blocks_nothing(name, tmp_path, rides):
         (b'{"system": {}, "times": "", "layout": {}}', r"an earlier version of jaxkane"),
     ],
 )
-def test_manifests_that_cannot_be_read_are_named(bytes_, message, copy):
+def test_unreadable_manifests_are_rejected(bytes_, message, copy):
     (copy / "sweep.json").write_bytes(bytes_)
     before = contents(copy)
     with pytest.raises(ValueError, match=message):
@@ -229,7 +229,7 @@ def damaged(data, how):
 
 
 @pytest.mark.slow
-def test_a_folder_is_known_again_whatever_the_order_of_the_columns(tmp_path):
+def test_the_order_of_columns_does_not_change_the_digest(tmp_path):
     columns = {"mass": [1.0, 2.0], "x": [0.1, 0.2]}
     first = run(tmp_path / "sweep", table=columns)
     with warnings.catch_warnings():
@@ -238,7 +238,7 @@ def test_a_folder_is_known_again_whatever_the_order_of_the_columns(tmp_path):
     np.testing.assert_array_equal(again.q, first.q)
 
 
-def test_damaged_chunks_are_computed_again_with_one_warning(copy, finished, rides):
+def test_damaged_chunks_are_recomputed_with_one_warning(copy, finished, rides):
     files = sorted(copy.glob("chunk-*.npz"))
     for hows in (("empty", "zeros", "cut"), ("text", "swapped bytes", "foreign")):
         for path, how in zip(files, hows, strict=True):
@@ -252,14 +252,14 @@ def test_damaged_chunks_are_computed_again_with_one_warning(copy, finished, ride
         assert contents(copy) == contents(finished)
 
 
-def test_a_chunk_of_other_shapes_is_not_taken(copy, rides):
+def test_a_chunk_with_wrong_shapes_is_recomputed(copy, rides):
     first, _, last = sorted(copy.glob("chunk-*.npz"))
     last.write_bytes(first.read_bytes())  # 32 members where 6 belong
     with pytest.warns(UserWarning, match="1 chunks cannot be read"):
         np.testing.assert_array_equal(run(copy).q, rides.q)
 
 
-def test_chunks_that_changed_places_are_computed_again(copy, finished, rides):
+def test_swapped_chunks_are_recomputed(copy, finished, rides):
     first, second, _ = sorted(copy.glob("chunk-*.npz"))
     whole = first.read_bytes()
     first.write_bytes(second.read_bytes())
@@ -269,7 +269,7 @@ def test_chunks_that_changed_places_are_computed_again(copy, finished, rides):
     assert contents(copy) == contents(finished)
 
 
-def test_a_file_in_the_place_of_the_folder(tmp_path):
+def test_a_file_instead_of_a_folder_is_rejected(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=r"file is a file\. Pass the name of a folder"):
         run(tmp_path / "file")
@@ -284,7 +284,7 @@ def manifest(name):
     return {"system": {"class": name}, "times": "", "layout": {}, "program": name}
 
 
-def test_of_two_sweeps_that_begin_at_once_one_is_refused(tmp_path):
+def test_only_one_of_two_sweeps_starting_simultaneously_is_accepted(tmp_path):
     for i in range(20):
         start, opened, refused = threading.Barrier(4), [], []
 
@@ -304,7 +304,7 @@ def test_of_two_sweeps_that_begin_at_once_one_is_refused(tmp_path):
         assert [path.name for path in (tmp_path / str(i)).iterdir()] == ["sweep.json"]
 
 
-def test_the_same_sweep_twice_at_once_gives_the_same_bytes(tmp_path, finished, rides):
+def test_two_simultaneous_runs_of_one_sweep_write_identical_files(tmp_path, finished, rides):
     found = []
     threads = [threading.Thread(target=lambda: found.append(run(tmp_path).q)) for _ in range(2)]
     [t.start() for t in threads]
@@ -315,7 +315,7 @@ def test_the_same_sweep_twice_at_once_gives_the_same_bytes(tmp_path, finished, r
     assert contents(tmp_path) == contents(finished)
 
 
-def test_a_chunk_is_not_missed_when_another_process_has_tidied_up(copy, monkeypatch):
+def test_a_chunk_is_written_after_another_process_removed_temporary_files(copy, monkeypatch):
     folder = Folder(copy, json.loads((copy / "sweep.json").read_text()))
     put, before = os.replace, contents(copy)
 
@@ -331,7 +331,7 @@ def test_a_chunk_is_not_missed_when_another_process_has_tidied_up(copy, monkeypa
         folder.write(0, {"x": np.ones(1)})
 
 
-def test_files_are_whole_or_not_there(tmp_path):
+def test_files_are_written_atomically(tmp_path):
     path = tmp_path / "file"
 
     def broken(file):
@@ -372,14 +372,14 @@ def test_finished_members_are_returned_after_an_exception(fails, rides):
     assert np.isnan(part.q[64:]).all()
 
 
-def test_an_exception_with_a_folder_says_that_it_can_be_resumed(fails, rides, tmp_path):
+def test_an_exception_with_a_folder_states_how_to_resume(fails, rides, tmp_path):
     with pytest.raises(RuntimeError, match="out of memory") as seen:
         run(tmp_path)
     assert f"64 of 70 members are finished and saved in {tmp_path}. Call sweep again" in seen.value.__notes__[0]
     np.testing.assert_array_equal(run(tmp_path).q, rides.q)
 
 
-def test_a_full_disk_says_which_chunk_and_what_to_do(rides, tmp_path, monkeypatch):
+def test_the_error_for_a_full_disk_states_the_chunk_and_the_remedy(rides, tmp_path, monkeypatch):
     fsync, calls = os.fsync, []
 
     def full(handle):
@@ -397,7 +397,7 @@ def test_a_full_disk_says_which_chunk_and_what_to_do(rides, tmp_path, monkeypatc
     np.testing.assert_array_equal(run(tmp_path).q, rides.q)
 
 
-def test_a_lost_manifest_is_written_again(copy, finished, rides, tmp_path_factory):
+def test_a_missing_manifest_is_rewritten_only_for_chunks_of_the_same_sweep(copy, finished, rides, tmp_path_factory):
     (copy / "sweep.json").unlink()
     (copy / "chunk-00000032.npz").write_bytes(b"damaged")
     with pytest.warns(UserWarning, match="1 chunks cannot be read"):
@@ -428,7 +428,7 @@ def test_batches_of_none_and_of_one():
     np.testing.assert_allclose(one["x"], [0.5 * GRAVITY * TS**2], rtol=1e-7)
 
 
-def test_what_is_given_twice_is_refused():
+def test_duplicate_values_and_invalid_options_are_rejected():
     pandas = pytest.importorskip("pandas")
     frame = pandas.DataFrame([[1.0, 2.0]], columns=["mass", "mass"])
     with pytest.raises(ValueError, match="more than one column named mass"):
@@ -480,13 +480,13 @@ def test_what_is_given_twice_is_refused():
         (lambda ride: np.sin(ride["x"]), "sweep: `reduce` uses a traced value"),
     ],
 )
-def test_what_is_no_reduction_is_named(reduce, message, tmp_path):
+def test_invalid_reductions_are_rejected(reduce, message, tmp_path):
     for folder in (None, tmp_path):
         with pytest.raises(TypeError, match=message):
             run(folder, reduce=reduce)
 
 
-def test_a_function_of_a_row_that_asks_for_a_value_is_named():
+def test_the_error_for_a_traced_value_states_the_function_of_the_row():
     def start(system, row):
         return REST if row["speed"] > 0.0 else jk.State(np.ones(1), np.ones(1))
 

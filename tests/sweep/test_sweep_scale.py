@@ -85,13 +85,13 @@ def same(a, b):
 
 
 @pytest.mark.slow
-def test_a_folder_holds_every_chunk_and_changes_nothing(rides, folder):
+def test_a_folder_contains_every_chunk_and_does_not_change_results(rides, folder):
     assert [path.name for path in chunks(folder)] == [f"chunk-{i:08d}.npz" for i in range(0, 600, 32)]
     same(rides, run())
 
 
 @pytest.mark.slow
-def test_a_sweep_that_was_killed_goes_on(rides, folder, script, tmp_path):
+def test_a_killed_sweep_is_resumed(rides, folder, script, tmp_path):
     process = subprocess.Popen([sys.executable, script, tmp_path / "sweep", tmp_path / "q.npy"])
     wait_for_chunks(tmp_path / "sweep", 3, process)
     process.send_signal(signal.SIGKILL)
@@ -105,7 +105,7 @@ def test_a_sweep_that_was_killed_goes_on(rides, folder, script, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_chunk_that_cannot_be_read_is_computed_again(rides, tmp_path):
+def test_an_unreadable_chunk_is_recomputed(rides, tmp_path):
     run(tmp_path)
     chunks(tmp_path)[2].write_bytes(chunks(tmp_path)[2].read_bytes()[:1000])
     with pytest.warns(UserWarning, match=r"1 chunks cannot be read and are computed again: chunk-00000064.npz"):
@@ -114,7 +114,7 @@ def test_a_chunk_that_cannot_be_read_is_computed_again(rides, tmp_path):
 
 @pytest.mark.slow_cases("folder")
 @pytest.mark.parametrize("kept", [True, False], ids=["folder", "memory"])
-def test_after_an_interruption_the_rest_is_called_so_and_not_kept(rides, tmp_path, monkeypatch, kept):
+def test_unfinished_members_are_interrupted_and_not_saved(rides, tmp_path, monkeypatch, kept):
     import jaxkane.sweep._chunks as solving
 
     calls, original = [], solving._solve
@@ -164,14 +164,14 @@ def test_a_folder_of_another_sweep_is_refused(rides, folder, change, message):
     assert contents(folder) == before
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path):
+def test_a_folder_with_other_files_is_rejected(tmp_path):
     (tmp_path / "thesis.tex").write_text("")
     with pytest.raises(ValueError, match=r"is not empty and does not contain sweep.json"):
         run(tmp_path)
 
 
 @pytest.mark.slow
-def test_two_devices_give_the_same(rides, script, tmp_path):
+def test_two_devices_give_identical_results(rides, script, tmp_path):
     flags = os.environ.get("XLA_FLAGS", "")  # the same code, to the last bit
     two = {**os.environ, "XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count=2"}
     subprocess.run([sys.executable, script, tmp_path / "sweep", tmp_path / "q.npy"], env=two, check=True, timeout=120)
@@ -179,7 +179,7 @@ def test_two_devices_give_the_same(rides, script, tmp_path):
 
 
 @pytest.mark.slow
-def test_two_devices_find_dependent_coordinates():
+def test_dependent_coordinates_are_assembled_on_two_devices():
     code = """
 import jaxkane as jk, numpy as np, jax
 jk.configure(cache=False, devices=2, verbose=False)
@@ -214,7 +214,7 @@ np.testing.assert_allclose(rides.q[:, -1], np.stack([np.cos(angle), np.sin(angle
 
 
 @pytest.mark.slow
-def test_a_worker_that_is_killed_is_survived(rides, folder, tmp_path):
+def test_a_sweep_completes_after_a_worker_is_killed(rides, folder, tmp_path):
     distributed = pytest.importorskip("distributed")
     workers = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "host": "127.0.0.1"}
     with distributed.LocalCluster(**workers, dashboard_address=None) as cluster, distributed.Client(cluster) as client:

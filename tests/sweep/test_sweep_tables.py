@@ -41,7 +41,7 @@ def test_a_grid_has_an_axis_for_every_name(rides):
 
 
 @pytest.mark.slow
-def test_members_of_a_grid_move_as_if_alone(rides):
+def test_members_of_a_grid_equal_separate_simulations(rides):
     state = jk.State(np.array([GRID.axis("theta1")[7], 0.0]), np.zeros(2))
     alone = jk.simulate(DoublePendulum(mass=3.0, length=1.0), state, TS, {"elbow_torque": 0.5}, **STEPS)
     np.testing.assert_allclose(rides.member(7, 2, 1).q, alone.q, atol=1e-12)
@@ -51,7 +51,7 @@ def test_members_of_a_grid_move_as_if_alone(rides):
 
 
 @pytest.mark.slow
-def test_what_reduce_keeps_is_what_it_would_make_of_the_motions(rides):
+def test_reduced_values_equal_those_computed_from_trajectories(rides):
     kept = jk.sweep.sweep(PENDULUM, REST, TS, table=GRID, chunk=32, reduce=largest, **STEPS)
     np.testing.assert_array_equal(kept["largest"], np.abs(rides["theta2"]).max(axis=-1))
     np.testing.assert_array_equal(kept["end"], rides.q[..., -1, :])
@@ -74,7 +74,7 @@ def test_xarray(rides):
 
 
 @pytest.mark.slow
-def test_a_table_with_labels_and_a_function_of_its_own():
+def test_a_table_with_labels_and_an_initial_state_function():
     table = {"rider": ["a", "b", "c"], "push": [0.1, 0.2, 0.3], "length": [1, 2, 3]}
 
     def start(system, row):  # pushed the harder, the longer it is
@@ -92,7 +92,7 @@ def test_a_table_with_labels_and_a_function_of_its_own():
     np.testing.assert_array_equal(jk.sweep.sweep(PENDULUM, start, TS, table=pandas.DataFrame(table)).q, swept.q)
 
 
-def test_coordinates_that_follow_the_parameters_are_assembled():
+def test_dependent_coordinates_are_assembled_for_each_parameter_value():
     start, lengths = jk.State([0.3, 0.95], [0.0]), [1.0, 1.2]
     members, shared, _ = members_of(RodOnPin(1.0), start, None, jk.sweep.grid(length=lengths), TS, TS.dtype)
     for i, length in enumerate(lengths):
@@ -101,7 +101,7 @@ def test_coordinates_that_follow_the_parameters_are_assembled():
 
 
 @pytest.mark.slow
-def test_coordinates_that_follow_are_found_anew():
+def test_dependent_coordinates_are_recomputed_for_each_member():
     bicycle = WhippleBicycle.benchmark()
     upright = jk.State(np.zeros(8), np.array([0.0, -15.0, 0.0]))
     leant = jk.sweep.sweep(bicycle, upright, [0.0, 0.01], table=jk.sweep.grid(roll=[0.0, 0.2], steer=[0.1, 0.4]))
@@ -180,7 +180,7 @@ class Anchored(jk.System):
 ANCHORED = jk.State(np.zeros(1), np.zeros(1))
 
 
-def test_one_array_may_be_a_batch_and_a_vector_that_all_share():
+def test_one_array_as_a_batch_and_as_a_shared_vector():
     both = jnp.array([1.0, 2.0, 4.0])
     system = Anchored(mass=both, anchor=both)
     assert system.mass is system.anchor
@@ -191,7 +191,7 @@ def test_one_array_may_be_a_batch_and_a_vector_that_all_share():
     np.testing.assert_array_equal(shared[0].anchor, both)
 
 
-def test_a_column_that_has_two_meanings_is_refused():
+def test_an_ambiguous_column_is_rejected():
     with pytest.raises(
         ValueError, match=r"'x' is ambiguous: .* more than one number of that name \(parameter, coordinate\)"
     ):
@@ -208,7 +208,7 @@ def test_a_column_that_has_two_meanings_is_refused():
         lambda row: next(iter(row.values())),
     ],
 )
-def test_a_row_may_be_read_as_any_mapping(read):
+def test_a_row_supports_the_mapping_methods(read):
     row = Row({"push": 1.0})
     assert "push" in row
     assert not row.read
@@ -216,7 +216,7 @@ def test_a_row_may_be_read_as_any_mapping(read):
     assert row.read == {"push"}
 
 
-def test_a_row_that_is_unpacked_is_read():
+def test_an_unpacked_row_is_marked_as_read():
     start = lambda system, row: jk.State(jnp.stack([dict(**row)["push"], row.get("other", 0.0)]), jnp.zeros(2))  # noqa: E731
     table = jk.sweep._members.as_table({"push": [0.1, 0.2]})
     assert members_of(PENDULUM, start, None, table, jnp.asarray(TS), TS.dtype)[2] == 2
@@ -232,7 +232,7 @@ def test_grids_that_are_refused():
 
 
 @pytest.mark.slow
-def test_a_column_that_a_function_reads_takes_no_place_by_its_name():
+def test_a_column_read_by_a_function_is_not_assigned_by_name():
     table = {"theta1": [0.1, 0.2], "mass": [1.0, 2.0]}
     twice = jk.sweep.sweep(
         lambda row: dataclasses.replace(PENDULUM, mass=2.0 * row["mass"]),
@@ -248,7 +248,7 @@ def test_a_column_that_a_function_reads_takes_no_place_by_its_name():
 
 
 @pytest.mark.parametrize("values", [[True, False], np.array([True, False]), [True, 2.0]])
-def test_truth_values_are_no_column(values):
+def test_boolean_columns_are_rejected(values):
     for make in (lambda: jk.sweep.grid(mass=values), lambda: as_table({"mass": values})):
         with pytest.raises(ValueError, match=r"'mass' must be a row of numbers.* Write booleans as numbers"):
             make()

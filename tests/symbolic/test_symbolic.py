@@ -34,7 +34,7 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in CATALOG if name n
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*FAST, *SLOW])
-def test_formulas_give_the_numbers_of_the_library(name):
+def test_symbolic_equations_agree_with_the_numerical_ones(name):
     """At three random states about the case's own, off the constraints too: formulas know of all coordinates."""
     rtol = 1e-13
     system, t, q, u, w = case(name)
@@ -87,7 +87,7 @@ def with_rationals(x):
 
 @pytest.mark.slow_cases("DoublePendulum")
 @pytest.mark.parametrize("name", [*PRINTED, *MORE])
-def test_what_the_book_prints(name):
+def test_equations_agree_with_those_printed_in_the_book(name):
     system = CATALOG[name].example()
     found = jk.symbolic.equations(system)
     symbols = found.symbols
@@ -110,7 +110,7 @@ def test_what_the_book_prints(name):
 
 
 @pytest.mark.slow
-def test_simplified_formulas_are_those_of_the_book():
+def test_simplified_equations_equal_those_of_the_book():
     m, l = (jk.symbolic.equations(CATALOG["DoublePendulum"].example()).symbols[name] for name in ("mass", "length"))
     found = jk.symbolic.equations(CATALOG["DoublePendulum"].example()).simplified()
     th1, th2 = found.q
@@ -135,7 +135,7 @@ def test_names_in_latex():
     assert name_in_latex("roll_rate", 1) == r"\dot{\mathit{roll\_rate}}"
 
 
-def test_numbers_are_exact_where_a_small_fraction_rounds_to_them():
+def test_numbers_become_small_fractions_if_these_round_to_them():
     whole = {
         0.5: "1/2",
         1 / 12: "1/12",
@@ -152,7 +152,7 @@ def test_numbers_are_exact_where_a_small_fraction_rounds_to_them():
         assert float(exact(value, "float64")) == value
 
 
-def test_a_parameter_that_is_called_like_a_coordinate_is_another_symbol():
+def test_a_parameter_named_like_a_coordinate_has_its_own_symbol():
     found = jk.symbolic.equations(Odd())
     assert found.symbols["angle"] in found.q
     assert found.symbols["angle_"] in found.parameters
@@ -166,7 +166,7 @@ def test_a_parameter_that_is_called_like_a_coordinate_is_another_symbol():
     assert not taken & {*named}, "x0 is a coordinate"
 
 
-def test_functions_of_time_are_differentiated_by_it():
+def test_coordinates_as_functions_of_time_can_be_differentiated():
     found = jk.symbolic.equations(CATALOG["SliderWithPinnedBar"].example(), of_time=True)
     x, theta = found.q
     assert str(x.diff(found.t)) == "Derivative(x(t), t)"
@@ -174,7 +174,7 @@ def test_functions_of_time_are_differentiated_by_it():
     assert r"\dot{x}" in found._repr_latex_()
 
 
-def test_dependent_speeds_stand_by_their_names_and_are_replaced_first():
+def test_dependent_speeds_are_symbols_and_the_first_replacements():
     found = jk.symbolic.equations(Bob())
     ((vy, formula),) = found.replacements
     x, y = found.q
@@ -190,7 +190,7 @@ def test_dependent_speeds_stand_by_their_names_and_are_replaced_first():
 
 
 @pytest.mark.slow
-def test_a_large_system_never_becomes_a_tree():
+def test_equations_of_a_large_system_use_common_subexpressions():
     """The bicycle's tree has more operations than could be counted one by one; its replacements no more than nodes."""
     bicycle = CATALOG["WhippleBicycle"].example()
     found = jk.symbolic.equations(bicycle)
@@ -212,7 +212,7 @@ def test_a_large_system_never_becomes_a_tree():
 # Linear models
 
 
-def test_the_linear_model_of_a_pendulum_is_that_of_the_book():
+def test_the_linear_model_of_a_pendulum_equals_that_of_the_book():
     model = jk.symbolic.linearize(CATALOG["DoublePendulum"].example(), {"theta1": 0.0}).simplified()
     g, l = model.symbols["gravity"], model.symbols["length"]
     assert model.states == ("theta1", "theta2", "theta1_dot", "theta2_dot")
@@ -231,7 +231,7 @@ def at_numbers(model, system, **more):
 
 
 @pytest.mark.slow
-def test_linear_models_on_constraints_are_those_of_stability():
+def test_linear_models_with_constraints_agree_with_the_stability_module():
     rtol = 1e-12
     bob = Bob()
     model = jk.symbolic.linearize(bob, {"y": "-length"}, states=("x", "vx"))
@@ -241,7 +241,7 @@ def test_linear_models_on_constraints_are_those_of_stability():
     assert str(sp.simplify(model.A[1, 0])) == "-981/(100*length)"
 
 
-def test_a_linear_model_where_dependent_coordinates_move():
+def test_a_linear_model_with_dependent_coordinates():
     """A rod of 5 m, pushed aside by 3 m: (y', v') = (v, -g / x y), the mass along y is m l^2 / x^2."""
     rod = RodOnPin(5.0)
     at = {"y": 3, "x": 4, "push": "147/10", "length": 5}
@@ -267,7 +267,7 @@ def test_the_linear_model_of_the_bicycle_in_its_speed():
         model.simplified()
 
 
-def test_what_is_no_linear_model_is_refused():
+def test_linearization_at_an_invalid_state_is_rejected():
     pendulum = CATALOG["DoublePendulum"].example()
     with pytest.raises(ValueError, match=r"not steady: theta1_dot is accelerated by .*steady=False"):
         jk.symbolic.linearize(pendulum, {"theta1": 1})
@@ -290,7 +290,7 @@ def test_what_is_no_linear_model_is_refused():
 
 
 @pytest.mark.slow
-def test_what_came_from_sympy_goes_back():
+def test_a_model_imported_from_sympy_exports_the_same_equations():
     """A model of `sympy.physics.mechanics`, made a system, has SymPy's own mass matrix and right side again."""
     me = pytest.importorskip("sympy.physics.mechanics")
     q, u = me.dynamicsymbols("q u")
@@ -309,7 +309,7 @@ def test_what_came_from_sympy_goes_back():
     assert sp.simplify(found.f.xreplace(back) - kane.forcing).is_zero_matrix
 
 
-def test_sympy_is_asked_for_by_name(monkeypatch):
+def test_the_error_without_sympy_states_the_package_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "sympy", None)
     with pytest.raises(ImportError, match=r'pip install "jaxkane\[symbolic\]"'):
         jk.symbolic.equations(Bob())
