@@ -11,6 +11,7 @@ from __future__ import annotations
 import collections
 import gc
 import itertools
+import math
 import threading
 import warnings
 import weakref
@@ -18,6 +19,7 @@ from collections.abc import Callable, Hashable, Iterable
 from typing import Any, ClassVar
 
 MISSING = object()
+_MAPPINGS_OF_A_PROGRAM = 900  # of a simulation with a contact and its derivative; most programs have a tenth
 _uses = itertools.count()
 
 
@@ -145,6 +147,7 @@ class _Limit:
     def __init__(self, mappings: int = 4000) -> None:
         self.mappings, self.has_warned = mappings, False
         self.dropped: set[int] = set()
+        self._expected: float = math.inf  # upper bound of the mappings now, from the last reading
         self._lock = threading.Lock()
 
     def check(self, new: int) -> None:
@@ -152,11 +155,16 @@ class _Limit:
         if not self._lock.acquire(blocking=False):  # another thread runs this check
             return
         try:
+            # To list 4000 mappings takes 10 ms or more, so they are read only if the limit may have been reached.
+            self._expected += _MAPPINGS_OF_A_PROGRAM
+            if self._expected <= self.mappings and new not in self.dropped:
+                return
             used, most = memory_mappings()
             if new in self.dropped:
                 self._double(most)
             if used > self.mappings:
                 used = self._drop(most)
+            self._expected = used + _MAPPINGS_OF_A_PROGRAM
             if used > 0.75 * most and not self.has_warned:
                 self.has_warned = True
                 warnings.warn(
