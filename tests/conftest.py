@@ -9,7 +9,7 @@ How to run them:
     JAXKANE_TEST_CACHE=FOLDER     keeps them elsewhere
     JAXKANE_TEST_CACHE=0          keeps none, and leaves XLA as a user has it
     pytest -m ""                  the slow ones too
-    pytest -m "slow and not long"  the slow ones that CI runs
+    pytest -m "slow and not weekly"  the slow ones that CI runs
     JAXKANE_VALIDATION=docs/validation.md pytest -m published    writes the table of published figures
 """
 
@@ -174,9 +174,9 @@ def _kernels_of(item):
     return item.callspec.params["kernels"] if "kernels" in item.fixturenames else None
 
 
-def _is_slow_case(item) -> bool:
-    """Whether `slow_cases` of the item's test makes this case slow. Patterns are those of `fnmatch`."""
-    marker = item.get_closest_marker("slow_cases")
+def _has_case(item, name) -> bool:
+    """Whether the marker `name` of a parametrized test selects this case. Patterns are those of `fnmatch`."""
+    marker = item.get_closest_marker(name)
     if marker is None:
         return False
     case = item.callspec.id
@@ -187,9 +187,11 @@ def _is_slow_case(item) -> bool:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark `slow_cases` and `weekly` tests as slow. Tests of a file that are compiled in one way follow each other."""
+    """Weekly tests are slow ones. Tests of a file that are compiled in one way follow each other."""
     for item in items:
-        if item.get_closest_marker("weekly") or _is_slow_case(item):
+        if _has_case(item, "weekly_cases"):
+            item.add_marker(pytest.mark.weekly)
+        if item.get_closest_marker("weekly") or _has_case(item, "slow_cases"):
             item.add_marker(pytest.mark.slow)
     files = {}
     items.sort(key=lambda item: (files.setdefault(item.path, len(files)), Compilation.of(item)))

@@ -63,7 +63,7 @@ def file_of(name):
 FILES = sorted(path for path in SOURCE.rglob("*.py") if path != SOURCE / "__init__.py")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_modules_import_only_from_lower_layers():
     for path in FILES:
         room = room_of(path)
@@ -75,7 +75,7 @@ def test_modules_import_only_from_lower_layers():
                 assert fine, f"{path.relative_to(SOURCE)} imports {below}, which does not stand below it"
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_no_circular_imports_including_imports_for_type_checking():
     graphlib.TopologicalSorter({path: set(imports_of(path, types=True)) - {path} for path in FILES}).prepare()
 
@@ -153,7 +153,7 @@ def test_every_public_name_has_a_docstring():
                 assert thing.__doc__, f"{module.__name__}.{name} has no docstring"
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_importing_changes_nothing_and_prints_nothing():
     code = (
         "import os, sys, jax; before = dict(os.environ), jax.config.values.copy(); import jaxkane; "

@@ -98,7 +98,7 @@ def test_missing_packages_are_reported_by_name(monkeypatch):
     assert {"Pinocchio", "SymPy + C", "PyDy's Cython"} <= set(_peers.missing())
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_benchmark_runs_without_the_compared_packages(tmp_path):
     blocked = "import sys; sys.modules.update(dict.fromkeys(['mujoco', 'pinocchio', 'jaxsim', 'rod']))\n"
     (tmp_path / "sitecustomize.py").write_text(blocked)
@@ -156,7 +156,7 @@ def test_a_failed_child_process_reports_the_reason():
         list(child("no_such_module"))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_baseline_of_first_calls_solves_its_equation():
     rtol = 1e-7
     slopes = first_calls.floor("sensitivities", samples=3, parameters=4)()

@@ -24,7 +24,7 @@ def assert_power_is_the_rate_of_energy(system, state):
     assert abs(float(rate - power)) < rtol * scale
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_mechanisms_of_the_recipes_satisfy_the_power_balance():
     names = {}
     for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL):

@@ -30,7 +30,7 @@ def test_matrix_products_in_user_code_are_correct_in_large_batches():
     np.testing.assert_allclose(squares, np.sum((rows @ turn.T) ** 2, axis=1), rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.optimized
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_accelerations_of_large_batches_are_correct(name, kernels):
@@ -47,7 +47,7 @@ def test_accelerations_of_large_batches_are_correct(name, kernels):
     assert_equal(batch(q, u), in_small_batches(batch, q, u))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.optimized
 def test_reduce_functions_with_matrix_products_in_large_sweeps():
     """`reduce` is code of the user, which may multiply matrices."""
@@ -61,7 +61,7 @@ def test_reduce_functions_with_matrix_products_in_large_sweeps():
     assert_equal(swept(N), swept(SMALL))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.optimized
 def test_elimination_in_large_batches_of_windows():
     n_z, n_b, n_x = 2, 1, 3

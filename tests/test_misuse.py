@@ -199,7 +199,7 @@ def test_a_parameter_change_that_prevents_loop_closure_is_rejected():
     assert np.all(np.isnan(found(0.1)))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_batch_member_whose_loop_cannot_be_closed_has_status_invalid():
     system = four_bar(jnp.zeros(()))
     apart = np.linspace(0.0, 0.1, 2)

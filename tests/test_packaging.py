@@ -88,7 +88,7 @@ def test_test_files_have_unique_names():
     assert sorted(names) == sorted(set(names))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_self_test():
     run = subprocess.run([sys.executable, "-m", "jaxkane"], capture_output=True, text=True)
     assert (run.returncode, run.stderr) == (0, "")

@@ -149,7 +149,7 @@ SMALL = Units(1e-6, 1e-9, 1e-3)  # as a micromechanism
 LARGE = Units(1e6, 1e9, 1e5)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("name", ["BarWithPiston", "SliderWithPinnedBar"])
 def test_results_do_not_depend_on_the_units(name):
     expected = results(name, Units())
@@ -176,7 +176,7 @@ def combinations(n=24):
 MODERATE = [Units(1e-3, 1e-3, 1.0), Units(1e2, 1e2, 1e-2), Units(1e-2, 1.0, 1e3)]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("name", ["BarWithPiston", "DoublePendulum", "RotatingFrameAndBar", "WhippleBicycle"])
 def test_results_do_not_depend_on_the_units_in_float32(name):
     """Within its range: an inertia of 1e-9 kg (1e-9 m)^2 times one of its kind is smaller than any number."""
@@ -185,7 +185,7 @@ def test_results_do_not_depend_on_the_units_in_float32(name):
         assert_equal(results(name, units, np.float32), expected, 1e-3, f"{name} in {units}")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(("i", "name"), [*enumerate(CATALOG)])
 def test_results_of_every_system_in_six_of_24_unit_systems(i, name):
     """Four systems in succession have all 24 units."""

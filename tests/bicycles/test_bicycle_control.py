@@ -90,7 +90,7 @@ def test_a_geared_rotor_adds_its_reflected_inertia_to_the_steer():
     np.testing.assert_allclose((both[0] - both[1])[2, 2], 1e-3 * rate**2, rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_steering_motor_has_delay_lag_and_torque_limit():
     """At 10 rad/s: a delay of 50 ms to the Pade approximation's error, (s T)^4 / 72 = 9e-4; a lag of 20 ms exactly."""
     motor = SteeringMotor(delay=0.05, lag=0.02, limit=1e9)
@@ -103,7 +103,7 @@ def test_a_steering_motor_has_delay_lag_and_torque_limit():
     np.testing.assert_allclose(limited["steer_torque"], 2.0, rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_dry_friction_acts_as_viscous_damping_at_low_rates():
     """To first order level / width is added to the damping of the steer: exact to rounding."""
     still, x = straight_ahead(BENCHMARK, 4.0), ("steer_rate",)
@@ -128,7 +128,7 @@ def test_steer_by_wire_applies_torques_to_fork_and_handlebar():
     np.testing.assert_allclose(forces(100.0) - forces(40.0), [torque, -0.8 * 0.5 * torque], rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_stiff_steer_by_wire_coupling_approaches_a_rigid_steering():
     """1e-4 of the largest slow eigenvalue at 1e5 N m/rad, and ten times that at 1e4: of the first order."""
     bar = {"mass": 0.5, "x": 0.88, "z": -0.8, "Ixx": 0.005, "Iyy": 0.003, "Izz": 0.002}
@@ -144,7 +144,7 @@ def test_a_stiff_steer_by_wire_coupling_approaches_a_rigid_steering():
     np.testing.assert_allclose(gap(1e4) / gap(1e5), 10.0, rtol=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_steer_by_wire_command_passes_through_the_motor():
     """The motor's command is the coupling's torque."""
     wire = SteerByWire(1.0, 0.85, -0.95, 0.02, 0.01, 0.015, stiffness=100.0, ratio=0.5, command="steer_command")
@@ -158,7 +158,7 @@ def test_a_steer_by_wire_command_passes_through_the_motor():
 # Drive
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_constant_speed_outputs_the_torque_that_balances_drag():
     """1e-10: power of the drag, 0.5 * 1.2 * 0.5 * 3^3 W, over the wheel's rate of 10 rad/s."""
     bicycle = BENCHMARK.with_parts(drive=(Drag(area=0.5, height=1.0), ConstantSpeed(3.0)))
@@ -185,7 +185,7 @@ def test_commanded_torques_are_outputs():
     assert "applied_drive_torque" not in told
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_feedback_gains_change_the_linear_model_to_A_minus_B_K():
     """A - B K, 1e-12."""
     plain = straight(BENCHMARK, 3.0)
@@ -212,7 +212,7 @@ def test_scheduled_gains_are_interpolated_linearly_over_speed():
         np.testing.assert_allclose(gains(v), known, atol=0.055 if v == 4.0 else 8e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_regulators_are_scheduled_over_speed():
     """1e-12 against the regulator of one speed; stable at the speeds between and above."""
     Q, R = [10.0, 1.0, 1.0, 0.1], 0.01
@@ -223,7 +223,7 @@ def test_regulators_are_scheduled_over_speed():
     assert np.asarray(steered).real.max() < -1.0
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_bicycle_follows_the_desired_roll_angle():
     """By `follow_gain`, 1e-9: the regulator's own is one at a speed of a schedule of one."""
     regulated = BENCHMARK.with_parts(control=scheduled_lqr(BENCHMARK, [4.0], [10.0, 1.0, 1.0, 0.1], 0.01))
@@ -232,7 +232,7 @@ def test_a_bicycle_follows_the_desired_roll_angle():
         follow_gain(BENCHMARK, 4.0)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_rider_of_hess_and_moore_closes_five_loops():
     """1e-9, against the matrix that the block diagram gives by hand; with the published gains it rides stably."""
     speed, w, z = 5.0, 30.0, 0.707
@@ -286,7 +286,7 @@ def test_the_path_follower_steers_along_an_arc_to_the_path():
 # All together
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_all_parts_are_compiled_into_one_program():
     """Traced, and not compiled: what cannot be part of one program of scalars is an error in these tests."""
     wire = SteerByWire(1.0, 0.85, -0.95, 0.02, 0.01, 0.015, stiffness=100.0, command="steer_command")
@@ -305,7 +305,7 @@ def test_all_parts_are_compiled_into_one_program():
         assert set(rates) == set(bicycle.states)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_energy_balance_includes_the_power_of_all_parts():
     """1e-9: of a motor with its rotor, friction, drag and tyres that slip, beside the gains that steer."""
     tyre = Tyre(lateral=LateralSlip(6000.0, 500.0, relaxation_length=0.1))

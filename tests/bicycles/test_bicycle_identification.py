@@ -81,7 +81,7 @@ def errors(found):
     return {name: (found.estimates[name] - truth[name]) / found.standard_errors[name] for name in truth}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_rider_and_relaxation_length_are_identified_within_standard_errors():
     """Inside three standard errors of the truth; of 20 seeds 18 at least were."""
     for seed in range(3):  # by one program

@@ -63,7 +63,7 @@ def test_accelerations_of_a_bicycle_with_tyre_slip(instants):
         np.testing.assert_allclose([rates[name] for name in known], list(known.values()), rtol=1e-12, atol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_normal_loads_of_a_bicycle_with_tyre_slip(instants):
     """1e-10 N."""
     for state, at in instants:
@@ -72,7 +72,7 @@ def test_normal_loads_of_a_bicycle_with_tyre_slip(instants):
         np.testing.assert_allclose(found, [state["loads"][end] for end in ENDS], atol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_tyre_relaxation_in_forward_and_backward_motion(instants):
     """1e-12 of the rates of the forces [N/s]: relaxation_length / |speed| F' + F = C1 slip + C2 camber."""
     directions = set()

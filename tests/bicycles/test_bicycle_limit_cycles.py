@@ -38,7 +38,7 @@ def cycles(speed, steer, until, **steps):
     return family(small.system, small, towards=towards, until={"drive.speed": until}, **steps)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_weave_and_wobble_have_limit_cycles():
     weave = cycles(WEAVE, 0.02, 5.87, step=0.3, max_step=1.0)
     assert np.all(weave.stable)  # below the weave speed, the motorcycle weaves and does not fall

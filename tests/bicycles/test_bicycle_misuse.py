@@ -155,20 +155,20 @@ def test_implausible_parameters_are_rejected_with_the_likely_unit_error(made, wo
         made()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_batch_member_with_an_implausible_parameter_has_status_invalid():
     swept = sweep(BENCHMARK, straight_ahead(BENCHMARK, 5.0), jnp.array([0.0, 0.1]), table={"zB": [-0.9, 0.9, -0.8]})
     assert swept.counts == {"completed": 2, "invalid": 1}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     "ask",
     [
         lambda bicycle: jk.accelerations(bicycle, 0.0, jnp.zeros(8), jnp.zeros(5)),
         pytest.param(
             lambda bicycle: jk.simulate(bicycle, straight_ahead(bicycle, 5.0), jnp.array([0.0, 0.1])),
-            marks=pytest.mark.slow,
+            marks=pytest.mark.weekly,
         ),
         lambda bicycle: linearize(bicycle, straight_ahead(bicycle, 5.0), states=bicycle.lateral),
     ],
@@ -236,7 +236,7 @@ def test_a_parameter_of_a_part_has_the_same_name_everywhere():
         bicycle.with_parts(**{name: -1.0})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_sweep_table_can_name_a_parameter_of_a_part():
     bicycle = BENCHMARK.with_parts(extra=[TRAILER])
     swept = sweep(bicycle, jk.assemble(bicycle, {}), jnp.array([0.0, 0.01]), table={"extra[0].mass": [20.0, 30.0]})
@@ -282,7 +282,7 @@ class Counts(Filter):
         return (1.0, 2.0)
 
 
-@pytest.mark.slow_cases("part[456]-*")
+@pytest.mark.weekly_cases("part[456]-*")
 @pytest.mark.parametrize(
     ("part", "error", "words"),
     [

@@ -65,7 +65,7 @@ def linear_models(bicycle, speeds, states):
     return np.array([model.A for model in models]), np.array([model.B for model in models])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_linear_model_with_a_leaning_rider_agrees_with_bicycle_parameters(tmp_path):
     """1e-9 asked."""
     bicycle, known = leaning(tmp_path), LITERATURE["lean"]
@@ -79,7 +79,7 @@ def test_the_linear_model_with_a_leaning_rider_agrees_with_bicycle_parameters(tm
             assert np.abs(found - value).min() < 1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_rider_feedback_agrees_with_bicycle_parameters():
     """1e-9 asked. T = -K x, with the torques of roll and steer."""
 
@@ -118,7 +118,7 @@ def assembled(model):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "model", [pytest.param(name, marks=[pytest.mark.slow] if name == "arms" else []) for name in SYMBRIM["models"]]
+    "model", [pytest.param(name, marks=[pytest.mark.weekly] if name == "arms" else []) for name in SYMBRIM["models"]]
 )
 def test_accelerations_agree_with_symbrim(model):
     """1e-11 asked."""
@@ -243,7 +243,7 @@ def small_ride():
     return bicycle, jk.State(start.q.at[0].set(0.05), start.u), jnp.linspace(0.0, 0.2, 3)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_parameters_of_parts_are_swept():
     bicycle, start, ts = small_ride()
     table = {"rider.stiffness": [0.0, 500.0, 500.0], "rider.mass": [48.0, 48.0, -1.0]}
@@ -356,7 +356,7 @@ def test_riders_and_their_parts_are_drawn():
     assert np.abs(np.abs(ends[:, 1]) - 0.02).min() < 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_energy_balance_of_a_rider_with_arms_holds():
     """1e-9 asked: springs and dampers of the hinge and the arms, weights and a torque at the hinge, along 0.3 s."""
     joints = {"shoulder_stiffness": 5.0, "shoulder_damping": 1.0, "elbow_stiffness": 8.0, "elbow_damping": 0.5}
@@ -370,7 +370,7 @@ def test_the_energy_balance_of_a_rider_with_arms_holds():
     assert abs(float(audit.energy_balance)) < 1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_parameters_of_a_rider_can_be_exported_and_fitted(tmp_path):
     """The stiffness of a hinge is found to three standard errors from a ride with noise, begun 20 % off."""
     truth = browser_jason(stiffness=128.0, damping=50.0)

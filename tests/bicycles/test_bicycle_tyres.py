@@ -50,7 +50,7 @@ def test_camber_is_equivalent_to_a_slip_angle():
     assert LateralSlip(cornering_stiffness=2e4).equivalent(0.1) == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("relaxation", [None, 0.1])
 def test_stiff_tyres_approach_ideal_rolling(relaxation):
     """1e-6 by extrapolation from 1e7 and 1e8 N/rad; the difference itself falls as one over the stiffness."""
@@ -65,7 +65,7 @@ def test_stiff_tyres_approach_ideal_rolling(relaxation):
     np.testing.assert_allclose((10.0 * found[1] - found[0]) / 9.0, whipple, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_tyres_with_large_stiffness_per_load_approach_ideal_rolling():
     """1e-6 asked at 1e8, met where that is the stiffness over the load [1/rad], 3e10 to 6e10 N/rad."""
     tyre = Tyre(lateral=MagicFormula(1e8))
@@ -99,7 +99,7 @@ class RoundedLoad(Part):
         return {"steer_torque": -self.missing * self.trail * lean}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.optimized
 @pytest.mark.published
 def test_eigenvalues_of_sharps_motorcycle_agree_with_the_published_table(published):
@@ -125,7 +125,7 @@ def test_eigenvalues_of_sharps_motorcycle_agree_with_the_published_table(publish
     )
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_modes_of_tyres_and_flexible_frame_are_named():
     """What bounces on the tyres, the wobble of a frame that gives way, and the bicycle's own modes, under jit too."""
     tyre = Tyre(lateral=LateralSlip(9000.0, 900.0, relaxation_length=0.1))
@@ -143,7 +143,7 @@ LEANING = {"roll": 0.2, "steer": 0.15, "yaw": 0.3, "x": 0.5, "y": -0.2}
 MOVING = {"roll_rate": 0.3, "rear_wheel_rate": -16.0, "steer_rate": -0.4}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_road_of_constant_grade_equals_a_slope():
     """1e-12. Its normal is the same everywhere; gravity is tilted against it."""
     slope = Bicycle.benchmark().with_parts(road=Slope(jnp.arctan(0.1)))
@@ -157,7 +157,7 @@ def test_a_road_of_constant_grade_equals_a_slope():
     np.testing.assert_allclose(found(road, x=0.5 / along), found(slope), rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_linear_models_on_a_grade():
     """1e-12: at an instant of a ride up a `Road` that rises evenly, and of the steady one up a `Slope`.
 
@@ -174,7 +174,7 @@ def test_linear_models_on_a_grade():
     np.testing.assert_allclose(here.A, linearize(slope, up, states=slope.lateral).A, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_linear_model_on_a_road_uses_compiled_scalar_programs(native):
     """Written out, its derivatives would be eight thousand operations of XLA."""
     bicycle = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * jnp.sin(x)))
@@ -191,7 +191,7 @@ def test_linear_models_along_a_road_raise_with_advice():
             ask(road, 5.0)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_linear_models_raise_if_straight_riding_is_not_steady():
     """What to do is said; NaN only where a family was given."""
     across = Bicycle.benchmark().with_parts(road=Slope(0.1, towards=0.5 * np.pi))
@@ -204,7 +204,7 @@ def linearize_straight(bicycle, speed):
     return linearize(bicycle, straight_ahead(bicycle, speed))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_flat_road_equals_level_ground():
     """1e-12, a torus that slips behind, a knife edge that rolls before."""
     tyre = Tyre(crown=0.03, lateral=LateralSlip(9000.0, 900.0), longitudinal=LongitudinalSlip(2e4))
@@ -220,7 +220,7 @@ def test_a_flat_road_equals_level_ground():
     np.testing.assert_allclose(u[:3], u_level, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_energy_is_conserved_and_wheels_keep_contact_over_a_bump():
     """1e-8 of the energy, 1e-8 m; 5 cm high, half a metre long, crossed at an angle with toroidal tyres."""
     bump = Road(lambda x, y: 0.05 * jnp.exp(-(((x - 2.0) / 0.5) ** 2)) * (1.0 + 0.2 * jnp.sin(y)))
@@ -234,7 +234,7 @@ def test_energy_is_conserved_and_wheels_keep_contact_over_a_bump():
     assert kept.drift < 1e-8
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_step_in_the_road_ends_the_simulation():
     """A kerb of 20 cm that is narrower than the solver's steps, and a start from where the wheel is in it."""
     kerb = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * (1.0 + jnp.tanh((x - 2.5) / 0.02))))
@@ -246,7 +246,7 @@ def test_a_step_in_the_road_ends_the_simulation():
         jk.assemble(kerb, {"x": 2.3 - 1.02})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_energy_balance_includes_tyres_and_flexible_frame():
     """1e-9: lateral slip with relaxation and moments, longitudinal slip, rolling resistance, a frame that gives way."""
     rear = Tyre(0.02, MagicFormula(12.0, 1.1, camber_ratio=0.1, relaxation_length=0.1), rolling_resistance=0.005)
@@ -263,7 +263,7 @@ def test_the_energy_balance_includes_tyres_and_flexible_frame():
     assert kept.energy_balance < 1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_tyre_forces_balance_the_centripetal_acceleration_in_a_steady_turn():
     """1e-10: weight, and mass times speed squared over radius, of all bodies in a steady turn."""
     law = LateralSlip(9000.0, 900.0, relaxation_length=0.1, pneumatic_trail=0.02, twisting_stiffness=5.0)
@@ -294,7 +294,7 @@ def test_tyre_forces_balance_the_centripetal_acceleration_in_a_steady_turn():
     np.testing.assert_allclose(force[:2] + tyres, needed, atol=1e-10 * total)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_tyres_with_relaxation_reverse_direction_with_finite_derivatives():
     """A torque against the motion; everything is finite, and so is the derivative in the stiffness."""
 
@@ -318,7 +318,7 @@ def with_load_transfer(lag, **more):
     return Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_tyre_loads_equal_the_constraint_forces_in_a_steady_turn():
     """1e-10 of the weight: loads and lateral forces of the tyres, against the forces of constraint at the contacts."""
     bicycle = with_load_transfer(0.02, rolling_resistance=0.005)
@@ -338,7 +338,7 @@ def test_tyre_loads_equal_the_constraint_forces_in_a_steady_turn():
     np.testing.assert_allclose(turn["rear_load_transfer"], -turn["front_load_transfer"], rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_tyre_loads_equal_the_constraint_forces_during_braking():
     """1e-10: the transfer stands still at what the moments about the rear contact give.
 
@@ -434,7 +434,7 @@ def test_a_measured_tyre_outside_its_range_of_validity():
     assert MagicFormula89(law.force_coefficients).moment(0.0, 0.05, 400.0, 0.1) == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_bicycle_with_measured_tyres_has_a_slower_weave():
     """Its weave is slower than with ideal tyres, and damped at 6 m/s; with their offsets it cannot ride straight on."""
 

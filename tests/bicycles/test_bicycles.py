@@ -21,7 +21,7 @@ def test_a_bicycle_without_parts_equals_the_catalogue_bicycle():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_tyre_crowns_change_only_the_gravity_stiffness_of_roll_and_steer():
     """K0 of the benchmark changes in roll by the normal loads times the crown radii, 94 kg * 0.02 m."""
     tyre = Tyre(crown=0.02)
@@ -54,7 +54,7 @@ class Seat(Part):
         return ()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_straight_riding_balances_drag_and_seat_deflection():
     """1e-7, the smoothing of the drag at rest: density / 2 area v^2 rR, and weight over stiffness."""
     bicycle = Bicycle.benchmark().with_parts(drive=Drag(area=0.6), extra=[Seat()])
@@ -63,7 +63,7 @@ def test_straight_riding_balances_drag_and_seat_deflection():
     np.testing.assert_allclose(motion["seat_drop"], 18.0 * bicycle.g / 2e4, rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("slipping", [False, True])
 def test_rolling_resistance_is_equivalent_to_shifted_normal_forces(slipping):
     """1e-9: eigenvalues with it are those with the moment of the normal forces about the contacts."""
@@ -91,7 +91,7 @@ class Ahead(Part):
         return found
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_longitudinal_slip_does_not_change_eigenvalues_and_mode_names():
     """1e-10: to first order upright riding does not notice it."""
     tyre = Tyre(longitudinal=LongitudinalSlip(2e4))

@@ -12,7 +12,7 @@ from jaxkane._scalarjit.program import Program
 from jaxkane.catalog import CATALOG
 
 
-@pytest.mark.slow_cases(
+@pytest.mark.weekly_cases(
     "WhippleBicycle",
     "SpatialDoublePendulum",
     "Aircraft",

@@ -56,11 +56,11 @@ FUNCTIONS = {f.__name__: f for f in (equations, forces, kinematics, modes)}
 QUICK = {("RodOnPin", f) for f in ("equations", "forces", "kinematics")} | {("BarWithPiston", "equations")}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("name", "f"),
     [
-        pytest.param(name, f, marks=[] if (name, f) in QUICK else [pytest.mark.slow])
+        pytest.param(name, f, marks=[] if (name, f) in QUICK else [pytest.mark.weekly])
         for name in SYSTEMS
         for f in FUNCTIONS
     ],

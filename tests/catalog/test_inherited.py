@@ -199,7 +199,7 @@ def test_a_non_leaning_rider_adds_his_inertia_to_the_frame(leaning):
     assert float(M4[3, 3]) == pytest.approx(m * h**2, rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_eigenvalues_of_a_bicycle_with_an_additional_rider_coordinate(leaning):
     """All that moves is in the model; a stiff rider has the modes of one who is part of the frame, and another."""
     stiff = dataclasses.replace(leaning, stiffness=1e8)

@@ -70,7 +70,7 @@ _example = functools.cache(Example)
 
 # One of each kind is enough for a plain run; CI asks all of them.
 QUICK = {"DoublePendulum", "RigidBody", "BarWithPiston", "DiskAndBar", "SpinningTop"}
-SLOW = pytest.mark.slow
+SLOW = pytest.mark.weekly
 
 
 @pytest.fixture(params=[name if name in QUICK else pytest.param(name, marks=SLOW) for name in CATALOG])

@@ -10,7 +10,7 @@ from jaxkane.catalog import Backlash, Belt, KerbWheel, RockingBlock, SliderCrank
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_rocking_block_agrees_with_housners_article():
     """From rest at 0.25 rad. The ratio of the rates at a landing is 1 - 3/2 sin^2 alpha = 0.85."""
     times = [0.6402887800202485, 1.338581180728541, 1.8563203472495828]
@@ -27,7 +27,7 @@ def test_a_rocking_block_agrees_with_housners_article():
     np.testing.assert_array_equal(ride.contacts["right"], np.where(ride["angle"] < 0, 2, 0))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_block_on_a_belt_sticks_and_slips_at_the_times_of_the_closed_form():
     """Closed forms of the times at which the block sticks and slips, from rest at x = 0."""
     times = [0.205758423033744, 2.101402346772704, 4.2602012771151685, 5.7602012771151685, 7.919000207457633]
@@ -42,7 +42,7 @@ def test_a_block_on_a_belt_sticks_and_slips_at_the_times_of_the_closed_form():
     np.testing.assert_allclose(ride["belt.friction"][~sticks], 2.5 * np.sign(0.5 - ride["x_dot"][~sticks]), rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_motor_drives_a_load_through_backlash():
     """With the torque A cos(w t) and e = 0. Momentum is conserved: the motor reaches the load with the speed
     A sin(w t) / w / J_m and continues with A sin(w t) / w / (J_m + J_l). It lifts off when the torque changes its sign.
@@ -64,7 +64,7 @@ def test_a_motor_drives_a_load_through_backlash():
     np.testing.assert_allclose(ride["drive.normal"][closed], force, rtol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_slider_with_clearance():
     """The first two impacts and the end of the figures for the parameters of Flores et al. (2010)."""
     start = jk.State([0.0] * 3, [150.0, -75.0, 0.0])
@@ -80,7 +80,7 @@ def test_a_slider_with_clearance():
     np.testing.assert_allclose(found, end, rtol=1e-7)  # impacts accumulate
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_wheel_without_friction_leaves_the_edge():
     """Energy and the normal force m g cos(phi) - m v^2 / R give cos(phi) = (2 + v0^2 / (g R)) / 3 at the lift-off."""
     v0, g, R, kerb = 1.4, 9.81, 0.35, 0.08
@@ -97,7 +97,7 @@ def test_a_wheel_without_friction_leaves_the_edge():
     np.testing.assert_allclose(jumps.t[last] - jumps.t[0], (fall - v * sine) / g, rtol=0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_wheel_rolls_over_the_edge():
     """Without slip, the energy 3/4 m v^2 + m g y is constant."""
     v0, g, R, kerb = 1.0, 9.81, 0.35, 0.08
@@ -111,7 +111,7 @@ def test_a_wheel_rolls_over_the_edge():
     np.testing.assert_allclose(ride["spin"][on_edge], np.sqrt(squares) / R, rtol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_woodpecker_toy_has_the_published_period():
     """The period of Leine et al. (2003) is 0.146 s. The sleeve jams in each period, so one multiplier is not zero."""
     jammed = jk.assemble(Woodpecker(), {"bird": -0.2788}, {"bird_rate": -7.4583, "climb": -0.3411}, touching=("lower",))

@@ -52,8 +52,8 @@ def planned(units, is_fastest):
     return solve(Problem(plate, 2 * T, cost=effort, **arguments), intervals=10)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("units", [OTHERS[0], pytest.param(OTHERS[1], marks=pytest.mark.slow)])
+@pytest.mark.weekly
+@pytest.mark.parametrize("units", [OTHERS[0], pytest.param(OTHERS[1], marks=pytest.mark.weekly)])
 def test_units_of_length_mass_and_time(units):
     rtol, (L, M, T) = 1e-9, units
     for is_fastest, factor in ((False, (M * L / T**2) ** 2 * T), (True, T)):
@@ -68,7 +68,7 @@ def test_units_of_length_mass_and_time(units):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("duration", [1e-9, pytest.param(1e-6, marks=pytest.mark.slow), 1e6])
+@pytest.mark.parametrize("duration", [1e-9, pytest.param(1e-6, marks=pytest.mark.weekly), 1e6])
 def test_durations(duration):
     """Without units of the system: a place of 1, a force of 1e18."""
     rtol, force = 1e-8, duration**-2.0
@@ -85,7 +85,7 @@ def test_durations(duration):
     assert plan.iterations < 30
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_states_that_are_zero_do_not_refine_the_mesh():
     """The flight of an aircraft straight ahead that rolls: y and z are zero but for errors of 2e-5 m beside 200 m. With
     these as sizes, the mesh grew from 40 to 316 intervals."""
@@ -157,7 +157,7 @@ def test_second_solve_compiles_nothing():
     assert not compiled
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_repeated_solves_do_not_grow_memory():
     problem = Problem(Sled(), 1.0, controls=["force"], cost=effort, **ENDS)
 
@@ -209,11 +209,12 @@ SIGNALS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
-    "name", [pytest.param("samples", marks=pytest.mark.slow), pytest.param("function", marks=pytest.mark.slow), "all"]
+    "name",
+    [pytest.param("samples", marks=pytest.mark.weekly), pytest.param("function", marks=pytest.mark.weekly), "all"],
 )
-@pytest.mark.parametrize("duration", [pytest.param(1.5, marks=pytest.mark.slow), (0.5, 1.5)])
+@pytest.mark.parametrize("duration", [pytest.param(1.5, marks=pytest.mark.weekly), (0.5, 1.5)])
 def test_inputs_and_systems_that_depend_on_time(name, duration):
     """The sum of all three forces is that of the undisturbed sled if the cost is that of the sum."""
 
@@ -243,7 +244,7 @@ class Valve(Sled):
         return {"power": now["actual"] * u["v"], "energy": {"kinetic": 0.5 * u["v"] ** 2}}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_first_order_states_and_outputs():
     """Outputs in the cost, along the motion, in a path constraint and at both ends."""
     problem = Problem(
@@ -261,7 +262,7 @@ def test_first_order_states_and_outputs():
     assert "energy.kinetic at the end" in plan.multipliers
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_dependent_coordinates_and_speeds():
     """A point on a circle, from its own start to a height, with bounds on the dependent speed."""
     rod = RodOnPin(length=1.0)

@@ -120,7 +120,7 @@ def test_linear_quadratic_problem_against_riccati():
     assert np.max(plan.errors) <= 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_multipliers_are_derivatives_of_the_least_cost():
     """By finite differences: of a start, an end, a bound, a condition, a path constraint and the duration's bound."""
     rtol, step = 1e-4, 1e-3
@@ -175,7 +175,7 @@ class Hypersensitive(Sled):
         return jk.Force((inputs["force"] - u["v"] ** 3) * motion.N.x, motion["sled"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_hypersensitive_problem():
     """J. T. Betts, Practical Methods for Optimal Control, example 10.7: 6.7241 over 10 000 s, which is at rest but for
     the first and last seconds."""
@@ -207,7 +207,7 @@ class Chute(jk.System):
         return jk.weight(motion, 9.81 * motion.N.y), jk.Torque(inputs["torque"] * motion.N.z, motion["bead"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_brachistochrone():
     """A cycloid of radius 1 m down to the parameter 2: its time is 2 sqrt(1 / 9.81) s. Its heading turns steadily."""
     rtol = 1e-5
@@ -224,7 +224,7 @@ def test_brachistochrone():
 BICYCLE = jk.catalog.WhippleBicycle.benchmark()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_lane_change_of_notebook_9():
     """1.941733 N^2 m^2 s in the notebook, by CasADi's symbolic derivatives and 200 intervals."""
     rolling = jk.assemble(BICYCLE, {}, {"rear_wheel_rate": -6.0 / float(BICYCLE.rR)})
@@ -246,7 +246,7 @@ WALKERS = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(("walker", "q", "u", "period"), WALKERS, ids=lambda x: type(x).__name__)
 def test_gaits_of_walkers(walker, q, u, period):
     """A phase that its own heel strike leads back to its start is the periodic orbit."""
@@ -261,7 +261,7 @@ def test_gaits_of_walkers(walker, q, u, period):
     np.testing.assert_allclose(plan.state(0).u, orbit.state.u, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("intervals", [7, 50])
 @pytest.mark.parametrize("method", ["hermite-simpson", "lobatto"])
 def test_a_switch_inside_an_interval_is_refined(method, intervals):

@@ -66,7 +66,7 @@ def test_plans_of_other_systems_are_refused(plan):
         jk.positions(SLED, plan, plan.q)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_polynomials_between_the_nodes(plan):
     """`at`, `inputs` and the trajectory agree at the nodes; `replay` reproduces the plan there, and with the accuracy
     of a parabola elsewhere."""
@@ -215,7 +215,7 @@ def test_copies_of_plans(plan):
         assert other.multipliers["x"][-1] == plan.multipliers["x"][-1]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_refinement_stays_within_its_limits():
     """A bang-bang control, and a spring so stiff that the first mesh is far too coarse."""
     fastest = Problem(

@@ -17,7 +17,7 @@ IN_CI = {"WhippleBicycle", "RotatingFrameAndBarChosenSpeeds", "SimplestWalker"}
 SYSTEMS = [pytest.param(name, marks=[] if name in IN_CI else pytest.mark.weekly) for name in WITHOUT_CONTACTS]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_derivatives_of_the_catalogue(name):
     rtol = 1e-10
@@ -31,7 +31,7 @@ def test_derivatives_of_the_catalogue(name):
     assert max(found.values()) < rtol, found
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_of_all_kinds_of_functions():
     """Cost, final cost, conditions and path constraints, with a free duration."""
     rtol, system = 1e-10, CATALOG["DoublePendulum"].example()
@@ -49,7 +49,7 @@ def test_derivatives_of_all_kinds_of_functions():
     assert max(found.values()) < rtol, found
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_with_a_free_parameter_and_phases():
     rtol = 1e-10
     one = Problem(
@@ -80,7 +80,7 @@ def test_derivatives_with_branches():
     assert max(found.values()) < rtol, found
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_with_dependent_coordinates_and_speeds():
     rtol = 1e-9
 

@@ -177,7 +177,7 @@ LIMITED = BODY.format(' range="20 90"').replace(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @needs_mujoco
 def test_a_limit_of_a_joint_is_a_contact():
     """A pendulum falls from 1 rad to its limit at 20 degrees: J w^2 / 2 = m g l (cos(limit) - cos(1)).
@@ -340,7 +340,7 @@ def test_a_missing_file_is_reported():
         jk.convert.from_mjcf("nowhere.xml")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @needs_mujoco
 def test_accelerations_can_be_differentiated_by_an_imported_mass():
     system = jk.convert.from_mjcf(FIGURES["model"])

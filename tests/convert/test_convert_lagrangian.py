@@ -98,7 +98,7 @@ def rates_of(lagrange, values, system, q, u):
     return every
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("name", MODELS)
 def test_accelerations_of_a_lagrangian_without_bodies_agree_with_sympy(name):
     lagrange, values, system = brought(name)
@@ -117,7 +117,7 @@ def test_accelerations_of_a_lagrangian_without_bodies_agree_with_sympy(name):
     assert jk.positions(system, 0.3, q, u) == {}  # it does not say where anything is
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_kinetic_energy_is_half_u_M_u_and_energy_is_conserved():
     _, values, system = brought("elastic_pendulum")
     kinetic = values["m"] * (0.3**2 + 0.8**2 * 0.5**2) / 2

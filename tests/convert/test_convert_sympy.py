@@ -359,7 +359,7 @@ def test_the_error_without_sympy_states_the_remedy(monkeypatch):
         jk.convert.from_sympy(None, {})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_code_of_the_page_on_importing_models_runs(me):
     pytest.importorskip("mujoco")
     page = (Path(__file__).parents[2] / "docs" / "bringing_models.md").read_text(encoding="utf-8")

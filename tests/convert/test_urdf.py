@@ -160,7 +160,7 @@ def test_limits_friction_and_damping():
         jk.convert.from_urdf(robot(link("base"), *wheels), stops=True, friction=True)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_friction_of_a_file_stops_a_flywheel():
     """J = 0.04 kg m^2 and the friction 0.02 N m: from 1 rad/s it stops after 2 s, at 1 rad."""
     text = robot(link("base"), link("wheel", 2.0), joint("j", "base", "wheel", more='<dynamics friction="0.02"/>'))

@@ -22,7 +22,7 @@ H, Q, SIGMA = 0.1, 0.2, {"x": 0.02, "x_dot": 0.1}
 CART = Cart(mass=1.0, stiffness=4.0, damping=0.3)
 START, DEVIATION = np.array([0.4, 0.1]), {"x": 0.1, "x_dot": 0.2}
 METHODS = pytest.mark.parametrize("method", ["extended", "unscented"])
-ONE_QUICKLY = pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.slow)])
+ONE_QUICKLY = pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.weekly)])
 
 
 def transition():
@@ -172,7 +172,7 @@ def by_hand(method, m, P, torque, y, h, density, sigma, drift):
     return m + K @ (y - expected), P - K @ (own + np.diag(sigma**2)) @ K.T
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @METHODS
 def test_the_filter_of_a_pendulum_equals_a_reference_implementation(method):
     tolerance = 1e-10
@@ -210,8 +210,8 @@ def last_of(filter, belief, n=12):
 MORE = {"lag": 2, "noise": {"torque": 1e-24, "rate": 0.01}}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [MORE, pytest.param({"lag": 20}, marks=pytest.mark.slow)])
+@pytest.mark.weekly
+@pytest.mark.parametrize("options", [MORE, pytest.param({"lag": 20}, marks=pytest.mark.weekly)])
 def test_the_lag_and_negligible_noise_do_not_change_the_current_estimate(options):
     tolerance = 1e-10
     first, other = last_of(*of_pendulum()), last_of(*of_pendulum(**options))
@@ -239,7 +239,7 @@ def bent(v, w):
     return jnp.stack([v[0] * v[1] + v[2] ** 2, jnp.sin(v[0]) + w[0] * v[1] + 2.0 * w[1], v[0] ** 3 - v[2]])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("rank", [3, 2])
 def test_moments_of_a_function_have_exact_derivatives(rank):
     """Of the mean, the covariance, and the covariance with what follows from the same x."""
@@ -276,7 +276,7 @@ def test_moments_of_a_function_equal_those_of_sigma_points(rank):
         np.testing.assert_allclose(S @ A[:, :5].T, across, rtol=1e-7, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @METHODS
 def test_derivatives_of_smoothed_and_late_states_are_exact(method):
     """Also where a parameter of the system is known, so that the covariance is singular."""
@@ -297,7 +297,7 @@ def test_derivatives_of_smoothed_and_late_states_are_exact(method):
     np.testing.assert_allclose(slope, numbers, rtol=1e-6, atol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @ONE_QUICKLY
 def test_filtering_of_a_closed_loop_does_not_depend_on_units(method):
     """The slider's place in metres, in units of 3.3 cm, and in metres where the crank is 30 m long."""
@@ -343,7 +343,7 @@ def test_initial_standard_deviations_satisfy_the_constraints():
     np.testing.assert_allclose(both.deviation(), [y * along, x * along, 0.0], rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_filter_runs_in_scan_vmap_and_grad():
     filter = Filter(Pendulum(), {"rate": 0.05}, noise={"torque": 0.01}, drift={"pull": 0.0})
     belief = begin(filter, jk.State(jnp.array([0.8]), jnp.array([-0.3])), {"angle": 0.1, "pull": 1.0})
@@ -381,7 +381,7 @@ def test_zero_time_steps_and_missing_measurements_change_nothing():
     assert (float(innovation.nis), int(innovation.n), float(innovation.deviation[0])) == (0.0, 0, 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @METHODS
 def test_the_filter_is_consistent(method):
     """200 simulated motions, of which the truth is known: both squares are chi squared."""
@@ -412,7 +412,7 @@ def test_the_filter_is_consistent(method):
     assert abs(np.corrcoef(e[:, 1:].ravel(), e[:, :-1].ravel())[0, 1]) < 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @METHODS
 def test_a_parameter_is_estimated_by_the_filter(method):
     system, ts = jk.catalog.DoublePendulum(mass=1.0, length=1.0), np.arange(0.0, 10.0, 0.02)
@@ -430,7 +430,7 @@ def test_a_parameter_is_estimated_by_the_filter(method):
     assert 1.8 < float(jnp.mean(innovation.nis)) < 2.3
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_filter_estimates_satisfy_the_constraints():
     """The rear wheel's contact and the front's: roll, steer and pitch depend on one another."""
     bicycle = jk.catalog.WhippleBicycle.benchmark()

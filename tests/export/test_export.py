@@ -107,14 +107,16 @@ def call(library, name, t, arrays, outputs, real=ctypes.c_double):
 
 SYSTEMS = ["DoublePendulum", "Odd", "Bob"]
 # Of the catalogue those with most to go wrong; `test_symbolic` has the same formulas of all.
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("Aircraft", "SpatialDoublePendulum", "WhippleBicycle")]
+SLOW = [
+    pytest.param(name, marks=pytest.mark.weekly) for name in ("Aircraft", "SpatialDoublePendulum", "WhippleBicycle")
+]
 
 
 # Who is told that something makes the library slow, is told so by other tests.
 pytestmark = pytest.mark.filterwarnings("ignore:.*its description uses")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @needs_compiler
 @pytest.mark.parametrize("name", [*SYSTEMS, *SLOW])
 def test_values_and_derivatives_in_c_agree_with_the_library(name, tmp_path):
@@ -137,7 +139,7 @@ def test_values_and_derivatives_in_c_agree_with_the_library(name, tmp_path):
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.weekly)])
 def test_the_test_program_passes_and_detects_errors(dtype, tmp_path):
     files = jk.export.c(Odd(), tmp_path / "odd.c", dtype=dtype)
 
@@ -435,7 +437,7 @@ def over_a_bump():
     return Bicycle.benchmark().with_parts(road=bump, rear_tyre=Tyre(crown=0.02))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_four_coupled_constraints_are_exported():
     """A bicycle that holds its speed: 1e-12 at a start that leans and steers, with another mass too."""
     bicycle = Bicycle.benchmark().with_parts(drive=(Drag(), ConstantSpeed(5.0)))
@@ -448,7 +450,7 @@ def test_four_coupled_constraints_are_exported():
         assert_close(rates, [np.asarray(x) for x in expected], 1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @needs_compiler
 @pytest.mark.parametrize("made", [steered, carrying, over_a_bump], ids=lambda made: made.__name__)
 def test_all_exports_of_a_bicycle_from_parts_agree_with_the_library(made, tmp_path):
@@ -562,7 +564,7 @@ np.savez(sys.argv[3], gradient=gradient, **found)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_stablehlo_without_jaxkane_is_bit_identical_for_any_batch(on_cpu, tmp_path):
     rtol = 1e-13
     pytest.importorskip("flatbuffers")

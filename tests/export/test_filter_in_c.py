@@ -150,28 +150,28 @@ def assert_same_steps(filter, belief, in_c, rtol, n=5, dt=0.02):
         np.testing.assert_allclose(nis, innovation.nis, rtol=100 * rtol, atol=100 * rtol)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @needs_compiler
-@pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.weekly)])
 def test_filter_steps_in_c_agree_with_the_library(method, tmp_path):
     """Inputs, states of the first order, outputs, parameters that drift, gaps and late measurements."""
     filter, belief = of_servo(method=method)
     assert_same_steps(filter, belief, compiled(filter, belief, tmp_path), 1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @needs_compiler
 @pytest.mark.parametrize(
-    "of", [of_circle, *(pytest.param(of, marks=pytest.mark.slow) for of in (of_crank, of_bicycle))]
+    "of", [of_circle, *(pytest.param(of, marks=pytest.mark.weekly) for of in (of_crank, of_bicycle))]
 )
-@pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.weekly)])
 def test_filter_steps_in_c_satisfy_the_constraints(of, method, tmp_path):
     filter, belief = of(method=method)
     assert_same_steps(filter, belief, compiled(filter, belief, tmp_path), 1e-12)
 
 
 @needs_compiler
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_single_precision_smoothed_states_and_invalid_times_in_c(tmp_path):
     filter, belief = of_servo(lag=0)
     in_c = compiled(filter, belief, tmp_path, ctypes.c_float)
@@ -186,7 +186,7 @@ def test_single_precision_smoothed_states_and_invalid_times_in_c(tmp_path):
     assert np.isnan(mean[:3]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @needs_compiler
 @METHODS
 def test_the_exported_test_program_passes(method, tmp_path):

@@ -178,7 +178,7 @@ class Unit:
 @needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 @pytest.mark.parametrize(
-    "name", ["Driven", "Bob", "Ball", "Odd", *(pytest.param(n, marks=pytest.mark.slow) for n in CATALOG)]
+    "name", ["Driven", "Bob", "Ball", "Odd", *(pytest.param(n, marks=pytest.mark.weekly) for n in CATALOG)]
 )
 def test_fmpy_validates_the_fmu(name, fmi, fmu_of):
     own = {"Driven": Driven, "Bob": Bob, "Ball": Ball, "Odd": Odd}

@@ -49,7 +49,8 @@ def arm(n, gravity=(0.0, -9.81, 0.0)):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("n", "numbers"), [pytest.param(1, 2, marks=pytest.mark.slow), (2, 5), pytest.param(3, 8, marks=pytest.mark.slow)]
+    ("n", "numbers"),
+    [pytest.param(1, 2, marks=pytest.mark.weekly), (2, 5), pytest.param(3, 8, marks=pytest.mark.weekly)],
 )
 def test_free_swings_with_friction(n, numbers):
     """The data's README: 2 numbers of a single pendulum, 5 of a double one, 8 of a triple one with known lengths."""
@@ -61,7 +62,7 @@ def test_free_swings_with_friction(n, numbers):
     assert len(found.places) == numbers + 1
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_vertical_hinge_has_one_base_parameter_and_a_horizontal_hinge_three():
     whole = {"center": (0.1, 0.02, 0.03), "inertia": ((0.02, 0.001, 0.002), (0.001, 0.03, 0.003), (0.002, 0.003, 0.04))}
     for axis, expected in (((0, 0, 1), ("Izz",)), ((0, 1, 0), ("mx", "mz", "Iyy"))):
@@ -71,7 +72,7 @@ def test_a_vertical_hinge_has_one_base_parameter_and_a_horizontal_hinge_three():
         assert found.count == len(expected)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("second", [1e6, 1e-6])
 def test_base_parameters_in_other_units_of_time(second):
     """A second is a million units of time, or the millionth part of one."""
@@ -90,7 +91,7 @@ def test_base_parameters_in_other_units_of_time(second):
     assert of_data.without_influence == ("link1.m",)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_puma_robot_has_36_base_parameters():
     """Mayeda, Yoshida and Osuka, Base parameters of manipulator dynamic models, 1990; the sums are Khalil's."""
     quarter = np.pi / 2
@@ -133,7 +134,7 @@ def test_base_parameters_from_a_regressor_of_many_samples():
         base_parameters(jax.tree.map(lambda x: x[0], rows))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_deviations_cover_the_truth():
     """Of 25 data sets with noisy torques, each base parameter; with a known sigma, and with an estimated one."""
     truth, at = swings()
@@ -150,7 +151,7 @@ def test_deviations_cover_the_truth():
         assert np.all(np.abs(np.mean(z, axis=0)) < 0.7)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_unidentifiable_base_parameters_are_reported_and_keep_their_values():
     """The second arm hangs still: its inertia is told by nothing."""
     truth, at = swings()
@@ -219,7 +220,7 @@ class Lagging(Swing):
         return [(now["torque1"] - x["motor"]) / 0.1]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_loads_that_depend_on_first_order_states():
     truth, _ = swings()
     system = Lagging(**{name: getattr(truth, name) for name in FREE if name[0] != "k"})
@@ -231,7 +232,7 @@ def test_loads_that_depend_on_first_order_states():
         base_parameters(Lagging(), KinematicSamples(at.t, at.q, at.u, at.u_dot))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_base_parameters_estimated_from_a_simulation():
     truth, at = swings()
     torque = {"torque1": lambda t, state: 0.3 * jnp.cos(9 * t)}
@@ -244,7 +245,7 @@ def test_base_parameters_estimated_from_a_simulation():
         kinematic_samples(truth, jax.tree.map(lambda x: x[::40] if x.shape[:1] == (401,) else x, ride))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_base_parameters_of_a_closed_loop():
     """A four-bar linkage tells 8 sums; those of another one with the same lengths, from its motion, exactly."""
 
@@ -270,7 +271,7 @@ def test_base_parameters_of_a_closed_loop():
     np.testing.assert_allclose(found.estimates, found.of(regressor(truth, *i).values), atol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_bicycle_has_twenty_base_parameters():
     """Of frame, fork and wheels; the whole mass, the height and place of its centre, and both wheels' spin moments."""
     found = base_parameters(jk.catalog.WhippleBicycle.benchmark(), parameters="steer_damping")

@@ -57,7 +57,7 @@ def test_scalar_and_body_parameters_are_mapped_in_one_compiled_program(jacobian)
     np.testing.assert_allclose(jax.jit(jacobian(values))(x), parameters.slopes(x), rtol=1e-13, atol=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_intervals_and_their_inverse():
     free = (
         Free("IBxx", bounds=(5.0, 20.0)),
@@ -94,7 +94,7 @@ def test_impossible_inertias_and_invalid_names_are_rejected():
         parameters_of(BICYCLE, (frame_inertia("B"), "IBxx"))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_inertia_of_a_thin_plate_is_estimated_only_with_possible_bodies():
     # A thin plate turns freely under small known torques: its third moment is nearly the sum of the two others.
     truth, rng = RigidBody(1.0, I11=1.0, I22=2.0, I33=2.97), np.random.default_rng(2)

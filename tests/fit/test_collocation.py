@@ -55,7 +55,7 @@ def by_collocation(trials, free=NAMES, guess=GUESS, unknown=("x", "x_dot"), **ho
     return fit(guess, trials, free, unknown=unknown, transcription=Collocation(**how), **options)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_equals_simulation_if_inputs_are_known():
     """Estimates within 0.4 % and a tenth of a standard error, standard errors within 5 %."""
     trial = record(1)
@@ -70,7 +70,7 @@ def test_equals_simulation_if_inputs_are_known():
         assert found.standard_errors[name] == pytest.approx(formal, rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_equals_the_kalman_filter_if_an_input_is_unknown():
     """A quarter of a standard error; standard errors within 15 %: observed and expected curvature differ."""
     trial = record(2, density=0.3)
@@ -94,14 +94,14 @@ def z_scores(seeds):
     return np.array(scores)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_intervals_cover_the_truth():
     """95 % intervals, 40 records of 3 parameters: at least 107 of 120, which less than 1 % of such sets miss."""
     inside = np.abs(z_scores(range(100, 140))) < 1.96
     assert inside.sum() >= 107
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_gains_offsets_priors_and_several_trials():
     """Truth within four standard errors; a strong prior wins."""
     trials = [record(seed, name=f"run {seed}") for seed in (3, 4)]
@@ -117,7 +117,7 @@ def test_gains_offsets_priors_and_several_trials():
     assert held.estimates["mass"] == pytest.approx(1.5, abs=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_delay_of_an_input():
     """0.1 s, within four standard errors."""
     trial = record(5)
@@ -220,7 +220,7 @@ def test_options_not_supported_by_collocation_are_rejected(option):
         fit(GUESS, record(1), (*NAMES, Delay("x")), transcription=Collocation())
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_wrong_standard_deviations_are_noted():
     """With a tenth of the true errors of the sensors, the mean square is not one."""
     trial = record(2, density=0.3)

@@ -45,7 +45,7 @@ FREE = ("restitution", "friction", "floor")
 SIGMA = {"x": 0.003, "y": 0.003, "angle": 0.03}  # [m, m, rad]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_intervals_contain_restitution_friction_and_gap():
     """Starts 20 % off: at least 18 of 20 fits have all errors below three standard errors.
 

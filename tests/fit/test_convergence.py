@@ -76,7 +76,7 @@ def test_nanometres_with_a_sigma_of_one_are_fitted_like_metres():
     assert nanometres.errors["gain"] == pytest.approx(metres.errors["gain"], rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_fit_with_a_parameter_at_its_bound():
     from test_parameters import Limited
 
@@ -185,7 +185,7 @@ def assert_coverage(fits, truth):
     assert low <= np.mean(held) <= high
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_interval_coverage_with_200000_residuals_and_a_close_initial_guess():
     # A fit that stops by a fraction of the cost does not move from the truth: its intervals would hold it in all sets.
     t, rng, truth = np.linspace(0.0, 4.0, 4001), np.random.default_rng(0), {"gain": 1.0, "drift": 0.3}
@@ -206,7 +206,7 @@ def test_interval_coverage_with_200000_residuals_and_a_close_initial_guess():
     assert low <= hits / (2 * SETS) <= high
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("factor", [0.01, 100.0], ids=lambda f: f"sigma {f}")
 def test_interval_coverage_with_a_wrong_sigma(factor):
     from test_fit_steps import GUESS, NAMES, PUSH, SIGMA, exact, t
@@ -220,7 +220,7 @@ def test_interval_coverage_with_a_wrong_sigma(factor):
     assert_coverage(fits, {"stiffness": 400.0, "damping": 3.0})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("sigma", [1e-9, 1.0])
 def test_intervals_of_micrometres(vibration, sigma):
     t, exact, _ = vibration

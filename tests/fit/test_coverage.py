@@ -196,7 +196,7 @@ def covered(kind, n, seed=0):
     return hits, finite
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("kind", KINDS)
 def test_interval_coverage_of_each_kind(kind):
     hits, finite = covered(kind, SETS)
@@ -217,11 +217,11 @@ def test_interval_coverage_of_each_kind(kind):
 
 
 SLOWLY = [
-    pytest.param(*case, marks=pytest.mark.slow) for case in ((8, 6, 0.0), (20, 3, 0.0), (8, 6, 0.5), (12, 2, 1.0))
+    pytest.param(*case, marks=pytest.mark.weekly) for case in ((8, 6, 0.0), (20, 3, 0.0), (8, 6, 0.5), (12, 2, 1.0))
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(("T", "p", "spread"), [(6, 2, 0.5), *SLOWLY])
 def test_interval_coverage_with_few_trials_and_correlated_residuals(T, p, spread):
     """Trials of unlike inputs, correlated residuals: intervals, and the test of several parameters that are zero."""
@@ -280,7 +280,7 @@ def rubbing(n, rng):
     return push, np.stack(out, axis=1)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_interval_coverage_without_friction_in_the_model():
     """Of 50 sets of eight trials. The next run lies in the intervals by held-out scatter, and not in confidence
     intervals. These are about what all runs have in common: the estimates from very many."""
@@ -351,7 +351,7 @@ def test_intervals_by_held_out_scatter_equal_those_of_a_mean():
     assert (low, high) == pytest.approx((own.mean() - half, own.mean() + half), abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_undetermined_parameter_has_an_infinite_interval():
     """Without a push its gain has no influence: infinite, or as wide as its prior says."""
     rng = np.random.default_rng(7)
@@ -385,7 +385,7 @@ def kicked():
     return minimize(problem, LeastSquares(damping=1e-9))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_parameter_determined_by_one_trial_has_no_clustered_error(kicked):
     """Left out, its estimate would stay where it is, and look exact."""
     found, folds = kicked, cross_validate(kicked)
@@ -494,7 +494,7 @@ def test_leverage_is_the_largest_share_of_a_cluster():
     assert with_prior.leverage == pytest.approx([0.5])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_four_trials_suffice_as_clusters():
     rng = np.random.default_rng(12)
     options = {"unknown": ("x_dot",), "simulation": Simulation(step=0.1)}

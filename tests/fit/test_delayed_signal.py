@@ -76,8 +76,8 @@ def tracks(order):
     return trials
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.weekly
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.weekly)])
 def test_a_low_pass_filter_is_selected_and_its_time_constant_estimated(order):
     before = fit(Track(gain=1.0), tracks(order), "gain", simulation=Simulation(step=0.025))
     candidates = [Gain("x"), Offset("x"), Delay("x"), LowPass("x"), LowPass("x", order=2)][-3 if order == 1 else 0 :]
@@ -90,7 +90,7 @@ def test_a_low_pass_filter_is_selected_and_its_time_constant_estimated(order):
     assert search.fit.variance < 1.3
 
 
-@pytest.mark.slow_cases(all_but=["Delay-2.5-1000.0"])
+@pytest.mark.weekly_cases(all_but=["Delay-2.5-1000.0"])
 @pytest.mark.parametrize("unit", [2e-6, 1e3])  # [s] between samples: 500 kHz, and three times an hour
 @pytest.mark.parametrize(("kind", "true"), [(LowPass, 4.0), (Delay, 2.5)])
 def test_delays_and_time_constants_in_any_unit_of_time(unit, kind, true):

@@ -56,7 +56,7 @@ def test_the_printed_correlation_is_the_largest_off_the_diagonal():
         assert str(plan).endswith(f"largest correlation: {printed}")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_design_optimizes_parameters_but_not_trial_offsets():
     free = ("gain", Offset("x", each="trial", prior=(0.0, 0.1)), "drift")
     plan = design(Track(), t[:11], push, C, free, sigma=SIGMA, initial={"x": 0.1}, steps=1)
@@ -64,7 +64,7 @@ def test_a_design_optimizes_parameters_but_not_trial_offsets():
     assert plan.covariance.shape == (2, 2)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_designed_input_reduces_the_standard_errors_as_predicted():
     names, limit = ("gain", "drift"), 0.6
     plan = design(
@@ -88,7 +88,7 @@ def test_a_designed_input_reduces_the_standard_errors_as_predicted():
     assert list(plan.standard_errors.values()) == pytest.approx(of_fit, rel=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_gradient_of_a_plan_against_differences():
     known = {name: np.asarray(x) for name, x in push(C, jnp.asarray(t)).items()}
     trial = Trial(t, {"x": 0.0 * t}, known, sigma=SIGMA, initial={"x": 0.1})

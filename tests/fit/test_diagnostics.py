@@ -65,7 +65,7 @@ class Sensed(Cart):
         return {"gyro": u["x_dot"]}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("factor", "words"), [(57.3, "seems to be recorded in degrees"), (-1.0, "have opposite signs")]
 )
@@ -78,7 +78,7 @@ def test_a_sensor_in_degrees_or_with_a_wrong_sign_is_reported(factor, words):
     assert any(note.startswith("gyro ") and words in note for note in found.notes)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_trial_with_large_residuals_is_reported():
     system = Cart(mass=1.0, stiffness=4.0, damping=0.2)
     rng, trials = np.random.default_rng(0), []

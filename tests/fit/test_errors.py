@@ -143,7 +143,7 @@ def test_innovations_are_those_of_the_dense_covariance(phi):
     assert not np.any(np.asarray([u, log_variance])[:, ~seen])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_two_channels_against_a_direct_likelihood(of_two_channels):
     found, theta = of_two_channels, numbers_of(of_two_channels)
     assert found.ok
@@ -159,7 +159,7 @@ def test_two_channels_against_a_direct_likelihood(of_two_channels):
     assert theta == pytest.approx(best, rel=1e-6, abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_autoregression_against_statsmodels(of_second_order):
     api, arima = pytest.importorskip("statsmodels.api"), pytest.importorskip("statsmodels.tsa.arima.model")
     found, numbers, total = of_second_order, of_second_order.measurement_errors["x"], 0.0
@@ -182,7 +182,7 @@ def test_autoregression_against_statsmodels(of_second_order):
     assert found.identifiability.degrees_of_freedom == pytest.approx(n - 5)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_huber_against_statsmodels(of_huber):
     api = pytest.importorskip("statsmodels.api")
     found, trials = of_huber, of_huber.problem.trials
@@ -208,7 +208,7 @@ def test_huber_against_statsmodels(of_huber):
     assert loss == pytest.approx(of_all, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_gradient_used_for_scoring_equals_that_of_the_likelihood(of_two_channels, of_huber):
     for found in (of_two_channels, of_huber):
         density, point = found.problem.log_density(), found.problem.at({"gain": 1.25})
@@ -220,7 +220,7 @@ def test_the_gradient_used_for_scoring_equals_that_of_the_likelihood(of_two_chan
             assert float(slope[i]) == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_estimates_do_not_depend_on_sigma_if_scales_are_estimated(of_two_channels):
     """A `sigma` that is wrong by another factor in each channel changes nothing."""
     found = of_two_channels
@@ -234,7 +234,7 @@ def test_estimates_do_not_depend_on_sigma_if_scales_are_estimated(of_two_channel
     assert scales == pytest.approx([0.01 * 0.5, 200.0], rel=0.5)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_without_error_models_only_scales_are_estimated(of_second_order):
     problem = of_second_order.problem
     found = fit(Track(), problem.trials, FREE, errors={}, **STEP)
@@ -256,7 +256,7 @@ def test_without_error_models_only_scales_are_estimated(of_second_order):
     assert plain.measurement_errors == {}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_residual_tests_and_notes_use_innovations(of_second_order):
     found = of_second_order
     plain = fit(Track(), found.problem.trials, FREE, **STEP)
@@ -275,7 +275,7 @@ def test_residual_tests_and_notes_use_innovations(of_second_order):
     assert "phi_2" in report(found)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_evidence_equals_the_marginal_density_of_the_measurements():
     """Linear in the start, with a Gaussian prior: the dense marginal density, given the estimated numbers."""
     rng = np.random.default_rng(5)
@@ -327,7 +327,7 @@ def test_a_fit_continues_from_its_error_model_parameters(of_two_channels):
     assert (low, high) == pytest.approx(found.intervals()["gain"], rel=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_held_out_trials_use_the_error_models_of_the_training_trials(of_two_channels):
     found = of_two_channels
     one = found.problem.trials[0]
@@ -342,7 +342,7 @@ def test_held_out_trials_use_the_error_models_of_the_training_trials(of_two_chan
     assert math.isnan(left_out.score)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_estimated_scale_is_not_reported_as_wrong():
     """With nearly as many unknown starts as residuals the ratio of residuals to degrees of freedom is far from one."""
     noise = np.random.default_rng(8).normal(size=(3, t.size))
@@ -422,7 +422,7 @@ def test_numbers_of_models_are_checked(make):
         make()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_error_model_parameters_estimated_from_known_residuals():
     """Of one channel each: given degrees of freedom, normal residuals, a random walk, and a channel without samples."""
     rng = np.random.default_rng(9)
@@ -479,7 +479,7 @@ KINDS = {  # models by channel, and what makes their errors
 }
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("kind", KINDS)
 def test_interval_coverage_with_error_models(kind):
     models, T = KINDS[kind], 6

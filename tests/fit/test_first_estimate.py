@@ -34,7 +34,7 @@ def test_accelerations_of_noisy_samples():
     assert set(two.trial) == {0, 1}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_first_guess_of_a_measured_double_pendulum():
     """Free swings: ratios of four base parameters of its makers' estimates within 3 %; friction has its sign."""
     recording = jk.data.multi_arm_pendulum(2)
@@ -54,7 +54,7 @@ def test_first_guess_of_a_measured_double_pendulum():
     assert "standard deviations from these" in str(guess)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_estimated_bodies_are_physically_consistent():
     """Torques that ask for a negative moment of inertia: what is returned has a positive pseudo-inertia."""
     ball = mechanism(
@@ -88,7 +88,7 @@ def test_estimated_bodies_are_physically_consistent():
     jk.accelerations(guess.system, 0.0, exact.q[0], exact.u[0])  # which refuses bodies that cannot be
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_first_estimate_with_an_initial_mass_centre_at_the_joint():
     """There the moment of inertia about the joint does not change with it, and elsewhere it does."""
     truth, at = swings()
@@ -179,7 +179,7 @@ class Driven(jk.System):
         )
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_first_guess_of_a_driven_double_pendulum():
     """Nine numbers, with rotors and friction, within a third of what fits by simulation find; the rotors' inertia is
     small beside the links', and drawn towards zero by noise."""

@@ -55,7 +55,7 @@ def problem(swings):
     return Problem.of(GUESS, swings, ("mass", "length", Offset("theta2", each="trial")), **OPTIONS)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_jacobian_against_central_differences(swings):
     tolerance = 1e-6
     own = (Offset("theta2", each="trial", prior=(0.0, 0.1)), Offset("shoulder_torque", each="trial"))
@@ -123,12 +123,12 @@ def check(result):
     assert "mass" in result.table(TRUTH)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_least_squares(problem):
     check(minimize(problem, LeastSquares()))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_gradient_descent(problem):
     result = minimize(problem, GradientDescent())
     check(result)
@@ -171,7 +171,7 @@ def test_steps_to_infinite_costs_are_halved(problem):
     assert np.isfinite(result.cost)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_parameter_without_influence_is_reported(swings):
     # Without inputs only the ratio of gravity and length matters, and the mass not at all.
     quiet = [Trial(s.t, s.measured, sigma=SIGMA, name=s.name) for s in swings]
@@ -189,7 +189,7 @@ def test_a_parameter_without_influence_is_reported(swings):
     assert "mass has no influence" in result.message
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_initial_guess_that_cannot_be_simulated_is_reported(swings):
     with pytest.raises(
         ValueError, match=r"1\.5 s: with the initial guess the residuals from 0 to 0\.68 s are not finite"

@@ -55,7 +55,7 @@ def unstable():
     return truth, trial, offsets, {"unknown": unknown}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_unstable_bicycle_from_five_initial_guesses(unstable):
     within = 0.01
     truth, trial, offsets, options = unstable
@@ -77,7 +77,7 @@ def test_an_unstable_bicycle_from_five_initial_guesses(unstable):
     assert all(abs(one.estimates["IBxx"] / float(truth.IBxx) - 1.0) > within for one in single.fits)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_estimated_bodies_of_a_bicycle_are_physically_possible(unstable):
     truth, trial, offsets, options = unstable
     rear = frame_inertia("B", fixed=("mB", "xB"))
@@ -106,7 +106,7 @@ def measured():
 OFFSETS = [Offset(name, each="trial") for name in ("roll_torque", "steer_torque")]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_steer_damping_of_a_measured_bicycle_by_descent(measured):
     """By least squares, with more parameters and with what the model lacks: `examples/identify_measured_bicycle.py` and
     notebook 13, which assert what they show."""

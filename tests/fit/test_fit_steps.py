@@ -58,7 +58,7 @@ def by_exact_motion(trial):
     return found.x, np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_few_samples_per_period_do_not_bias_the_estimates(trial, by_exact_motion):
     best, errors = by_exact_motion
     found = fit(GUESS, trial, NAMES, optimizer=LeastSquares())
@@ -128,7 +128,7 @@ def test_more_fixed_steps_than_any_default_allows(trial):
     assert found.ok, found.message
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_evidence_by_quadrature(trial, by_exact_motion):
     (k, c), errors = by_exact_motion
     priors = {"stiffness": (395.0, 4.0), "damping": (2.0, 0.5)}
@@ -157,7 +157,7 @@ def beyond():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
-    [GradientDescent(), *(pytest.param(m, marks=pytest.mark.slow) for m in (LeastSquares(),))],
+    [GradientDescent(), *(pytest.param(m, marks=pytest.mark.weekly) for m in (LeastSquares(),))],
     ids=lambda m: m.name,
 )
 def test_no_method_reports_convergence_if_the_optimum_cannot_be_simulated(beyond, method):
@@ -193,7 +193,7 @@ def stiff():
     return guess, trials, by_error
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.many_steps
 @pytest.mark.parametrize(
     "how", [None, Simulation(step=0.05 / 16, solver=diffrax.Kvaerno5())], ids=["halved", "implicit"]
@@ -210,7 +210,7 @@ def test_stiff_motions_are_fitted(stiff, how):
     assert by_error.estimates["stiffness"] == pytest.approx(6.0, abs=3.5 * error)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.many_steps
 def test_a_window_that_fails_at_the_guess_uses_the_step_of_the_others(stiff):
     """One start is far off, so that the step finds no end there whatever it is; it is as short as those of others."""

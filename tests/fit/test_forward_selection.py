@@ -101,7 +101,7 @@ def found(rubbing):
     return forward_selection(rubbing, FIVE, depth=1, refits=1)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_dry_friction_is_selected_from_five_candidates(rubbing, found):
     assert found.selected == ("dry",)
     assert found.best is found.rounds[0][0]
@@ -117,7 +117,7 @@ def test_dry_friction_is_selected_from_five_candidates(rubbing, found):
     assert best.errors["dry"] == pytest.approx(found.fit.clustered_errors["dry"], rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_predicted_cost_agrees_with_a_new_fit(rubbing):
     """Beside a fit that is posed anew with one more parameter, and trials left out of it by refits."""
     found = forward_selection(rubbing, FIVE[:3], depth=3, refits=3)
@@ -155,7 +155,7 @@ def beams():
     return [forward_selection(without, ("both", "dry", "spring"), depth=2, beam=n) for n in (1, 2)]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_beam_search_selects_terms_that_greedy_selection_misses(beams):
     greedy, beam = beams
     assert greedy.selected[0] == "both"
@@ -171,7 +171,7 @@ def test_beam_search_selects_terms_that_greedy_selection_misses(beams):
     assert costs == sorted(costs)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_absent_terms_are_rarely_selected():
     taken = 0
     for seed in range(10):
@@ -180,7 +180,7 @@ def test_absent_terms_are_rarely_selected():
     assert taken <= 2  # at a level of 0.05, more than two are accepted in one of a hundred repetitions
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_implausible_negative_friction_is_not_accepted(rubbing):
     asked = ("quadratic", Free("spring", bounds=(0.0, None)))
     found = forward_selection(
@@ -197,7 +197,7 @@ def test_implausible_negative_friction_is_not_accepted(rubbing):
     assert spring.bound_violations[0].startswith("spring = -")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_common_sensor_offset_is_selected():
     trials = record(3, angle=0.05)
     kinds = (Offset("angle", scale=0.1), Offset("rate"), Gain("rate"), Delay("torque"), Delay("rate"), "dry")
@@ -206,7 +206,7 @@ def test_a_common_sensor_offset_is_selected():
     assert found.fit.estimates["offset of angle"] == pytest.approx(0.05, abs=4 * found.best.errors["offset of angle"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_common_offset_of_known_initial_states_is_selected():
     trials = [trial.with_initial_state({"rate": 0.5 * (i % 3) + 0.1}) for i, trial in enumerate(record(4))]
     found = forward_selection(fitted(trials, unknown="angle"), [Offset("rate", of="start"), "dry", "quadratic"])
@@ -214,7 +214,7 @@ def test_a_common_offset_of_known_initial_states_is_selected():
     assert found.fit.estimates["offset of start of rate"] == pytest.approx(-0.1, abs=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("hold", [(), ("torque",)], ids=["linear", "held"])
 def test_an_input_delay_is_selected(hold):
     """By two samples of 0.05 s; of a held one the delay is found to where its mean is taken for it."""
@@ -239,7 +239,7 @@ class Lagging(Pendulum):
         return jk.sensors.low_pass(now["torque"], x["acting"], self.lag)[0]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_candidate_system_with_an_additional_state_is_selected():
     """What is not neutral anywhere is fitted; what its system begins with is not what is plausible."""
     trials = record(6, system=Lagging(lag=0.08))
@@ -251,7 +251,7 @@ def test_a_candidate_system_with_an_additional_state_is_selected():
     assert found.fit.estimates["lag"] == pytest.approx(0.08, abs=0.004)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_unidentifiable_candidates_are_reported(rubbing):
     posed = fitted(rubbing.problem.trials, Offset("torque", each="trial"))
     found = forward_selection(posed, ["unused", Offset("torque")])
@@ -264,7 +264,7 @@ def test_unidentifiable_candidates_are_reported(rubbing):
     assert np.isnan(next(row for row in found.rounds[0] if row.name == "unused").errors["unused"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_selection_with_one_trial(rubbing):
     alone = fitted(rubbing.problem.trials[:1])
     found = forward_selection(alone, ["dry", "spring"])
@@ -275,7 +275,7 @@ def test_selection_with_one_trial(rubbing):
         forward_selection(alone, "dry", folds=2)
 
 
-@pytest.mark.slow_cases("asked0-*")
+@pytest.mark.weekly_cases("asked0-*")
 @pytest.mark.parametrize(
     ("asked", "options", "message"),
     [
@@ -291,7 +291,7 @@ def test_selection_with_one_trial(rubbing):
             ("dry",),
             {"plausible": {"dyr": (0.0, 1.0)}},
             "`plausible` contains unknown names: dyr",
-            marks=pytest.mark.slow,
+            marks=pytest.mark.weekly,
         ),
         (("dry",), {"plausible": {"damping": (1.0, 0.0)}}, "must be less than the upper end"),
         (("dry",), {"plausible": {"dry": 0.2}}, "a relative deviation must be positive, and needs an initial guess"),
@@ -316,7 +316,7 @@ def test_forward_selection_requires_a_converged_fit(rubbing):
         forward_selection(dataclasses.replace(rubbing, status="steps"), "dry")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_fits_are_compared_in_a_table(rubbing, found):
     held = record(9, system=Pendulum(dry=0.4))
     table = compare({"viscous": rubbing, "with friction": found.fit}, held, plausible={"damping": 0.5})
@@ -348,7 +348,7 @@ def test_fits_are_compared_in_a_table(rubbing, found):
         compare([rubbing.problem])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_fit_of_one_candidate_reuses_the_compiled_program_of_all(rubbing, monkeypatch):
     """Nothing is compiled for it, and it has the derivatives of a program of its own."""
     asked = checked_terms(rubbing, ["dry", Gain("torque"), "spring"])
@@ -374,7 +374,7 @@ def test_a_fit_of_one_candidate_reuses_the_compiled_program_of_all(rubbing, monk
     assert len(programs() - compiled) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_report_contains_the_forward_selection(found, tmp_path):
     page = save_report(found.fit, tmp_path / "fit.html", forward_selection=found).read_text(encoding="utf-8")
     assert "Model extensions" in page
@@ -401,7 +401,7 @@ class Squared(Track):
         return super().loads(t, q, u, motion, {"push": inputs["push"] ** 2})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_candidate_that_is_not_nested_is_compared_by_held_out_cost():
     """Another system without one parameter more, beside what is promising, with one refit: trials left out decide."""
     rng, times, trials = np.random.default_rng(7), np.linspace(0.0, 3.0, 31), []
@@ -474,7 +474,7 @@ def row_of(found, name):
     return next(row for round in found.rounds for row in round if row.name == name)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_selection_does_not_depend_on_units():
     """Masses of 1e-12 and 1e12 kg: a candidate that starts at zero has a scale of its own."""
     rows = []
@@ -491,7 +491,7 @@ def test_selection_does_not_depend_on_units():
             assert one[1:] == pytest.approx(same[1:], rel=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_requested_number_of_refits_is_made():
     """However little a score test says of a candidate: the linearization may hardly see a damper."""
     found = forward_selection(
@@ -503,7 +503,7 @@ def test_the_requested_number_of_refits_is_made():
     assert all(row.reason == "no more than chance" for row in found.rounds[0] if row.p >= 1e-9 / 4)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_term_is_replaced():
     """The fit has viscous friction, the cart has drag: nothing else is left of it once drag is there."""
     before = loaded(carts(lambda x, v: 0.3 * v * abs(v)), ("stiffness", "damping"), damping=0.2)
@@ -524,7 +524,7 @@ def test_a_term_is_replaced():
         forward_selection(without, "drag", remove="dampign")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_pair_is_selected_if_neither_term_is_accepted_alone():
     """Two forces that are nearly alike, with opposite signs: only their difference acts."""
     trials = carts(lambda x, v: v - 1.6 * np.sin(3.0 * v) / 3.0, sigma=0.02, size=lambda i: 0.25)
@@ -539,7 +539,7 @@ def test_a_pair_is_selected_if_neither_term_is_accepted_alone():
         forward_selection(loaded(trials[:1]), "damping", exchange=True)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_parameter_with_a_lower_bound_has_a_one_sided_test():
     before = loaded(carts(lambda x, v: 0.006 * v, sigma=0.02))
     both = row_of(forward_selection(before, "damping", refits=0), "damping")
@@ -567,7 +567,7 @@ def test_trials_are_held_out_by_label():
         cross_validate(loaded(trials[::2]), folds="amplitude")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_implausible_estimates_of_the_initial_model_are_reported():
     """A negative damping makes up for an offset: it is named, and it is no reason against what is found."""
     trials = carts(lambda x, v: -0.1 * v + 0.3)
@@ -585,7 +585,7 @@ def test_implausible_estimates_of_the_initial_model_are_reported():
     assert energy_sources(loaded(carts(lambda x, v: 0.1 * v), ("stiffness", "damping"))) == {}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_selection_from_a_fit_with_a_parameter_at_its_bound():
     """Predictions do not move it beyond the bound. The fit of a candidate may take it off the bound."""
     trials = carts(lambda x, v: 0.1 * v - 0.2 * np.sin(3.0 * v), n=4, sigma=0.02, size=lambda i: 0.25)
@@ -618,7 +618,7 @@ def slow(rng, *shape):
     return rng.normal(size=shape) + 0.4 * e
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("noise", [white, slow])
 @pytest.mark.parametrize("T", [3, 6, 12])
 def test_false_positives(T, noise):

@@ -35,7 +35,7 @@ def covered(prior, deviation, noise=0.05, sets=SETS):
     return {name: float(np.mean(of_one)) for name, of_one in hits.items() if of_one}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("prior", "deviation", "least"),
     [(None, 0.3, 0.95), ("normal", 0.3, 0.95), ("normal", 0.03, 0.80)],  # a note warns of the last case

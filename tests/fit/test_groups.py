@@ -67,7 +67,7 @@ def mixed():
     return trials, fit(Track(), trials, (Free("gain", each="rider", prior="normal"), "drift"), **EXACT)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_distribution_over_groups_maximizes_the_restricted_likelihood(mixed):
     trials, found = mixed
     best = optimize.minimize_scalar(
@@ -81,7 +81,7 @@ def test_a_distribution_over_groups_maximizes_the_restricted_likelihood(mixed):
     assert found.ok, found.message
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_few_groups_give_few_degrees_of_freedom(mixed):
     """Satterthwaite's, by differences of the dense likelihood in the logarithms a of ratio and variance."""
     trials, found = mixed
@@ -126,7 +126,7 @@ def test_a_distribution_over_groups_agrees_with_statsmodels(mixed):
     assert [found.estimates[f"gain [{r}]"] for r in RIDERS] == pytest.approx(effects, rel=TIGHT)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_groups_without_a_distribution_equal_separate_fits():
     trials = recorded(1)
     found = fit(Track(), trials, Free("gain", each="rider"), **EXACT)
@@ -170,7 +170,7 @@ def test_groups_without_differences_have_a_deviation_near_zero():
     assert any("the standard deviation of 5 groups is uncertain" in note for note in found.notes)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_log_normal_distribution_equals_that_of_the_linearized_model():
     trials = recorded(5, deviation=0.2)
     free = (Free("gain", bounds=(0.0, None), each="rider", prior="lognormal"), "drift")
@@ -212,7 +212,7 @@ def test_gains_and_offsets_of_a_trial_combine_with_the_common_ones():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_offsets_per_window_equal_offsets_of_trials_of_one_window():
     tolerance = 1e-6  # the end of the iterations differs by 1e-8 between processors
     rng, trials = np.random.default_rng(5), []

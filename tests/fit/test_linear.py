@@ -203,7 +203,7 @@ def test_errors_by_trial(case):
     assert [*found.error_kinds.values()] == ["trial", "trial"]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_errors_by_window():
     """Two trials of four windows: each window left out in turn, all others solved for again."""
     records = recorded(2, wander=0.2)[:2]
@@ -273,7 +273,7 @@ def test_cross_validation_equals_refits_without_each_trial(case):
     assert left_out.n.tolist() == [np.isfinite(y).sum() for y in records]
 
 
-@pytest.mark.slow_cases("noise")
+@pytest.mark.weekly_cases("noise")
 def test_the_held_out_cost_equals_that_of_cross_validation(case):
     rtol = 1e-5  # of starts and offsets that are searched for
     free = ("gain", "drift", Offset("x_dot", each="trial", prior=(0.0, 0.5)))  # which starts cannot stand for
@@ -328,7 +328,7 @@ def evidence():
     return of
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_evidence_depends_on_priors_but_not_on_scales(evidence):
     prior = (1.0, 0.5)
     drift = Free("drift", prior=(0.0, 2.0))
@@ -360,7 +360,7 @@ def test_the_evidence_depends_on_priors_but_not_on_scales(evidence):
     assert cut - whole == pytest.approx(np.log(2.0), abs=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_wider_prior_reduces_the_evidence(evidence):
     drift = Free("drift", prior=(0.0, 2.0))
     wide = [evidence(Free("gain", prior=(1.2, width)), drift).log_evidence for width in (10.0, 1000.0)]
@@ -375,7 +375,7 @@ def test_a_wider_prior_reduces_the_evidence(evidence):
         none.sample(-1)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_parameter_without_influence_does_not_change_the_other_errors():
     """Without a push its gain is free: infinite errors of both kinds, and those of the drift as without it."""
     trials = [Trial(t, x.measured, {"push": 0.0 * t}, sigma=SIGMA[0]) for x in trials_of(recorded(5, wander=0.2))]
@@ -440,7 +440,7 @@ class Doubled(Track):
         return {"double": 2.0 * q["x"]}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_outputs_of_a_system_are_fitted_as_channels():
     x, push = 0.4 * t**2, {"push": np.sin(3.0 * t)}
     fixed = {"simulation": Simulation(step=0.1), "optimizer": LeastSquares(rtol=1e-14, damping=1e-7)}
@@ -471,7 +471,7 @@ def test_errors_by_part():
     np.testing.assert_allclose(found.clustered_covariance, C[:2, :2], rtol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_held_out_cost_with_a_parameter_at_its_bound():
     """A parameter at its bound is fixed: as in a fit that does not free it."""
     records, bounded = trials_of(recorded(3)), Free("gain", start=0.5, bounds=(0.0, 1.0))  # it is 1.2
@@ -483,7 +483,7 @@ def test_the_held_out_cost_with_a_parameter_at_its_bound():
     assert at_bound.message.startswith("converged: gain rests at its bound")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_subset_of_parameters_has_only_its_own_priors():
     """Of three parameters, the last alone with its prior: as one that was never posed with the others."""
     records = trials_of(recorded(3))

@@ -40,7 +40,7 @@ def steered():
     return [window for run in runs for window in windows_of(run)]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_damping_of_the_robot_bicycle(steered):
     bicycle = WhippleBicycle.from_parameters(jk.data.robot_bicycle().parameters)
     options = {

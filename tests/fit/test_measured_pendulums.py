@@ -42,7 +42,7 @@ class Arm(jk.System):
         )
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_intervals_of_the_single_arm_cover():
     """Ten simulated versions of the measured swings, of which every tenth sample is taken."""
     sigma, rng = 0.0009, np.random.default_rng(7)  # [rad], what the residuals are; another seed, another few per cent

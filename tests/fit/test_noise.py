@@ -114,7 +114,7 @@ def found(case):
     return minimize(case[2], LeastSquares(rtol=1e-9))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_likelihood_equals_that_of_the_linear_gaussian_model(case):
     _, y, problem = case
     there = problem.linearize(problem.start)
@@ -132,7 +132,7 @@ def test_the_likelihood_equals_that_of_the_linear_gaussian_model(case):
     np.testing.assert_allclose(slopes, differences, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_information_matrix_is_the_fisher_information_on_average(case):
     """1/2 tr (C^-1 dC C^-1 dC) + dm^T C^-1 dm, of all measurements at once."""
     _, y, problem = case
@@ -160,7 +160,7 @@ def test_the_information_matrix_is_the_fisher_information_on_average(case):
     assert np.all(error < 0.1 * np.sqrt(np.outer(exact.diagonal(), exact.diagonal())))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_fit_maximizes_the_likelihood(case, found):
     _, y, _ = case
     assert found.status == "converged"
@@ -187,7 +187,7 @@ def test_the_fit_maximizes_the_likelihood(case, found):
         found.trajectories()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_gradient_descent_converges_to_the_same_maximum(case, found):
     problem = case[2]
     assert minimize(problem, GradientDescent()).cost == pytest.approx(found.cost, abs=1e-3)
@@ -195,7 +195,7 @@ def test_gradient_descent_converges_to_the_same_maximum(case, found):
     np.testing.assert_allclose(slope, -problem.linearize(problem.start).blocks.gradient[2], rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_fit_with_process_noise_is_saved_and_loaded(case, found, tmp_path):
     again = load(found.save(tmp_path / "fit.npz"), case[2])
     assert again.estimates == found.estimates
@@ -237,7 +237,7 @@ def test_the_smoother_is_conditioned_on_all_measurements(case):
         motion.band("x", 95)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_initial_state_without_a_standard_deviation_has_a_diffuse_prior(case):
     """Found with the parameters, it is the mean of the smoother that began with any start, whose band is its own."""
     _, y, _ = case
@@ -252,7 +252,7 @@ def test_an_initial_state_without_a_standard_deviation_has_a_diffuse_prior(case)
     assert held.nuisance["trial"]["start of x"][0] == pytest.approx(mean[0], abs=1e-3 * deviation[0, 0])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_zero_process_noise_reduces_the_fit_to_least_squares(case):
     """A start that is found and no intensity: the same numbers as a plain fit, but for the residuals' variance."""
     _, y, _ = case
@@ -269,7 +269,7 @@ def test_zero_process_noise_reduces_the_fit_to_least_squares(case):
     assert quiet.cost == pytest.approx(plain.cost + logs + n * np.log(2 * np.pi), rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_invalid_process_noise_is_rejected():
     _, y = drawn(1)
     trial = trial_of(y)
@@ -307,7 +307,7 @@ def test_invalid_process_noise_is_rejected():
             posed(**more)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_biases_inputs_and_several_trials():
     """Of a cart of 2 kg: noise of the input (N) and of the speed, an offset of every trial's sensor, a trial at another
     rate with a gap of a second, in which the filter takes several steps."""
@@ -356,7 +356,7 @@ def linked(y, t, values, jump, factor=1.0):
     return total
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_linked_windows_with_log_determinant_equal_the_kalman_filter():
     """As short as the samples, linked by what disturbs them."""
     t, jump = np.arange(0.0, 3.0, 0.1), np.array([0.01, 0.15])
@@ -397,7 +397,7 @@ class Dragged(Cart):
         return {"cell": 2.0 * now["force"]}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_likelihood_with_process_noise_on_first_order_states():
     """A motor's force that wanders, by the matrix exponential of the three equations."""
     t, rng, q_force = np.arange(0.0, 1.5, 0.1), np.random.default_rng(5), 0.8
@@ -469,7 +469,7 @@ class Bound(jk.System):
         return {"place": q["x"]}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_likelihood_with_dependent_coordinates():
     """A pendulum by its angle and by its place: the same likelihood, but for the order of the noise squared."""
     rng, t, length, begun = np.random.default_rng(3), np.arange(0.0, 1.0, 0.05), 1.5, 0.5
@@ -527,14 +527,14 @@ def many():
     return many_fits(100, 99, {"x": START[0], "x_dot": START[1]}, unknown=OPTIONS["unknown"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_interval_coverage_with_measured_initial_states():
     covered, (low, high) = np.mean(many_fits(SETS, 7, None)[2], axis=0), coverage_band(SETS)
     print(f"of {SETS}:", covered)
     assert np.all((covered >= low) & (covered <= high)), covered
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_spectral_density_and_noise_scale_estimates_are_unbiased(many):
     truth, estimates, _ = many
     error = estimates[:50].std(axis=0, ddof=1) / 50**0.5
@@ -542,7 +542,7 @@ def test_spectral_density_and_noise_scale_estimates_are_unbiased(many):
     assert np.all(np.abs(estimates[:50].mean(axis=0) - truth)[2:] < 2 * error[2:])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_intervals_cover_under_process_noise(many):
     covered = many[2].sum(axis=0)
     print("of 100:", covered)
@@ -554,7 +554,7 @@ class Fenced(Cart):
         return {"fence": jk.falling(q["x"] + 0.2)}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_simulation_ended_by_an_event_is_reported():
     """Also where a measurement, and no step, takes the mean over it."""
     _, y = drawn(1)
@@ -564,7 +564,7 @@ def test_a_simulation_ended_by_an_event_is_reported():
     assert np.isfinite(far.cost)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_implicit_solver_and_xla_give_the_same_filter(by_xla):
     """Their loops are differentiated forward."""
     _, y = drawn(1)
@@ -579,7 +579,7 @@ def test_an_implicit_solver_and_xla_give_the_same_filter(by_xla):
     assert costs["Bosh3"] == pytest.approx(exact, rel=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_step_longer_than_the_sample_interval_is_reported_as_too_coarse():
     t = np.arange(0.0, 6.0, 0.5)
     _, y = drawn(1, t)
@@ -589,7 +589,7 @@ def test_a_step_longer_than_the_sample_interval_is_reported_as_too_coarse():
     assert any("too coarse" in note for note in told.notes)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_measured_initial_state_has_the_uncertainty_of_its_sample():
     """As a start of which nothing is known before, but that its sample is no measurement any more."""
     _, y = drawn(1)
@@ -628,7 +628,7 @@ def test_a_measured_initial_state_has_the_uncertainty_of_its_sample():
     assert motion.deviation("x_dot")[0] == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_likelihood_of_a_closed_loop_does_not_depend_on_units():
     """The place of a slider in metres, in units of 3.3 cm, and in metres where the crank is 30 m long."""
     t = np.arange(0.0, 2.0, 0.05)

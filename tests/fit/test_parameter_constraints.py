@@ -47,7 +47,7 @@ def solved(trial, rows=(), values=()):
     return np.linalg.lstsq(np.vstack([A, *rows]), np.append(trial.measured["x"] / 0.05, values), rcond=None)[0]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("free", [("gain", "drift"), (Free("gain", bounds=(0.0, None)), Free("drift", scale=0.1))])
 def test_an_exact_sum(trial, free):
     found = fit(Track(), trial, free, constraints=[Linear({"gain": 1.0, "drift": 2.0}, equals=1.9)], **EXACT)
@@ -86,7 +86,7 @@ def test_a_measured_sum_and_a_joint_prior_equal_least_squares_rows(trial):
     assert "No evidence" in laplace(joint).message
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_cost_and_the_log_density_include_constraint_residuals(trial):
     """Of the likelihood of a filter, and of the density for samplers with its gradient."""
     known = [Linear({"gain": 1.0, "drift": 2.0}, 1.5, 0.1)]

@@ -24,7 +24,7 @@ def drifting():
     return dataclasses.replace(result, point=point), trial
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_prediction_errors_have_the_variance_of_a_linear_regression(drifting):
     """A line through the 11 samples of the past second, extrapolated; the mean square within four deviations."""
     result, trial = drifting
@@ -55,7 +55,7 @@ def test_predictions_ignore_later_samples_and_omit_gaps(drifting):
     assert not ((after.t > 1.15) & (after.t < 1.55)).any()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_predictions_of_a_filter():
     exact = Trial(t[:61], {"x": 0.1 * t[:61] ** 2}, {"push": 0.0}, sigma=SIGMA)
     options = {"unknown": ("x", "x_dot"), "noise": {"x_dot": 1e-4}, "simulation": Simulation(step=DT)}

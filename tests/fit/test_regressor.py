@@ -26,7 +26,7 @@ from jaxkane.fit import base_parameters, regressor
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["DoublePendulum", "SliderWithPinnedBar", pytest.param("ColumnFrameAndDisk", marks=pytest.mark.slow)]
+    "name", ["DoublePendulum", "SliderWithPinnedBar", pytest.param("ColumnFrameAndDisk", marks=pytest.mark.weekly)]
 )
 def test_matrix_times_parameters_equals_kanes_equations(name):
     """At any accelerations; `ColumnFrameAndDisk` has a body that spins in its frame."""
@@ -60,7 +60,7 @@ def test_the_matrix_does_not_depend_on_unknown_parameters(kernels):
     assert guessed.units[-1] == "N m s/rad"
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_weights_coded_by_hand_are_detected_or_rejected():
     _truth, at = swings()
     i = (0.0, at.q[3], at.u[3], at.u_dot[3])
@@ -87,7 +87,7 @@ def test_dependent_speeds():
     assert named == pytest.approx(expected, abs=tolerance)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_regressor_in_batches_derivatives_and_jit():
     tolerance = 1e-10
     truth, at = swings()
@@ -106,7 +106,7 @@ def test_regressor_in_batches_derivatives_and_jit():
     assert np.isfinite(length(0.2))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_nonlinear_and_invalid_parameters_are_rejected():
     _truth, at = swings()
     i = (0.0, at.q[3], at.u[3], at.u_dot[3])

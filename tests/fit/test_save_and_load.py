@@ -92,7 +92,7 @@ class Rewritten(Track):
         return (jk.Force(push, motion["cart"]), jk.Force(steady, motion["cart"]))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_fit_of_changed_code_is_loaded_only_if_its_cost_is_unchanged(result, path):
     for kind in (Slow, Rewritten):
         kind.__name__ = "Track"
@@ -103,7 +103,7 @@ def test_a_fit_of_changed_code_is_loaded_only_if_its_cost_is_unchanged(result, p
         load(path, pose(Slow()))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_fit_of_another_problem_is_refused(path):
     for other, message in (
         (pose(free=["gain"]), r"free parameters \(gain, drift there, gain here\)"),
@@ -162,7 +162,7 @@ def test_functions_reject_a_fit_for_a_problem_and_vice_versa(result):
     np.testing.assert_allclose(seen.singular_values, result.singular_values, rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_tolerances_of_optimizer_and_simulation_are_separate(result):
     coarse = fit(Track(gain=3.0), TRIALS, FREE, unknown=("x",), optimizer=LeastSquares(rtol=0.5, damping=3.0))
     assert coarse.status == "converged"

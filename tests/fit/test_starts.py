@@ -88,7 +88,7 @@ def bead(initial, **measured):
     return Trial(t, {"x_dot": np.zeros(3), **measured}, sigma=0.1, initial=initial, name=f"bead {sorted(initial)}")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("follows", [(), ("y",)])
 def test_known_initial_coordinates_are_kept_in_assembly(follows):
     system = Wire(follows=follows)
@@ -115,7 +115,7 @@ def test_a_trial_without_the_initial_values_of_the_others_is_reported():
     np.testing.assert_allclose(starts(of_each), [[0.3, 0.7], [0.0, 1.0]], atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("follows", [(), ("e4",)])
 def test_missing_euler_parameters_default_to_no_rotation(follows):
     turned = Trial(t, {"w1": np.zeros(3)}, sigma=0.1)
@@ -174,10 +174,10 @@ def turning(sigma=0.01):
     return Trial(t, measured, sigma=sigma, initial={"w1": 1.0, "w2": 2.0, "w3": -0.5})
 
 
-SLOW = pytest.mark.slow
+SLOW = pytest.mark.weekly
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("system", "window"),
     [
@@ -231,7 +231,7 @@ def test_recorded_tosses_start_at_the_measured_poses():
 TURNS = {"omega": ("w1", "w2", "w3"), "v": ("vx", "vy", "vz")}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_initial_speed_that_is_not_given_is_reported():
     def notes_of(*trials, **options):
         problem = posed(Wire(follows=("y",)), "mass", *trials, **options)

@@ -80,7 +80,7 @@ def test_elimination_of_chained_windows_equals_the_dense_solution():
     np.testing.assert_allclose(eliminated.log_determinant, determinant, rtol=tolerance)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_short_chained_windows_equal_a_kalman_filter():
     tolerance = 1e-6
     t = np.arange(0.0, 2.0, 0.05)
@@ -149,7 +149,7 @@ def result(problem):
     return minimize(problem, LeastSquares())
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_delays_gains_rates_and_gaps(result):
     assert result.ok, result.message
     near(result)
@@ -161,7 +161,7 @@ def test_delays_gains_rates_and_gaps(result):
     assert steps.min() < 0.021
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_new_data_and_initial_guesses_do_not_recompile(result, runs, problem):
     before = programs()
     again = [Trial(r.t, r.measured, r.inputs, sigma=0.02, name="again") for r in runs]
@@ -170,7 +170,7 @@ def test_new_data_and_initial_guesses_do_not_recompile(result, runs, problem):
     assert programs() <= before
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("method", [LeastSquares(damping=0.0), GradientDescent()], ids=lambda m: m.name)
 def test_other_methods_converge_to_the_same_estimates(problem, result, method):
     found = minimize(problem, method)
@@ -199,7 +199,7 @@ def test_an_interrupted_fit_is_resumed_from_its_file(problem, method, tmp_path):
         minimize(problem.only([0]), method, checkpoint=path)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_growing_horizons_converge_from_a_distant_initial_guess():
     # With a stiffness sixteen times too large a single shoot ends in another minimum; growing horizons do not.
     t = np.arange(0.0, 8.0, 0.05)
@@ -211,7 +211,7 @@ def test_growing_horizons_converge_from_a_distant_initial_guess():
     assert minimize(problem, LeastSquares(horizons=())).cost > 10 * grown.cost
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_chained_windows_account_for_process_noise():
     # A hidden force shakes the cart: what it does in a window is what the motion may jump by at its end.
     t = np.arange(0.0, 8.0, 0.05)
@@ -231,7 +231,7 @@ def test_chained_windows_account_for_process_noise():
     assert 0.5 < chained.variance < 2.0
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_delay_of_a_zero_order_hold_input_is_estimated():
     t = np.arange(0.0, 4.0, 0.1)
     push = {"push": np.round(np.sin(2.0 * t))}
@@ -254,7 +254,7 @@ def late_push(delay):
     return Trial(t, {"x": ride["x"]}, {"push": push}, sigma=1e-3), np.asarray(ride.inputs["push"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("free", [[Delay("push")], ["mass", Delay("push", each="trial")]])
 @pytest.mark.parametrize("delay", [1.3, -0.7])
 def test_windows_contain_the_delayed_part_of_an_input(free, delay):
@@ -274,7 +274,7 @@ def _windows(problem):
     return [jax.tree.map(lambda x, i=i: x[i], problem.windows) for i in range(len(problem.slices))]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_windows_contain_the_inputs_required_by_the_bounds_of_a_delay():
     trial, acted = late_push(0.4)
     sizes = []
@@ -295,7 +295,7 @@ def test_a_delay_longer_than_a_trial_is_refused():
         Problem.of(TRUTH, trial, Delay("push", bounds=(0.0, 20.0), start=1.0), unknown="x")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_long_delay_is_estimated_with_windows():
     trial, _ = late_push(0.8)
     free = ("mass", "stiffness", "damping", Delay("push", bounds=(0.0, 2.0), start=0.6))
@@ -303,7 +303,7 @@ def test_a_long_delay_is_estimated_with_windows():
     assert [found.estimates[n] for n in found.names] == pytest.approx([1.3, 5.0, 0.4, 0.8], abs=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_tied_parameters_and_gains():
     trial = record(np.arange(0.0, 4.0, 0.05), 4)
     twice = Trial(trial.t, trial.measured, {"push": 0.5 * trial.inputs["push"]}, sigma=0.01)
@@ -358,7 +358,7 @@ def test_inputs_with_shared_times_share_discontinuities(own, kinks, restart, mon
     assert [(each.times.shape[0], each.restart) for each in seen] == [(kinks, restart)]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_gradients_by_a_delay_with_shared_and_separate_sample_times():
     # x(1) = int (1 - t) f(t - s) dt for a delay s; by parts, its slope at s = 0 is -int (1 - t) f'(t) dt.
     t = np.linspace(0.0, 1.0, 5)
@@ -388,7 +388,7 @@ def late_records(delay, n=3):
     return trials
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_samples_without_recorded_delayed_inputs_are_excluded_or_reported():
     """The input is delayed by 0.8 s; its first sample is a wrong guess of what it was before."""
     trials, options = late_records(0.8), {"unknown": ("x", "x_dot")}
@@ -408,7 +408,7 @@ def test_samples_without_recorded_delayed_inputs_are_excluded_or_reported():
         Problem.of(TRUTH, trials, guess(bounds=(0.0, 5.9)), **options)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_delayed_input_has_the_given_value_before_its_first_sample():
     t = np.arange(0.0, 3.0, 0.1)
     trial = Trial(t, {"x": np.cos(t)}, {"push": 1.0 + t}, sigma=0.1)

@@ -63,7 +63,7 @@ def again(problem, trials):
     return minimize(other, LeastSquares())
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_interval_coverage_equals_the_level(problem):
     level, hits, n = 0.8, np.zeros(3), 40
     rng = np.random.default_rng(11)
@@ -79,7 +79,7 @@ def test_interval_coverage_equals_the_level(problem):
     assert np.all((hits >= 24) & (hits <= 38)), hits
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_interval_coverage_near_a_bound():
     """They are those of a fit without the bound, and end there."""
     rng, hits, beside = np.random.default_rng(5), 0, 0
@@ -184,7 +184,7 @@ def test_multi_start_converges_to_one_minimum(problem, result):
     assert "4 of 4 initial guesses end at the best" in str(found)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_log_density_is_minus_half_the_cost(problem, result):
     density = of_x(problem)
     both, there = jax.jit(jax.value_and_grad(density)), result.point
@@ -225,7 +225,7 @@ def test_laplace_approximation_has_the_standard_errors_of_given_sigma(problem, r
         minimize(problem, LeastSquares(), steps=1).laplace()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("package", ["numpyro", "blackjax"])
 def test_samplers_agree_with_the_laplace_approximation(package):
     sampler, key = pytest.importorskip(package), jax.random.key(0)
@@ -268,7 +268,7 @@ def test_priors_are_weighted_and_reported(problem, result):
 # Suspicious data, each reported by name.
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_wrong_sign_of_an_input_is_reported(trials, monkeypatch):
     wrong = [Trial(t.t, t.measured, {"push": -t.inputs["push"]}, sigma=0.01, name=t.name) for t in trials]
     # With the mass free, an infinite one takes the wrong push out of the model.
@@ -298,7 +298,7 @@ def test_inconsistent_rates_and_zero_columns_are_reported(trials):
     assert duplicate == "run 1 has the same samples as run 1, so these are counted twice. Omit one trial."
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_parameter_at_its_bound_is_reported(trials):
     bounds = (Free("damping", start=1.0, bounds=(0.8, None)), "stiffness")  # it is 0.4
     found = minimize(Problem.of(GUESS, trials, bounds, **UNKNOWN), LeastSquares())
@@ -312,7 +312,7 @@ def test_a_parameter_at_its_bound_is_reported(trials):
     assert "bound" in report(found)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_trade_off_between_parameters_is_reported_with_units(trials):
     # Without a push only the ratios of mass, stiffness and damping show.
     quiet = [Trial(t.t, t.measured, sigma=0.01, name=t.name) for t in trials]
@@ -336,7 +336,7 @@ class Twice(Cart):
         return (*super().loads(t, q, u, motion, inputs), jk.Force(force * motion.N.x, motion["cart"]))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_undetermined_directions_are_reported_in_the_simplest_form(trials):
     free = ("stiffness", "more_damping", "damping", "more_stiffness")
     seen = identifiability(Problem.of(Twice(), trials, free, **UNKNOWN))
@@ -394,7 +394,7 @@ def test_text_of_a_report_marks_code_and_escapes():
     assert '<td style="text-align: left" data-label="&quot;x&quot;">1 &amp; 2</td>' in table
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.skipif(browser.PROGRAM is None, reason=browser.WHY_NOT)
 def test_a_narrow_report_shows_all_columns_of_the_estimates(result, tmp_path):
     path = save_report(result, tmp_path / "report.html", truth=TRUTH)
@@ -449,7 +449,7 @@ def test_an_input_that_is_zero_in_only_one_trial_is_reported(trials):
     assert told(0) == told(3) == []
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_printed_interval_has_its_level_and_kind(result):
     head, row = (line.split() for line in str(result).splitlines()[1:3])
     low, high = result.intervals()["mass"]

@@ -51,7 +51,7 @@ def falling():
     return fit(Falling(), NEAR, FREE, simulation=STEP, optimizer=LeastSquares())
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_validation_reports_trials_that_fail_and_keeps_the_others(falling, tmp_path):
     held = validate(falling, [FAR[0], *NEAR, FAR[1]])
     alone = validate(falling, NEAR)
@@ -72,7 +72,7 @@ def test_validation_reports_trials_that_fail_and_keeps_the_others(falling, tmp_p
     assert "not simulated" in text
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_validation_simulates_one_trial_at_a_time_with_one_compiled_program():
     """Of one, two and three windows, with priors: as all of them together; and nothing is compiled for more trials."""
     long = np.linspace(0.0, 3.0, 31)
@@ -101,14 +101,14 @@ def test_validation_simulates_one_trial_at_a_time_with_one_compiled_program():
     assert more.cost > held.cost + min(costs_by_trial(found.problem, found.point)[:2])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     "options",
     [
-        pytest.param({}, marks=pytest.mark.slow),
-        pytest.param({"zero_order_hold": "push"}, marks=pytest.mark.slow),
+        pytest.param({}, marks=pytest.mark.weekly),
+        pytest.param({"zero_order_hold": "push"}, marks=pytest.mark.weekly),
         {"free": ("gain", Free("drift", start=0.2), Delay("push", bounds=(0.0, 0.3)))},
-        pytest.param({"noise": {"x_dot": 0.1}}, marks=pytest.mark.slow),
+        pytest.param({"noise": {"x_dot": 0.1}}, marks=pytest.mark.weekly),
         {"window": 1.0, "defect_std": {"x": 0.01, "x_dot": 0.02}},
     ],
     ids=["plain", "held", "late", "noise", "chained"],
@@ -149,7 +149,7 @@ def test_shortened_and_excluded_windows_are_not_linked():
     np.testing.assert_array_equal(problem.only([1]).windows.linked, [0, 0, 0, 1, 1, 0])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_fit_continues_without_a_trial_that_cannot_be_simulated(falling, tmp_path):
     found = fit(Falling(), [FAR[0], *NEAR, FAR[1]], FREE, simulation=STEP, optimizer=LeastSquares())
     assert found.trial_names == ("near a", "near b", "near c")
@@ -171,7 +171,7 @@ def test_a_fit_continues_without_a_trial_that_cannot_be_simulated(falling, tmp_p
         fit(Falling(), FAR, FREE, simulation=STEP)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_growing_horizons_exclude_no_trial_with_or_without_a_checkpoint(falling, tmp_path):
     """By them the fit comes to parameters that simulate all, from a guess that simulates none."""
     guess = Falling(drift=30.0)
@@ -208,7 +208,7 @@ def test_the_held_out_score_is_independent_of_the_initial_guess():
     assert f"{100 * near.score:.1f} % of the measurements' variance" in str(near)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_windows_are_simulated_as_one_batch_on_a_gpu(monkeypatch):
     """Without states of its own the system has trajectories with arrays of size zero, which a batch must permit."""
     rtol = 1e-12
@@ -223,7 +223,7 @@ def test_windows_are_simulated_as_one_batch_on_a_gpu(monkeypatch):
         np.testing.assert_allclose(there.q[i], motion.q, rtol=rtol)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_reported_initial_states_equal_those_of_the_trajectory():
     """With a gain and an offset of what is known of the starts."""
     trial = TRIAL.with_initial_state({"x": 0.5, "x_dot": 0.2})
@@ -257,7 +257,7 @@ def test_notes_report_a_fit_that_has_not_converged():
     assert ended.notes[0].startswith("The fit has not converged (stopped after the last step")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_validation_of_a_system_with_given_parameter_values():
     """Of a system as of a fit with the same values: nothing but the starts is estimated."""
     posed = {"unknown": ("x", "x_dot"), "simulation": STEP}

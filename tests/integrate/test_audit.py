@@ -23,7 +23,7 @@ def run(name, end=10.0, times=1001, inputs=None, **options):
     return system, jk.simulate(system, state, jnp.linspace(0.0, end, times), inputs, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("name", [name for name in CATALOG if name not in ("BarWithPiston", "KerbWheel")])
 def test_energy_balance_of_ten_seconds(name):
     # Conservative or not: the audit counts the work of dampers, and of the motors of Example 5's engines.
@@ -39,7 +39,7 @@ def test_energy_balance_of_ten_seconds(name):
     assert audit.drift < RTOL
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_unresolved_work_between_samples_does_not_fail_the_audit():
     # Exercise 5.1 comes to rest within a second: 100 times a second are too few for the damper's work.
     audit = jk.audit(*run("BarWithPiston", rtol=1e-10, atol=1e-10))
@@ -50,14 +50,14 @@ def test_unresolved_work_between_samples_does_not_fail_the_audit():
     assert jk.audit(*run("BarWithPiston", end=2.5, rtol=1e-10, atol=1e-10)).energy_balance < RTOL
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_energy_balance_includes_the_work_of_inputs():
     audit = jk.audit(*run("DoublePendulum", 2.0, 401, {"shoulder_torque": lambda t, s: jnp.sin(t) - s["theta1_dot"]}))
     assert np.abs(audit.work).max() > 0.1
     assert audit.energy_balance < 1e-7
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_momenta_of_a_free_body_are_conserved():
     audit = jk.audit(*run("RigidBody", 2.0, 21))
     text = str(audit)
@@ -72,7 +72,7 @@ def test_an_inaccurate_simulation_fails_the_audit():
     assert "bad" in str(audit)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_audit_reports_the_conditioning_of_the_bicycle():
     system, ride = run("WhippleBicycle", 1.0, 11)
     audit = jk.audit(system, ride)
@@ -117,9 +117,9 @@ TORQUE = jk.Samples(KNOTS, np.random.default_rng(5).normal(size=21), zero_order_
     "torque",
     [
         TORQUE,
-        pytest.param(jk.Samples(KNOTS, TORQUE.values), marks=pytest.mark.slow),
-        pytest.param(jk.Samples(KNOTS + 0.0334, TORQUE.values, zero_order_hold=True), marks=pytest.mark.slow),
-        pytest.param(lambda t, s: TORQUE(t - 0.05) - 0.3 * s["theta1_dot"], marks=pytest.mark.slow),
+        pytest.param(jk.Samples(KNOTS, TORQUE.values), marks=pytest.mark.weekly),
+        pytest.param(jk.Samples(KNOTS + 0.0334, TORQUE.values, zero_order_hold=True), marks=pytest.mark.weekly),
+        pytest.param(lambda t, s: TORQUE(t - 0.05) - 0.3 * s["theta1_dot"], marks=pytest.mark.weekly),
     ],
     ids=["held", "linear", "between the times", "in a function"],
 )
@@ -132,7 +132,7 @@ def test_the_work_of_discontinuous_inputs_is_integrated_accurately(torque):
     assert audit.work_error < 10 * rtol * np.abs(audit.work).max()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_input_jumps_between_samples_do_not_fail_the_audit():
     torque = {"shoulder_torque": jk.Samples(KNOTS, TORQUE.values, zero_order_hold=True)}
     audit = jk.audit(*run("DoublePendulum", 2.0, 6, torque, rtol=1e-11, atol=1e-11))
@@ -184,7 +184,7 @@ class Oscillator(jk.System):
         return jk.Force((-400.0 * q["x"] - 0.4 * u["v"]) * motion.N.x, motion.bodies[0])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("times", [2, 5, 33])
 def test_work_between_too_few_samples_has_a_large_reported_error(times):
     """With 33 samples in 10 s, a sample a period, all rules of quadrature agree to 4e-8 and are wrong."""
@@ -265,7 +265,7 @@ class Satellite(jk.System):
         return jk.Force(-500.0 * 3.986e14 / q["r"] ** 2 * motion["A"].x, motion["satellite"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_mixed_units_do_not_cause_a_bad_condition_number():
     rate = np.sqrt(3.986e14 / 7e6**3)
     ride = jk.simulate(Satellite(), jk.State([7e6, 0.0], [0.0, rate]), np.linspace(0.0, 0.1, 11) / rate)

@@ -61,7 +61,7 @@ def operations(f, system, *more):
     return len(program.program.jaxpr.eqns), program.is_fusable
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("held", [False, True])
 def test_the_audit_takes_no_more_operations_than_the_accelerations(held):
     """It is one plain program, so that nothing is computed twice; and no longer than a right-hand side."""
@@ -75,7 +75,7 @@ def test_the_audit_takes_no_more_operations_than_the_accelerations(held):
     assert counts[8] - counts[6] < 1.6 * (counts[6] - counts[4])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_audit_of_scalar_and_array_programs_is_the_same(monkeypatch):
     """The accelerations in one program or by columns and LAPACK: the same table, forces and multipliers."""
     system = TiltedChain(n=3, held=True)
@@ -140,7 +140,7 @@ class Geared(jk.System):
         return jk.Motion(bodies, [1e-9 * u["a"] + u["b"]])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_condition_of_a_single_residual_includes_the_other_speeds():
     """C_dep alone is (1 x 1) and has the condition number 1, whatever it is."""
     ride = jk.simulate(Geared(), jk.State(jnp.zeros(2), jnp.array([1e-9])), jnp.linspace(0.0, 0.1, 6))

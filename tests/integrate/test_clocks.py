@@ -30,7 +30,7 @@ def state(dtype):
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("t0", STARTS)
-@pytest.mark.parametrize("rate", [100.0, pytest.param(1e3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rate", [100.0, pytest.param(1e3, marks=pytest.mark.weekly)])
 @pytest.mark.parametrize("hold", [True, False])
 def test_elapsed_time_is_exact_at_samples(dtype, t0, rate, hold):
     """A free particle at 1 m/s: its place is the time."""
@@ -61,7 +61,7 @@ def place_of_the_last(t0, dtype, hold, options):
     return jax.jit(jax.value_and_grad(place))(jnp.array([0.0, 1.0], dtype))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("options", [{}, {"step": 0.05}], ids=["adaptive", "fixed"])
 @pytest.mark.parametrize("hold", [True, False])
 def test_derivatives_do_not_depend_on_the_start_time(options, hold):
@@ -72,7 +72,7 @@ def test_derivatives_do_not_depend_on_the_start_time(options, hold):
         np.testing.assert_allclose(slope1, slope, rtol=rtol, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("step", [None, 0.01])
 def test_uneven_samples_under_a_hold(dtype, step):
@@ -89,7 +89,7 @@ def test_uneven_samples_under_a_hold(dtype, step):
         np.testing.assert_allclose([ride["x"][-1], ride["v"][-1]], [x, v], rtol=50 * jnp.finfo(dtype).eps, atol=atol)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_a_hold_that_jumps_at_the_last_time(dtype):
     """As when the requested times are those of the samples: 125 steps instead of a few."""
@@ -147,7 +147,7 @@ def test_a_short_flight_in_a_long_simulation(t0, flight):
     assert height == pytest.approx(-0.5 * flight, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_third_derivatives_of_the_end_time_are_nan():
     """A fall from h takes sqrt(2 h); its third derivative at h = 0.5 is 3, and two are exact."""
 
@@ -205,7 +205,7 @@ class Switched(Particle):
         return jk.Force(push * motion.N.x, motion["mass"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.filterwarnings("ignore:Switched")
 @pytest.mark.parametrize(
     ("sampled", "options"), [(False, {}), (False, {"step": 0.05}), (True, {})], ids=["given", "fixed", "samples"]

@@ -48,7 +48,7 @@ BOUNCES = [0.4590853109923369, 1.1280946846381106, 1.6405736265752897, 2.0400984
 BOUNCES += [2.603903008180971, 2.802033708031122, 2.9599159114088045]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_bouncing_ball_with_drag():
     atol, slope_rtol = 1e-10, 1e-6  # the second derivative of |v| v is discontinuous at the top
     slopes, ride = drop(DROP, jnp.linspace(0.0, 3.0, 21))
@@ -129,7 +129,7 @@ def jumps_of(ride):
     return np.asarray(ride.jumps.t)[: int(ride.jumps.count)]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_ball_with_spin_drag_and_friction():
     # Extrapolation in 40 digits; derivatives by differences of the fourth order.
     atol, slope_rtol = 1e-10, 1e-8
@@ -173,7 +173,7 @@ BY_MU_V_W = {
 }
 
 
-@pytest.mark.slow_cases("sphere")
+@pytest.mark.weekly_cases("sphere")
 @pytest.mark.parametrize("kind", BACKSPIN)
 def test_a_ball_with_backspin_slides_and_then_rolls(kind):
     atol, slope_atol = 1e-10, 1e-8
@@ -452,7 +452,7 @@ def random_values(rng, kind):
     return values | rod | {"h": 0.05 + 0.5 * np.cos(angle) + drop}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("kind", ["ball", "rod"])
 def test_random_simulations_satisfy_the_contact_laws(kind):
     """They land, bounce until they rest, slide, stick, reverse, and lift off, while the force changes at 1 s."""
@@ -531,7 +531,7 @@ ALL = jnp.array([[{**ROD, **values}.get(name, 0.0) for name in NAMES] for values
 PUSH = jnp.array([2.0, 0.0, -4.0, 0.0])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_members_with_different_contact_states_are_independent():
     """Each is the same to the last digit at every place of a batch."""
     batch = jax.jit(jax.vmap(lambda p: plain(p, jnp.linspace(0, 2.5, 21), PUSH)))
@@ -546,7 +546,7 @@ def test_members_with_different_contact_states_are_independent():
         np.testing.assert_array_equal(first.contacts["table"][i], one.contacts["table"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_reverse_mode_equals_forward_mode():
     """Without NaN from contact states that do not occur."""
     reverse = jax.jit(jax.grad(lambda p: plain(p, jnp.linspace(0, 2.5, 21), PUSH, adjoint="reverse").end.q[0]))
@@ -561,7 +561,7 @@ belt = simulate_with_slopes(lambda p: Belt(jnp.ones(()), *p[:4]), lambda p: jk.S
 BELT = jnp.array([4.0, 0.5, 2.5, 4.0, 0.0, 0.0])  # stiffness, speed, kinetic, static, x, x_dot
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_block_on_a_belt_sticks_and_slips():
     atol, slope_atol = 1e-10, 1e-8
     slopes, ride = belt(BELT, jnp.linspace(0, 20, 21))
@@ -580,7 +580,7 @@ def test_a_block_on_a_belt_sticks_and_slips():
     np.testing.assert_array_equal(slopes["end"][1, 4:], 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_static_friction_that_equals_the_kinetic_one():
     """The oscillator of Siconos: it rests after eight turns."""
     atol, slope_atol = 1e-10, 1e-8

@@ -24,7 +24,7 @@ def drop(height=1.0, restitution=0.8, drag=0.1, ts=TS, **options):
     return jk.simulate(system, jk.State(h[None], jnp.zeros_like(h)[None]), ts, **{**TIGHT, **options})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_each_member_of_a_batch_bounces_at_its_own_times():
     """A member equals its own simulation: one bounces until it rests, one a hundred times, one never."""
     heights, restitutions = jnp.array([0.2, 0.05, 60.0]), jnp.array([0.5, 0.985, 0.5])
@@ -43,7 +43,7 @@ def test_each_member_of_a_batch_bounces_at_its_own_times():
         np.testing.assert_array_equal(batch.contacts["floor"][i], one.contacts["floor"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_exceeding_max_jumps_ends_the_simulation():
     ride = drop(0.05, 0.985, 0.0, max_jumps=16)
     assert ride.reason == "max jumps"
@@ -52,7 +52,7 @@ def test_exceeding_max_jumps_ends_the_simulation():
     assert (ride.contacts["floor"][-1]) == -1
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_in_reverse_mode():
     """The same as in forward mode, without NaN from contact states that do not occur, also when the ball rests."""
     slopes = jax.jit(jax.grad(lambda p: drop(p[0], p[2], p[1]).end.q[0]))(jnp.array([1.0, 0.1, 0.8]))
@@ -61,7 +61,7 @@ def test_derivatives_in_reverse_mode():
     np.testing.assert_allclose(rests, 0.0, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_gradients_of_a_sweep():
     """Of the mean height of a batch by its common restitution, and of each member by its own height."""
 
@@ -89,7 +89,7 @@ def test_gradients_of_a_sweep():
     np.testing.assert_allclose(by_h, by_formula[1], rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("options", "atol"),
     [
@@ -110,7 +110,7 @@ def test_results_agree_for_other_solvers_and_options(options, atol):
     np.testing.assert_allclose([rests.end.q, rests.end.u], 0.0, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_float32():
     ride = drop(jnp.float32(1.0), ts=jnp.asarray(TS, jnp.float32), rtol=1e-6, atol=1e-6)
     assert ride.q.dtype == jnp.float32
@@ -122,7 +122,7 @@ def test_float32():
     np.testing.assert_allclose(rests.q[-8:], 0.0, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_simulation_resumes_with_the_contact_states():
     """From the state at the end of another one. The contacts of a ball at rest remain closed."""
     first = drop(0.2, 0.5, 0.0)

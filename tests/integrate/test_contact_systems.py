@@ -30,7 +30,7 @@ def tilted(angle, width=0.4, height=1.2, **speeds):
     return jk.State({"x": -height / 2 * np.sin(angle) + side * np.cos(angle) - side, "y": y, "angle": angle}, speeds)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_rocking_block_agrees_with_the_closed_form():
     # Quadrature; the energy ratio of an impact is r^2 with r = 1 - 3/2 sin^2(alpha).
     atol = 1e-10
@@ -48,7 +48,7 @@ def test_a_rocking_block_agrees_with_the_closed_form():
     np.testing.assert_array_equal(ride.contacts["right"], np.where(left, OPEN, STICKS))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_of_a_rocking_block():
     # Quadrature: of the time of the sixth impact by the half width, the half height and the angle at the start.
     def sixth(p):
@@ -91,7 +91,7 @@ def test_a_block_slides_on_both_corners():
     np.testing.assert_allclose(ride["left.normal"] + ride["right.normal"], 9.81, rtol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_random_blocks_satisfy_the_contact_laws():
     rng = np.random.default_rng(1)
     for _ in range(40):
@@ -136,7 +136,7 @@ class KickedBlock(RockingBlock):
         return {"along": jk.rising(t - 0.5, then=along), "away": jk.rising(t - 1.0, then={"y_dot": u["y_dot"] + 2.0})}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_events_change_the_state_of_closed_contacts():
     """Both corners slide, stick, open together and land together. Then the simulation continues from its end."""
     atol = 1e-10
@@ -171,7 +171,7 @@ class BallsInARow(jk.System):
         return {f"{i} and {i + 1}": jk.Contact(gap=q[i + 1] - q[i], restitution=self.restitution) for i in range(4)}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_sequential_and_simultaneous_impacts_of_balls():
     atol = 1e-12
     start = jk.State({"b": 1.0, "c": 2.0, "d": 3 + 1 / 7, "e": 4.0}, {"a_dot": 1.0})
@@ -219,7 +219,7 @@ class Particle(jk.System):
         return {"plane": jk.Contact(motion["P"], motion.N.z, **law)}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_particle_on_a_slope_changes_the_direction_of_its_slip():
     """For mu = tan(slope), |v| + v_x is constant: the particle that started sideways ends with half of its speed."""
     rtol = 1e-10
@@ -232,7 +232,7 @@ def test_a_particle_on_a_slope_changes_the_direction_of_its_slip():
     np.testing.assert_allclose(ride["plane.normal"], 9.81 * np.cos(np.arctan(0.5)), rtol=rtol)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_particle_bounces_and_stops_in_space():
     """Impulses of friction mu L_N along the slip, then friction mu m g until it stops; all along one line."""
     atol = 1e-9
@@ -255,7 +255,7 @@ class Driven(Particle):
         return jk.weight(motion, -10.0 * N.z), jk.Force(force, motion["particle"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(("tolerance", "atol"), [(1e-6, 1e-6), (1e-10, 1e-9)])
 def test_slip_begins_with_zero_acceleration(tolerance, atol):
     """Static equals kinetic friction. In polar coordinates of the slip, by SciPy's Radau with 1e-11.
@@ -307,7 +307,7 @@ class Billiard(jk.System):
         return {"table": jk.Contact(bottom, motion.N.z, friction=self.friction)}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_billiard_ball_with_side_spin():
     """The slip keeps its direction e and vanishes after 2 s0 / (7 mu g): v = v0 - (2/7) s0 e."""
     atol = 1e-9
@@ -323,7 +323,7 @@ def test_a_billiard_ball_with_side_spin():
     np.testing.assert_array_equal(ride.contacts["table"], np.where(ride.t < t, SLIDES, STICKS))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_wheel_strikes_a_kerb():
     """It rolls, and its angular momentum about the edge is that before: the ratio of the rates has a closed form."""
     atol, R, h = 1e-9, 0.35, 0.08
@@ -343,7 +343,7 @@ def test_a_wheel_strikes_a_kerb():
     np.testing.assert_allclose(energy[on_edge], 0.5 * about_edge * after**2, rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_falling_wheel_begins_to_slip_sideways():
     """It rolls and falls to its side. Static equals kinetic friction, so the slip begins without an acceleration."""
     start = jk.State({"x": -3.0, "z": 0.35 * np.cos(0.4), "lean": -0.4}, {"x_dot": 1.575, "spin_rate": 4.5})
@@ -354,7 +354,7 @@ def test_a_falling_wheel_begins_to_slip_sideways():
 
 
 # -- Stops and loops.
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_gear_with_backlash():
     """The play is not exceeded, and the angular momentum is the integral of the torque."""
     torque = {"torque": lambda t, state: 0.01 * jnp.sin(6.0 * t)}
@@ -369,7 +369,7 @@ def test_a_gear_with_backlash():
     np.testing.assert_allclose(lead[closed], 0.01, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_slider_in_guides_with_clearance():
     # Integration in extended precision: 23 impacts of two corners, then both slide, then they lift off.
     ride = jk.simulate(
@@ -400,7 +400,7 @@ class StruckSliderCrank(SliderCrank):
         return {"wall": jk.Contact(gap=q["x"] - self.wall, restitution=0.4)}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_impact_preserves_the_loop_closure_of_a_slider_crank():
     # The wall is where the slider is for a crank angle of 0.9 rad. Without loads, the kinetic energy is constant.
     atol = 1e-9

@@ -24,8 +24,8 @@ def ride(ts, values, **options):
     return jk.simulate(Cart(), jk.State([0.0], [0.0]), np.linspace(0.0, 1.0, 3), push, **options)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("n", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+@pytest.mark.weekly
+@pytest.mark.parametrize("n", [100_000, pytest.param(1_000_000, marks=pytest.mark.weekly)])
 def test_a_smooth_signal_and_a_peak_with_dense_samples(n):
     """The samples of a smooth signal; and the same with a peak of one sample: a push of `height` dt [N s]."""
     atol, ts = 1e-8, np.linspace(0.0, 1.0, n)
@@ -84,7 +84,7 @@ def test_steps_end_at_all_samples_if_these_are_differentiated():
         np.testing.assert_array_equal(slopes, slope)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_by_delay_and_scale_of_samples_agree_with_the_closed_form():
     """By a delay and by a factor of all values, against those of the motion in closed form."""
     atol, n = 1e-7, 9001

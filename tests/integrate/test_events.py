@@ -59,7 +59,7 @@ def exact(h, v, g):
     return jnp.stack([(v + root) / g, 0.0 * h, -root])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("options", [{}, {"step": 0.07}], ids=["adaptive", "fixed"])
 def test_a_dropped_particle(options):
     atol = 1e-9
@@ -74,7 +74,7 @@ def test_a_dropped_particle(options):
     assert np.isnan(ride["drive"][~reached]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_second_derivatives_of_the_end_time():
     """By the velocity at the start, against the formula."""
     h, g = jnp.array(1.0), jnp.array(9.81)
@@ -108,7 +108,7 @@ class Pendulum(jk.System):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("way", "quarters"), [(-1, 1), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((0, 1), (1, 3)))]
+    ("way", "quarters"), [(-1, 1), *(pytest.param(*x, marks=pytest.mark.weekly) for x in ((0, 1), (1, 3)))]
 )
 def test_a_pendulum_crosses_the_vertical_after_a_quarter_period(way, quarters):
     """A quarter of the period is sqrt(l / g) K(sin(a / 2)); its derivative by the length, that over 2 l."""
@@ -123,7 +123,7 @@ def test_a_pendulum_crosses_the_vertical_after_a_quarter_period(way, quarters):
     np.testing.assert_allclose(slope, expected / 2.6, rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_second_derivatives_along_several_directions():
     """By a length, an angle and a rate; rates and the event read coordinates, speeds and the time. In forward mode,
     and forward over reverse, against differences of first derivatives."""
@@ -159,7 +159,7 @@ def test_an_event_that_is_zero_at_the_start():
         assert np.isnan(at_once.q[1:]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("ends", "options"), [("ground", {}), ("either", {"step": 0.5})], ids=["falling-adaptive", "either-fixed"]
 )
@@ -171,7 +171,7 @@ def test_two_crossings_within_a_step(ends, options):
     np.testing.assert_allclose(ride.t_end, (1 - np.sqrt(1 - 2 * 5.19 * 0.08)) / 5.19, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_earliest_of_several_events_in_one_step_is_located():
     ride = dropped(1.0, 1.0, Particle(ends="roof"), step=2.0)
     assert ride.reason == "c top"
@@ -199,7 +199,7 @@ class Suction(Particle):
         return [*super().loads(t, q, u, motion, inputs), jk.Force(force, motion.bodies[0])]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_non_finite_trial_steps_are_rejected_without_nan_in_derivatives():
     """Steps that ended under the ground are thrown away, and leave no NaN in a derivative in either mode."""
 
@@ -226,7 +226,7 @@ class Brake(eqx.Module):
 TOP = jnp.array([0.0, 1.0])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_outputs_after_an_early_end_are_nan():
     """Dependent speeds, a controller's input and projected coordinates, where they were reached; NaN where not."""
 
@@ -248,7 +248,7 @@ def test_outputs_after_an_early_end_are_nan():
         assert np.isnan(found[2:]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_singular_dependent_speeds_end_the_simulation():
     """The bead's horizontal speed vanishes at a quarter of a turn: the motion ends before."""
     ride = jk.simulate(Bead(ends=False), jk.State(TOP, jnp.ones(1)), TS)
@@ -259,7 +259,7 @@ def test_singular_dependent_speeds_end_the_simulation():
     assert np.isnan(ride["vy"][~reached]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_other_end_times_have_nan_derivatives():
     """`max_steps` is no smooth end: its time has a derivative that is NaN, and so has what was not reached."""
 
@@ -293,7 +293,7 @@ def test_an_event_that_is_not_finite_at_the_start_raises():
         dropped(0.1, 0.0, Particle(ends="lost"))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_event_in_single_precision():
     particle, ts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (Particle(), TS))
     start = jk.State(jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32))
@@ -304,7 +304,7 @@ def test_an_event_in_single_precision():
     np.testing.assert_allclose(ride.end.q, 0.0, atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_event_with_an_implicit_solver():
     """The bead passes y = 0.3 where cos(t) does; Kvaerno's method solves for the stages of every step."""
     ride = jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), TS, solver=diffrax.Kvaerno5())
@@ -312,15 +312,15 @@ def test_an_event_with_an_implicit_solver():
     np.testing.assert_allclose(ride.t_end, np.arccos(0.3), atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     "options",
     [
         {},
         {"step": 0.13},
-        pytest.param({"solver": diffrax.Heun()}, marks=pytest.mark.slow),
-        pytest.param({"solver": diffrax.HalfSolver(diffrax.Bosh3())}, marks=pytest.mark.slow),
-        pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow),
+        pytest.param({"solver": diffrax.Heun()}, marks=pytest.mark.weekly),
+        pytest.param({"solver": diffrax.HalfSolver(diffrax.Bosh3())}, marks=pytest.mark.weekly),
+        pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.weekly),
     ],
     ids=["Tsit5", "fixed", "Heun", "HalfSolver", "Kvaerno5"],
 )
@@ -358,7 +358,7 @@ def test_xla_compiles_the_accelerations_once(platform, by_xla):
     assert calls * function.count("stablehlo.tanh") == 2  # in the loop, and halfway to the event
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_event_of_a_stabilized_simulation():
     ride = jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), TS, stabilize=10.0)
     assert ride.reason == "low"
@@ -409,7 +409,7 @@ def test_only_functions_that_are_zero_at_the_start_cross_zero_there():
     assert np.any(x <= 1)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_derivatives_by_sample_times_agree_with_differences(mode):
     """Two signals, one of whose kinks stand at one time; the times of the ride itself; against central differences."""
@@ -593,7 +593,7 @@ _BY_FORMULA = jax.jit(jax.vmap(slopes(lambda x, _: _formulas(*x), "forward"), in
 _number = lambda low, high: st.floats(low, high, allow_nan=False)  # noqa: E731
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(_number(0.5, 1.5), _number(-1.0, 2.0), _number(5.0, 15.0))
@@ -617,7 +617,7 @@ def test_batch_members_end_at_their_own_times_with_correct_derivatives(mode, h, 
     assert np.isnan(found[2, 1:6, 0, 2]).all(), "what is missing has no derivative"
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(("adjoint", "derivative"), [("forward", jax.jacfwd), ("reverse", jax.jacrev)])
 def test_derivatives_of_an_event_after_an_input_jump(adjoint, derivative):
     """A force of 1 N from 0.5 s + delay on. The step that begins there is rejected and repeated."""

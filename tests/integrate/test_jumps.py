@@ -88,8 +88,8 @@ def test_a_bouncing_ball_with_drag():
         ride.jumps.name(3)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("adjoint", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
+@pytest.mark.weekly
+@pytest.mark.parametrize("adjoint", ["forward", pytest.param("reverse", marks=pytest.mark.weekly)])
 def test_derivatives_through_jumps(adjoint):
     """Of the state at the end and of the time of the last bounce, against the closed form.
 
@@ -114,7 +114,7 @@ def test_derivatives_through_jumps(adjoint):
     np.testing.assert_allclose(jax.jit(slopes(found))(P), jax.jacfwd(expected)(P), rtol=rtol)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_second_derivatives_through_a_jump():
     """Without drag, by height, gravity and restitution: the derivative of |v| v has a corner at the top."""
     rtol, ts, p = 1e-8, jnp.linspace(0.0, 1.0, 6), jnp.array([1.0, 9.81, 0.8])
@@ -132,7 +132,7 @@ def test_second_derivatives_through_a_jump():
     assert np.isnan(jax.jit(third)(1.0))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     "options",
     [{"step": 0.01}, {"solver": diffrax.Heun(), "rtol": 1e-7, "atol": 1e-7}],
@@ -146,13 +146,13 @@ def test_results_agree_for_other_solvers_and_options(options):
     np.testing.assert_allclose([ride.end.q[0], ride.end.u[0]], closed_form(P, 2.0), atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_implicit_solver():
     ride = drop(P, solver=diffrax.Kvaerno5(), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose([ride.end.q[0], ride.end.u[0]], closed_form(P, 2.0), atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_each_member_of_a_batch_jumps_at_its_own_times():
     """A member equals its own simulation, beside one without jumps and one with as many as are allowed."""
     heights = jnp.array([0.01, 1.0, 30.0])
@@ -218,7 +218,7 @@ def kick(t, q, u, x):
     return {"kick": jk.rising(q["x"] - 1.0, when=0.5 - x["mode"], then={"v": 2.0 * u["v"], "mode": 1.0})}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_sample_at_the_time_of_a_jump_has_the_value_after_it():
     ride = moving(kick)
     np.testing.assert_allclose(ride["v"], np.where(np.asarray(TS) < 1.0 - 1e-9, 1.0, 2.0))
@@ -229,7 +229,7 @@ def test_a_sample_at_the_time_of_a_jump_has_the_value_after_it():
     np.testing.assert_allclose(at_end["x"], TS, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_sample_at_a_jump_has_no_derivative_by_the_time_of_the_jump():
     """It does not exist if the time of the jump depends on the parameter. At a jump with a fixed time it does."""
 
@@ -246,7 +246,7 @@ def test_a_sample_at_a_jump_has_no_derivative_by_the_time_of_the_jump():
     np.testing.assert_allclose(by_time, np.where(TS <= 1.0, TS, 2 * TS - 1), atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_end_at_a_jump_has_no_derivative_by_the_time_of_the_jump():
     """It does not exist either if the time of the jump depends on the parameter."""
 
@@ -279,7 +279,7 @@ def test_simultaneous_events_are_processed_in_alphabetical_order():
     np.testing.assert_allclose(ride["x"][-1], 0.0, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_two_almost_simultaneous_events():
     for gap in (1e-13, 1e-9):
 
@@ -295,7 +295,7 @@ def test_two_almost_simultaneous_events():
         assert ride.jumps.name(0) == "soon" or gap < 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_event_has_no_effect_while_its_condition_is_not_positive():
     """Crossings while `when` is not positive have no effect, and do not hide later ones."""
 
@@ -407,7 +407,7 @@ def test_a_compass_gait():
     assert ride.jumps.energy[0] > 0
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_energy_balance_includes_losses_in_jumps():
     """The audit counts what the impacts lose, and no work where a jump moves a mass centre."""
     p = P.at[2].set(0.0)
@@ -431,7 +431,7 @@ def test_functions_that_cannot_represent_jumps_raise_or_warn(tmp_path):
         jk.export.c(Ball(), tmp_path / "ball.c", ["rates"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_sweep_over_parameters_with_different_numbers_of_jumps():
     heights = jnp.array([[0.5], [1.0], [9.0]])
     batch = jk.sweep.sweep(Ball(drag=0.0), jk.State(heights, jnp.zeros((3, 1))), jnp.linspace(0.0, 1.0, 5), chunk=2)
@@ -441,7 +441,7 @@ def test_a_sweep_over_parameters_with_different_numbers_of_jumps():
     np.testing.assert_allclose(batch.jumps.t[0, 1], first[0] * 2.6, rtol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_invalid_jumps_raise():
     def then(new):
         return lambda t, q, u, x: {"kick": jk.rising(q["x"] - 1.0, then=new)}
@@ -466,7 +466,7 @@ def test_invalid_jumps_raise():
         np.testing.assert_allclose(ride.t_end, 1.0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_jump_that_violates_a_configuration_constraint_ends_the_simulation():
     class Kicked(jk.catalog.WhippleBicycle):
         def events(self, t, q, u):

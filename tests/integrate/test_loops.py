@@ -12,7 +12,7 @@ import jaxkane as jk
 from jaxkane._integrate import integrate
 
 # Without constraints, with a constraint of the configuration, and with dependent speeds and coordinates.
-SYSTEMS = ["DoublePendulum", *(pytest.param(x, marks=pytest.mark.slow) for x in ("SpinningTop", "WhippleBicycle"))]
+SYSTEMS = ["DoublePendulum", *(pytest.param(x, marks=pytest.mark.weekly) for x in ("SpinningTop", "WhippleBicycle"))]
 
 
 def both_loops(monkeypatch, simulate):
@@ -35,7 +35,7 @@ def assert_same(fast, other):
         np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_fast_loop_and_diffrax_take_the_same_steps(name, monkeypatch):
     entry = jk.catalog.CATALOG[name]
@@ -46,15 +46,15 @@ def test_the_fast_loop_and_diffrax_take_the_same_steps(name, monkeypatch):
 SAMPLED = {"push": jk.Samples(np.linspace(0.0, 1.0, 5), np.array([1.0, -2.0, 0.5, 3.0, 1.0]), zero_order_hold=True)}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("system", "inputs", "options"),
     [
         (Thrown(), None, {}),
-        pytest.param(Particle(), SAMPLED, {}, marks=pytest.mark.slow),
-        pytest.param(Particle(), SAMPLED, {"step": 0.05}, marks=pytest.mark.slow),
-        pytest.param(Particle(), SAMPLED, {"solver": diffrax.Kvaerno3(), "rtol": 1e-6}, marks=pytest.mark.slow),
-        pytest.param(Particle(), None, {"max_steps": 3}, marks=pytest.mark.slow),
+        pytest.param(Particle(), SAMPLED, {}, marks=pytest.mark.weekly),
+        pytest.param(Particle(), SAMPLED, {"step": 0.05}, marks=pytest.mark.weekly),
+        pytest.param(Particle(), SAMPLED, {"solver": diffrax.Kvaerno3(), "rtol": 1e-6}, marks=pytest.mark.weekly),
+        pytest.param(Particle(), None, {"max_steps": 3}, marks=pytest.mark.weekly),
     ],
     ids=["event", "hold", "fixed", "implicit", "max steps"],
 )
@@ -63,7 +63,7 @@ def test_the_fast_loop_and_diffrax_agree_with_events_and_discontinuities(system,
     assert_same(*both_loops(monkeypatch, lambda: jk.simulate(system, state, [0.0, 0.5, 1.0], inputs, **options)))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_fast_loop_and_diffrax_agree_in_batches_and_derivatives(monkeypatch):
     def ends(v):
         ride = jax.vmap(lambda v: jk.simulate(Thrown(), jk.State(jnp.zeros(1), v[None]), [0.0, 1.0, 2.0]))(v)
@@ -87,7 +87,7 @@ def swing(**options):
     return np.array([angle, slope, status])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     "options",
     [
@@ -102,7 +102,7 @@ def test_diffrax_options_are_supported(options):
     np.testing.assert_allclose(swing(**options), swing(), rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_diffrax_controller_still_locates_events():
     control = diffrax.PIDController(rtol=1e-7, atol=1e-7, pcoeff=0.2, icoeff=0.5)
     ride = jk.simulate(Thrown(), jk.State([0.0], [1.5]), [0.0, 10.0], controller=control)

@@ -61,7 +61,7 @@ def swing(gravity, ts, **options):
     return jk.simulate(system, state, ts, rtol=1e-12, atol=1e-12, max_steps=100_000, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_with_multipliers_passes_singular_dependent_speeds():
     ts = jnp.linspace(0.0, 2.0, 21)
     assert jk.simulate(Links(), jk.assemble(Links(), START, None), ts).reason == "singular speeds"
@@ -79,7 +79,7 @@ def test_with_multipliers_passes_singular_dependent_speeds():
     np.testing.assert_allclose(slope, differences, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_energy_and_constraints_hold_for_thirty_seconds():
     ride = swing(9.81, jnp.linspace(0.0, 30.0, 601), stabilize=10.0)
     audit = jk.audit(jk.with_multipliers(Links()), ride)
@@ -122,7 +122,7 @@ class Parallelogram(jk.System):
         return jk.weight(motion, -9.81 * motion.N.y)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("excess", [0.0, 1e-8])
 def test_a_redundant_third_rocker_does_not_change_the_motion(excess):
     system = jk.with_multipliers(Parallelogram(excess))
@@ -147,7 +147,7 @@ def test_with_multipliers_rejects_unsupported_uses():
         jk.accelerations(system, 0.0, START, np.zeros(4))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_other_independent_speeds_preserve_contacts_and_state_events():
     class Crank(Links):
         states = ("turns",)

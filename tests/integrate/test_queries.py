@@ -97,7 +97,7 @@ def test_functions_evaluated_at_one_time_and_for_a_batch(ride):
         jk.positions(Disc(), ride, [0.0, 0.0], [1.0])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_along_a_trajectory_that_ended_early():
     def last(push, adjoint):  # the rim where it was last
         system = dataclasses.replace(Disc(), push=push)

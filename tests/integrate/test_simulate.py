@@ -31,7 +31,7 @@ def mechanical_energy(bike, q, u):
     return jax.jit(jax.vmap(one))(q, u)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_energy_and_front_contact_over_five_seconds():
     """v = 4.6 m/s, roll rate 0.5 rad/s (Meijaard et al., Figure 4), rtol 1e-10."""
     state = jk.assemble(BIKE, {}, {"roll_rate": 0.5, "rear_wheel_rate": -4.6 / 0.3})
@@ -45,7 +45,7 @@ def test_energy_and_front_contact_over_five_seconds():
     np.testing.assert_allclose(ride["yaw_rate"], ride.u_dep[:, 0])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_fixed_and_adaptive_steps_agree():
     fine = jk.simulate(PENDULUM, START, TS, solver=diffrax.Dopri8(), rtol=1e-11, atol=1e-11)
     steps = jk.simulate(PENDULUM, START, TS, step=1e-3)
@@ -53,7 +53,7 @@ def test_fixed_and_adaptive_steps_agree():
     assert steps.stats["steps"] == 1000
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_inputs_of_every_kind():
     forward = {"adjoint": "forward"}
     constant, number = (jk.simulate(PENDULUM, START, TS, {"elbow_torque": x}, **forward) for x in (2.0, jnp.array(2.0)))
@@ -83,7 +83,7 @@ class Rider(eqx.Module):
         return {"steer_torque": self.gain * steer, "roll_torque": -0.001 * state["yaw_rate"]}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_steering_controller_stabilizes_the_bicycle():
     """A rider who steers into the fall keeps the bicycle up at 2.5 m/s, where it falls by itself."""
     state = jk.assemble(BIKE, {"roll": 0.02}, {"rear_wheel_rate": -2.5 / 0.3})
@@ -131,7 +131,7 @@ def test_a_controller_reads_the_state_by_name():
     np.testing.assert_allclose(ride["torque"], -3.0 * x - 0.6 * x_dot, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_statuses():
     few = jk.simulate(PENDULUM, START, TS, max_steps=5)
     assert few.status == jk.Status.MAX_STEPS
@@ -203,7 +203,7 @@ def loss(system, state, torque, adjoint):
     return jnp.sum(ride["theta1"] ** 2 + ride["theta2_dot"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("torque", "forward", "reverse"),
     [(jnp.array(0.7), "auto", "both"), (jnp.sin(jnp.linspace(0.0, 3.0, 11)), "forward", "auto")],
@@ -231,13 +231,13 @@ def test_gradients_of_a_simulation_against_central_differences(torque, forward, 
 NAMES = {"auto": "ForwardMode", "both": "DirectAdjoint", "reverse": "RecursiveCheckpointAdjoint"}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("adjoint", "mode"),
     [
         ("auto", "forward"),
-        pytest.param("both", "forward", marks=pytest.mark.slow),
-        pytest.param("reverse", "reverse", marks=pytest.mark.slow),
+        pytest.param("both", "forward", marks=pytest.mark.weekly),
+        pytest.param("reverse", "reverse", marks=pytest.mark.weekly),
         ("both", "reverse"),
     ],
 )
@@ -255,7 +255,7 @@ def test_every_adjoint_against_differences(adjoint, mode):
     np.testing.assert_allclose(both(x)[0], differences(both, x, 1e-4), rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_forward_mode_through_a_compiled_reverse_mode_raises_with_advice():
     def read(u):
         return jk.simulate(Pendulum(), jk.State(jnp.array([0.4]), u), TS[:3], step=0.05, max_steps=4)["angle"][-1]
@@ -278,7 +278,7 @@ def test_forward_mode_through_a_compiled_reverse_mode_raises_with_advice():
     np.testing.assert_allclose(seen, alone[None], rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("mode", ["reverse over reverse", "reverse of forward", "reverse over forward"])
 def test_unsupported_reverse_mode_derivatives_raise_with_advice(mode):
     def read(rate, **options):
@@ -305,7 +305,7 @@ def test_a_state_of_mixed_types_is_promoted():
     assert jk.simulate(Pendulum(), state, TS[:3], step=0.05, max_steps=4).q.dtype == jnp.float64
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_second_derivatives_forward_over_forward():
     f = lambda m: loss(DoublePendulum(mass=m, length=1.0), START, 0.7, "forward")  # noqa: E731
     both = slopes(lambda m, _: jax.jacfwd(f)(m), "forward")  # the second derivative, and the first
@@ -313,7 +313,7 @@ def test_second_derivatives_forward_over_forward():
     np.testing.assert_allclose(both(1.0)[0], numeric, rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_gradients_of_the_bicycle():
     """Reverse and forward through a ride, a parameter and the initial roll rate, against differences."""
     import dataclasses
@@ -332,7 +332,7 @@ def test_gradients_of_the_bicycle():
     np.testing.assert_allclose(f(x)[1], numeric, rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_float32_results():
     pendulum = jax.tree.map(lambda x: x.astype(jnp.float32), PENDULUM)
     start = jax.tree.map(lambda x: x.astype(jnp.float32), START)
@@ -373,7 +373,7 @@ def test_a_simulation_can_be_resumed_from_its_end():
     np.testing.assert_allclose(second.q[-1], whole.q[-1], atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_invalid_times_and_samples_give_status_invalid_under_jit():
     """Where no check sees the numbers."""
     kinds = (False, True)
@@ -468,7 +468,7 @@ class Pendulum(jk.System):
         return [*jk.weight(motion, -9.81 * motion.N.y), jk.Torque(inputs["torque"] * motion.N.z, motion.bodies[0])]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_step_that_ends_a_rounding_error_before_a_sample():
     """Steps of 2.5 ms by chance end a rounding error before samples; what is left was once too short a step."""
     pendulum = Pendulum()

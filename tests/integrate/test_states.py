@@ -98,7 +98,7 @@ def test_accelerations_state_rates_and_outputs_at_one_time(cart, ride):
         jk.accelerations(cart, 0.0, [0.0], [0.0], {"froce": 1.0})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_in_both_modes_and_in_batches(cart):
     def last(cart, force):
         ride = jk.simulate(cart, jk.State({"place": 0.2}, {}, {"force": force}), ts, {"command": 5.0})
@@ -120,7 +120,7 @@ def test_derivatives_in_both_modes_and_in_batches(cart):
     assert float(rides["acceleration"][0, -1]) != float(rides["acceleration"][1, -1])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_sweep_over_parameters_and_initial_states(cart):
     rides = sweep(cart, START, ts, {"command": 5.0}, table={"lag": [0.1, 0.2], "force": [3.0, 1.0]})
     assert rides["acceleration"].shape == (2, 21)
@@ -130,7 +130,7 @@ def test_a_sweep_over_parameters_and_initial_states(cart):
     assert rides.to_xarray()["motor.force"].shape == (2, 21)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_linear_models_and_steady_motions(cart):
     still = equilibrium(cart, inputs={"command": 5.0})
     assert float(still["place"]) == pytest.approx(5.0 / 30.0)
@@ -155,14 +155,14 @@ def test_a_controller_reads_a_state(cart):
     np.testing.assert_allclose(ride["command"], -2.0 * ride["force"] + ride["filtered"], atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_audit_includes_the_power_of_states(cart):
     ride = jk.simulate(cart, START, np.linspace(0.0, 1.0, 201), {"command": 5.0})
     kept = jk.audit(cart, ride)
     assert np.abs(kept.energy_error).max() < 1e-6 * np.abs(kept.work).max()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_lag_and_the_initial_value_of_a_state_are_identified(cart):
     rng = np.random.default_rng(0)
     true = jk.simulate(Cart(lag=0.13, gain=1.2), START, ts, {"command": 5.0})
@@ -208,7 +208,7 @@ class Falling(jk.System):
         return {"ground": q["height"]}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_event_ends_the_integration_of_states():
     def end(height):
         ride = jk.simulate(Falling(), jk.State([height], [0.0], [0.0]), ts)
@@ -222,7 +222,7 @@ def test_an_event_ends_the_integration_of_states():
     assert np.isnan(after)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_initial_values_of_states_in_every_form(cart):
     assert jk.assemble(cart, {"place": 0.1}, x={"force": 2.0}).x.tolist() == [2.0, 0.0]
     assert jk.assemble(cart, {"place": 0.1}).x.tolist() == [0.0, 0.0]

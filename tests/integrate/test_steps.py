@@ -25,8 +25,8 @@ def test_a_solver_without_error_estimate_requires_a_fixed_step():
         jk.simulate(system, state, jnp.linspace(0.0, 0.5, 3), solver=diffrax.SemiImplicitEuler(), step=0.01)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", [diffrax.Heun(), pytest.param(diffrax.Kvaerno3(), marks=pytest.mark.slow)])
+@pytest.mark.weekly
+@pytest.mark.parametrize("method", [diffrax.Heun(), pytest.param(diffrax.Kvaerno3(), marks=pytest.mark.weekly)])
 def test_half_solver_meets_tolerances_and_has_correct_derivatives(method):
     _, state = pendulum()
 
@@ -41,7 +41,7 @@ def test_half_solver_meets_tolerances_and_has_correct_derivatives(method):
     assert float(slope) == pytest.approx(float(exact_slope), abs=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), diffrax.ImplicitEuler()])
 def test_implicit_solvers_with_fixed_steps_have_their_order(solver):
     system, state = pendulum()
@@ -76,18 +76,18 @@ def controller(duration, step=None, first=0.01, tolerance=1e-7, discontinuities=
     return StepSizeController(tolerance, tolerance, step, first, longest, duration, discontinuities, None, none)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("solver", "adjoint", "step"),
     [
         (diffrax.Tsit5(), "forward", None),
         (UnrolledERK(diffrax.Dopri5()), "reverse", None),
-        pytest.param(diffrax.Kvaerno5(), "forward", None, marks=pytest.mark.slow),
+        pytest.param(diffrax.Kvaerno5(), "forward", None, marks=pytest.mark.weekly),
         (diffrax.HalfSolver(diffrax.Euler()), "forward", None),
         (diffrax.Ralston(), "forward", 0.03),
-        pytest.param(diffrax.Tsit5(), "reverse", None, marks=pytest.mark.slow),
-        pytest.param(diffrax.Kvaerno5(), "reverse", None, marks=pytest.mark.slow),
-        pytest.param(diffrax.Bosh3(), "both", None, marks=pytest.mark.slow),
+        pytest.param(diffrax.Tsit5(), "reverse", None, marks=pytest.mark.weekly),
+        pytest.param(diffrax.Kvaerno5(), "reverse", None, marks=pytest.mark.weekly),
+        pytest.param(diffrax.Bosh3(), "both", None, marks=pytest.mark.weekly),
     ],
 )
 def test_steps_and_derivatives_agree_with_diffrax(solver, adjoint, step):
@@ -149,8 +149,8 @@ class Oscillator(jk.System):
 AT_REST = jk.State([1.0], [0.0])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("adjoint", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
+@pytest.mark.weekly
+@pytest.mark.parametrize("adjoint", ["forward", pytest.param("reverse", marks=pytest.mark.weekly)])
 def test_a_fixed_step_to_a_non_finite_state_ends_the_simulation(adjoint):
     """As one with tolerances: with a reason, and derivatives that are NaN where there is no motion."""
 
@@ -199,7 +199,7 @@ def test_an_implicit_step_without_a_solution_ends_the_simulation():
         jk.simulate(Growth(), state, [0.0, 1.0, 2.0], step=1.0, solver=diffrax.ImplicitEuler())
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.skipif(not native.is_on(), reason="XLA alone leaves out a term for the time that it takes to compile")
 def test_the_derivative_of_an_event_early_in_a_long_motion():
     def end(level):
@@ -248,7 +248,7 @@ def test_a_program_with_boolean_results_is_differentiable(kernels):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("jacobian", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("jacobian", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.weekly)])
 def test_results_are_differentiable_by_the_first_and_last_time(jacobian):
     system, state = pendulum()
 
@@ -271,7 +271,7 @@ def test_a_step_ends_at_a_discontinuity_or_halfway_to_it():
         assert end == 0.5 or end == min(length, 0.25)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("adjoint", ["forward", "reverse"])
 def test_an_invalid_batch_member_takes_no_steps(adjoint):
     """Beside one that can: a body with a negative mass, and a parameter that is no number."""

@@ -38,9 +38,9 @@ def motion(solver, jump, args):
 
 
 # FSAL with a jump, after which the first stage is made anew; one that is neither FSAL nor SSAL.
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
-    ("method", "jump"), [(diffrax.Tsit5, True), pytest.param(diffrax.Dopri8, False, marks=pytest.mark.slow)]
+    ("method", "jump"), [(diffrax.Tsit5, True), pytest.param(diffrax.Dopri8, False, marks=pytest.mark.weekly)]
 )
 def test_unrolled_stages_give_the_same_steps_values_and_derivatives(method, jump):
     rtol = 1e-11
@@ -80,7 +80,7 @@ class Rod(jk.System):
         return jk.weight(motion, -9.81 * motion.N.y)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_massless_batch_member_does_not_affect_the_gradients_of_others():
     def ends(length, masses):
         start, ts = jk.State({"angle": 0.3}, {}), jnp.linspace(0.0, 0.5, 3)

@@ -39,7 +39,7 @@ def end(delay, adjoint="auto"):
     return jk.simulate(Cart(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], {"push": push}, adjoint=adjoint)["place"]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_solution_and_its_derivative_by_a_delay_are_exact():
     found, slope = jax.jit(lambda d: jax.jvp(lambda d: end(d, "forward"), (d,), (1.0,)))(0.03)
     exact = [place(t, 0.03) for t in (0.0, 0.5, 1.0)]
@@ -50,7 +50,7 @@ def test_the_solution_and_its_derivative_by_a_delay_are_exact():
     assert float(reverse) == pytest.approx(float(slope[-1]), rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_fixed_steps_that_end_at_the_samples_are_exact():
     push = jk.Samples(ts, values, zero_order_hold=True)
     ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())
@@ -60,7 +60,7 @@ def test_fixed_steps_that_end_at_the_samples_are_exact():
     np.testing.assert_allclose(ride["place"], [place(t, 0.0) for t in ts], atol=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_fixed_steps_have_derivatives_by_sample_values_and_nan_by_times(mode):
     def end(delay, factor):
@@ -147,7 +147,7 @@ def test_a_delay_within_an_input_function_is_differentiable():
     np.testing.assert_allclose(found, (place(1.0, 0.03), slope), rtol=rtol)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("form", ["branch", "controller"])
 def test_samples_called_by_a_function_equal_samples_passed_directly(form):
     rtol = 1e-11
@@ -164,7 +164,7 @@ class Blown(Cart):
         return jk.Force(self.wind(t) * motion.N.x, motion["cart"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.filterwarnings("ignore:Blown")
 def test_samples_stored_in_a_system_have_derivatives_by_their_times():
     rtol, h = 1e-8, 1e-6
@@ -180,7 +180,7 @@ class Late(Cart):
         return jk.Force(samples_held(t - self.delay) * motion.N.x, motion["cart"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.filterwarnings("ignore:Late")
 def test_discontinuities_of_samples_captured_by_a_system_are_found():
     rtol, h = 1e-8, 1e-6
@@ -209,7 +209,7 @@ def test_unsupported_calls_of_samples_in_input_functions_raise(push, options, me
 samples_held = jk.Samples(ts, values, zero_order_hold=True)
 
 
-@pytest.mark.parametrize("f", ["linear", "held", pytest.param("motion", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("f", ["linear", "held", pytest.param("motion", marks=pytest.mark.weekly)])
 def test_memory_is_proportional_to_the_number_of_samples(f):
     """A table of samples by times of 20 000 would take 3.2 GB."""
     n, per_sample = 20_000, 1000
@@ -232,9 +232,9 @@ class Two(Cart):
         return jk.Force((inputs["push"] - 2.0 * inputs["pull"]) * motion.N.x, motion["cart"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(("shift", "slope"), [(0.0, np.nan), (0.05, values[0] - values[4])], ids=["same", "other"])
-@pytest.mark.parametrize("mode", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", ["forward", pytest.param("reverse", marks=pytest.mark.weekly)])
 def test_simultaneous_jumps_of_two_signals_have_nan_derivatives_by_delay(mode, shift, slope):
     """By the delay of one of them. A step that ends at both jumps has one derivative with respect to its end."""
 

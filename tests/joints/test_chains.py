@@ -41,7 +41,7 @@ SYSTEMS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_scalar_and_array_programs_agree(name, monkeypatch):
     args = SYSTEMS[name]()
@@ -66,7 +66,7 @@ def test_scalar_and_array_programs_agree_in_reverse_mode(monkeypatch):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12), *found)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_energy_of_a_long_chain_is_conserved():
     chain, _, q, u, _ = at(Chain(n=14), 14)
     assert not components.is_written_out(14)

@@ -158,7 +158,7 @@ def test_a_ball_joint_spring_is_smooth_at_rest_and_takes_the_shorter_rotation():
     np.testing.assert_allclose(slope, -4.0, rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("base", [free("base"), planar("base"), [ball("s"), slide("x", (1, 2, 0))]])
 def test_motion_and_rates_of_a_tree_of_joints_are_consistent(base):
     """`check_description` relies on this and does not check trees."""
@@ -278,7 +278,7 @@ def test_a_planar_loop_with_an_out_of_plane_offset_is_rejected():
         four_bar(across=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_two_welded_bodies_move_as_one_body():
     slab = {"mass": 1.0, "inertia": (0.1, 0.2, 0.3), "center": (0.1, 0.2, 0.0)}
     a, b = Link("a", None, free("r"), **slab), Link("b", None, hinge("h", (0, 0, 1)), (0.1, 0.0, 0.0), **slab)
@@ -295,7 +295,7 @@ def test_two_welded_bodies_move_as_one_body():
     np.testing.assert_allclose(rate[speed], jk.accelerations(both, 0.0, [0.4], [0.9])[0], rtol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     "turned", [(1.0, 0.0, 0.0, 0.0), (0.0, 0.6, -0.8, 0.0), (0.5, 0.5, 0.5, 0.5), (0.0, 0.0, 0.0, 1.0)]
 )
@@ -386,7 +386,7 @@ def test_parameters_have_names_units_and_a_sign():
     assert set(mechanism([beside]).center["a"]) == {"x", "z"}  # a JAX zero is a parameter
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_mechanism_is_swept_by_the_names_of_its_parameters():
     arm, ts = mechanism(pendulums()), jnp.linspace(0.0, 0.2, 5)
     start = jk.State({"q0": 0.3}, {})
@@ -407,7 +407,7 @@ def test_a_mechanism_may_be_made_of_traced_numbers():
     np.testing.assert_allclose(jax.vmap(alpha)(jnp.array([1.0, 2.0])), [2 / 0.14, 4 / 0.18], rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_loop_may_be_made_of_traced_numbers():
     def alpha(across):
         system = four_bar(across, dependent=("q2", "q3"))

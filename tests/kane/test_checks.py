@@ -180,7 +180,7 @@ class TwoHingesOnOneAxis(jk.System):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.weekly)])
 def test_a_numerically_singular_mass_matrix_raises(many):
     system = TwoHingesOnOneAxis(many=many)
     rng = np.random.default_rng(0)
@@ -294,7 +294,7 @@ def test_impossible_inertias_are_checked_by_the_same_rule_everywhere(asked):
         asked(AnyInertia(1.0, -0.1, 1.0))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_impossible_bodies_in_a_batch_have_status_invalid():
     # possible, rounded, measured, refused, negative
     I33 = np.array([2.0, 2.003, 2.1, 2.2, -0.1])
@@ -439,7 +439,7 @@ def test_assemble_reports_why_it_fails():
     np.testing.assert_array_equal(given.u, [0.0, -10.0, 0.0])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_assemble_is_twice_differentiable_and_can_be_vmapped():
     bike = WhippleBicycle.benchmark()
     pitch = lambda x: jk.assemble(bike, jnp.zeros(8).at[jnp.array([0, 2])].set(x)).q[4]  # noqa: E731
@@ -526,7 +526,7 @@ class Coincident(jk.System):
         return jk.loads.spring(motion["O"], motion["P"], 3.0, self.length)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("derivative", [lambda f: f, jax.grad, jax.jacfwd])
 def test_a_force_without_direction_is_rejected_under_derivatives(derivative):
     def end(length):

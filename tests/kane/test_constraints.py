@@ -21,7 +21,7 @@ def crank_rocker():
     return system, jk.assemble(system, {"q1": 0.5, "q2": 1.0, "q3": 2.0}, {"u1": 4.0})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_projection_prevents_drift_of_a_four_bar_linkage_over_a_minute():
     system, state = crank_rocker()
     ts = jnp.linspace(0.0, 60.0, 601)
@@ -46,14 +46,14 @@ def top(**options):
     return system, jk.simulate(system, state, jnp.linspace(0.0, 5.0, 26), rtol=1e-5, atol=1e-5, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_stabilized_and_projected_coordinates_do_not_drift():
     free, stabilized, projected = (jk.audit(*top(**how)) for how in ({}, {"stabilize": 10.0}, {"project": True}))
     assert stabilized.drift < 0.3 * free.drift  # what is left is the interpolation between steps
     assert projected.drift < 1e-14
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_projected_simulation_has_gradients_after_an_early_end():
     top = jk.catalog.SpinningTop()
     entry = jk.catalog.CATALOG["SpinningTop"]
@@ -158,7 +158,7 @@ def test_best_dependent_speeds_rejects_non_finite_coordinates():
         jk.best_dependent_speeds(bicycle, 0.0, jnp.zeros(8).at[2].set(jnp.nan))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_massless_speed_is_refused_by_name():
     # Kamman, Unit 5, Example 6, note 2: a line has no moment of inertia about itself
     system, q, u = spatial_pendulum(I22_1=0.0)
@@ -175,7 +175,7 @@ def test_a_massless_speed_is_refused_by_name():
     assert rides.reason == ["no solution", "completed"]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_gimbal_lock_triggers_an_event_or_an_error_with_advice():
     system, q, u = spatial_pendulum()
     with pytest.raises(ValueError, match=r"theta11, theta12, theta13 are not finite.*Euler parameters"):
@@ -254,7 +254,7 @@ def test_projection_with_redundant_or_zero_residuals_is_differentiable():
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=1e-9), found, expected)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_stabilization_and_projection_work_with_redundant_residuals():
     state = jk.State(jnp.array([0.6, -0.8, 0.0]), jnp.array([1.0, 0.5]))
     ts = jnp.linspace(0.0, 1.0, 3)

@@ -89,7 +89,7 @@ PINOCCHIO = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [pytest.param(x, marks=[pytest.mark.slow] * (x[0] > "3")) for x in PINOCCHIO])
+@pytest.mark.parametrize("case", [pytest.param(x, marks=[pytest.mark.weekly] * (x[0] > "3")) for x in PINOCCHIO])
 def test_impulses_agree_with_pinocchio(case):
     q, before, residuals, e, u, p = PINOCCHIO[case]
     after = jk.impact(chain(len(q)), 0.0, q, before, residuals, e)
@@ -215,7 +215,7 @@ def by_multipliers(system, q, u, residuals, e):
     return u_all + solution[: len(u_all)], solution[len(u_all) + len(G) :]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_impact_preserves_nonholonomic_constraints():
     bicycle, entry = CATALOG["WhippleBicycle"].example(), CATALOG["WhippleBicycle"]
     q, u = jnp.array(entry.q), jnp.array(entry.u)
@@ -376,7 +376,7 @@ def strike(x, e, leg, q):
     return jnp.concatenate([after.u, after.impulses, after.energy_lost[None]])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_agree_with_central_differences():
     # central differences; truncation h^2 = 1e-10
     point = STRIKE_U, jnp.array(0.3), jnp.array(5.0), STRIKE_Q
@@ -441,7 +441,7 @@ def test_many_speeds():
     np.testing.assert_allclose(after.energy_lost, 3.0 * (1 - 0.2**2) * np.sum(u[:6]) ** 2, rtol=1e-11)
 
 
-@pytest.mark.slow_cases(all_but=["hoop"])
+@pytest.mark.weekly_cases(all_but=["hoop"])
 @pytest.mark.parametrize("case", ["walker", "block", "hoop", "singular"])
 def test_arrays_equal_written_out_scalars(case, monkeypatch):
     cases = {

@@ -134,7 +134,7 @@ SYSTEMS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_derivatives_by_every_argument_agree_with_differences(name):
     """Parameters, time, state and inputs, against central differences."""
@@ -233,7 +233,7 @@ def test_a_second_call_outside_jit_does_not_retrace(monkeypatch):
     np.testing.assert_allclose(jk.mass_matrix(Beads(), 0.0, q, u), 2.0 * np.eye(13), atol=1e-15)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_long_chain():
     """Ten speeds: M and f by closed form, derivatives in both modes."""
 

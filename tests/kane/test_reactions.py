@@ -238,7 +238,7 @@ def test_the_power_of_a_moving_constraint():
     np.testing.assert_allclose(equations.power_of_prescribed_motions(), 2.0 * (9.81 + 2 * t) * t**2, rtol=RTOL)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_constraint_forces_along_a_trajectory_under_jit_and_in_gradients():
     system, q, u = moving("DoublePendulum")
     inputs = {"elbow_torque": 0.4}

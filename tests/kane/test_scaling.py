@@ -63,7 +63,7 @@ def test_ranks_do_not_depend_on_the_units():
             np.testing.assert_allclose(A @ found, A @ x, rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_least_norm_solution_is_differentiable_with_repeated_rows():
     def x(a, xp=jnp):
         row = xp.stack([a, 2.0 + a * a, 1.0])

@@ -116,7 +116,7 @@ class SliderCrank(SliderInGuides):
         return jk.Impact(*rows, restitution=0.4)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_slider_strikes_its_guide_with_two_corners():
     # the first impact from the state at t = 0.002692502752021212, which DOP853 computed at rtol 1e-13
     q = [0.355304455027672, -0.17150954094013907, 0.0]
@@ -136,7 +136,7 @@ def sphere(u, mu, e=0.5):
     return strike(np.diag([1, 1, 1, 0.4, 0.4, 0.4]), [C], u, e, mu)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_sphere_slides_or_sticks_in_three_dimensions():
     before = np.array([3.0, 1.0, -2.0, 0.5, -1.0, 0.3])
     slip = np.array([3.0 + 1.0, 1.0 + 0.5])
@@ -156,7 +156,7 @@ def random_problem(c, rows, seed):
     return tuple(map(jnp.asarray, ((A @ A.T).reshape(c, rows, c, rows), v, e, mu)))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(("c", "rows"), [(2, 2), (1, 3)])
 def test_random_impacts_satisfy_the_contact_laws(c, rows):
     each = [random_problem(c, rows, seed) for seed in range(200)]
@@ -176,7 +176,7 @@ def test_random_impacts_satisfy_the_contact_laws(c, rows):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("c", "rows"), [(2, 2), pytest.param(1, 3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("c", "rows"), [(2, 2), pytest.param(1, 3, marks=pytest.mark.weekly)])
 def test_derivatives_agree_with_central_differences(c, rows):
     # central differences of step 1e-5; at least one contact slides
     G, v, e, mu = random_problem(c, rows, 0)

@@ -147,14 +147,14 @@ def test_assembly_in_float32_does_not_depend_on_the_units(make):
         assert (best.rank, best.current) == (2, system.dependent_speeds)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("make", "options"),
     [
         (four_bar, {"project": True}),
         (slider_crank, {"stabilize": 10.0}),
-        pytest.param(four_bar, {"stabilize": 10.0}, marks=pytest.mark.slow),
-        pytest.param(slider_crank, {"project": True}, marks=pytest.mark.slow),
+        pytest.param(four_bar, {"stabilize": 10.0}, marks=pytest.mark.weekly),
+        pytest.param(slider_crank, {"project": True}, marks=pytest.mark.weekly),
     ],
 )
 def test_projection_and_stabilization_do_not_depend_on_the_units(make, options):

@@ -110,7 +110,7 @@ def test_torsional_springs_and_dampers_of_hinges():
     np.testing.assert_allclose(u_dot, [-on_disk - 0.7, on_disk / 2.0], rtol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_spring_conserves_energy():
     law = lambda P, Q, i: jk.loads.spring(P, Q, 10.0, 4.5)  # noqa: E731
     system = type("Two", (Two,), {"law": staticmethod(law)})()

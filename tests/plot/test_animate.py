@@ -186,7 +186,7 @@ def test_size_and_time_of_an_animation_of_ten_seconds(ride, weaving):
     assert again == weaving.html()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_single_precision_far_from_the_origin(ride):
     """Places that are known to 0.03 mm only, a kilometre away, are still those of rigid bodies: within 3 mm."""
     system, trajectory = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == float else x, ride)

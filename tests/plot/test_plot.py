@@ -217,7 +217,7 @@ def test_stable_ranges_end_at_the_last_finite_value():
     assert stable_ranges(x, np.ones((5, 1)) + 0j) == []
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_results_of_the_stability_module_are_plotted_directly(style):
     """Columns of one name share a colour; the number of names is checked."""
     bicycle = jk.catalog.WhippleBicycle.benchmark()

@@ -92,16 +92,16 @@ def sweep(system):
     jk.sweep.sweep(class_of_cell()(), START, TS, table={"mass": np.array([1.0, 2.0])})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @on_linux
 @pytest.mark.parametrize(
     ("cell", "times", "each"),
     [
         (rerun, 5, 100),
-        pytest.param(rerun, 40, 100, marks=pytest.mark.slow),
-        pytest.param(differentiate, 6, 500, marks=pytest.mark.slow),
-        pytest.param(fit, 8, 250, marks=pytest.mark.slow),
-        pytest.param(sweep, 8, 200, marks=pytest.mark.slow),
+        pytest.param(rerun, 40, 100, marks=pytest.mark.weekly),
+        pytest.param(differentiate, 6, 500, marks=pytest.mark.weekly),
+        pytest.param(fit, 8, 250, marks=pytest.mark.weekly),
+        pytest.param(sweep, 8, 200, marks=pytest.mark.weekly),
     ],
 )
 def test_rerunning_a_notebook_cell_frees_the_programs_of_the_old_class(cell, times, each, limit, system):
@@ -144,7 +144,7 @@ KINDS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("kind", KINDS)
 def test_programs_are_freed_with_the_functions_that_they_were_traced_with(kind, system):
     def simulated(push):
@@ -198,7 +198,7 @@ def test_functions_with_the_same_code_have_separate_programs(system):
         assert values == pytest.approx([expected(4.0, push) for push in (1.0, 2.0, 3.0)], rel=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_classes_of_the_same_name_have_separate_programs():
     systems = [class_of_cell(k)() for k in (4.0, 9.0)]
     for forget in (False, True):
@@ -246,7 +246,7 @@ def test_controllers_compared_by_value_have_separate_programs(kind, system):
         assert last(system, kind(push), step=0.1) == pytest.approx(expected(4.0, push), rel=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @on_linux
 def test_models_used_alternately_are_not_recompiled_in_every_round(limit):
     systems = [class_of_cell(k)() for k in (4.0, 5.0, 6.0)]

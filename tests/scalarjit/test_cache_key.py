@@ -349,9 +349,9 @@ def bytes_of(answer):
     return answer if isinstance(answer, str) else [np.asarray(x).tobytes() for x in jax.tree.leaves(answer)]
 
 
-@pytest.mark.slow_cases(all_but=["orientations", "symbolic.equations"])
+@pytest.mark.weekly_cases(all_but=["orientations", "symbolic.equations"])
 @pytest.mark.parametrize(
-    "name", [*QUESTIONS, *(pytest.param(name, marks=pytest.mark.slow) for name in QUESTIONS_THAT_COMPILE)]
+    "name", [*QUESTIONS, *(pytest.param(name, marks=pytest.mark.weekly) for name in QUESTIONS_THAT_COMPILE)]
 )
 def test_every_public_function_detects_a_changed_global(name, monkeypatch):
     ask = (QUESTIONS | QUESTIONS_THAT_COMPILE)[name]
@@ -424,8 +424,8 @@ class Walled(Still):
         return {"wall": q[0] - 0.52}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("derivative", [pytest.param(jax.jacrev, marks=pytest.mark.slow), jax.jacfwd])
+@pytest.mark.weekly
+@pytest.mark.parametrize("derivative", [pytest.param(jax.jacrev, marks=pytest.mark.weekly), jax.jacfwd])
 def test_values_captured_by_an_input_function_are_differentiable(derivative):
     start = jk.State(np.array([0.5]), np.array([0.3]))
     given = lambda k: jk.simulate(Walled(), start, TS, {"push": k}, **SHORT)["x"]  # noqa: E731
@@ -481,7 +481,7 @@ class Holder(eqx.Module):
         return self.gain * self.f(t, state)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_sweeps_fits_linear_models_and_forces_detect_changes(monkeypatch):
     table = {"mass": np.array([1.0, 2.0])}
     trial = jk.fit.Trial(TS, {"x": fall(1.62) * (TS / TS[-1]) ** 2}, sigma=1.0)

@@ -105,7 +105,7 @@ print("right")
 """
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_without_internals_of_jax_results_are_correct():
     run = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, timeout=300, check=False)
     assert run.stdout.strip() == "right", run.stderr[-2000:]

@@ -112,7 +112,7 @@ def first(cache, python):
     return python(f"jk.configure(cache={str(cache)!r})\n" + RIDE).stdout.splitlines()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_configure_prints_a_summary(first, cache):
     assert first[0] == f"jaxkane: float64, {KERNELS}"
     assert first[1].startswith(f"  Compiled programs are stored in {cache} (none yet)")
@@ -131,7 +131,7 @@ def test_compiled_simulations_are_reused_by_the_next_process(first, cache, pytho
     assert len(second) == 1  # and nothing else was printed
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_exceptions_are_raised_with_a_cache(cache, python):
     python(f"jk.configure(cache={str(cache)!r}, verbose=False)\n" + REFUSALS)
 

@@ -61,7 +61,7 @@ def by_plain_jax(name):
     return jax.jit(TRANSFORMATIONS[name](plain))(*ARGUMENTS)
 
 
-@pytest.mark.slow_cases(all_but=["native-jit-*", "native-eager-itself", "XLA-jit-itself", "XLA-jit-batch"])
+@pytest.mark.weekly_cases(all_but=["native-jit-*", "native-eager-itself", "XLA-jit-itself", "XLA-jit-batch"])
 @pytest.mark.parametrize("name", TRANSFORMATIONS)
 @pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
 def test_results_agree_with_plain_jax(name, compiled, kernels):
@@ -224,7 +224,7 @@ print("alive")
 """
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_unusual_programs_do_not_crash_the_process():
     run = subprocess.run([sys.executable, "-c", CRASHES], capture_output=True, text=True, timeout=300, check=False)
     assert run.stdout.strip() == "alive", run.stderr[-2000:]
@@ -337,7 +337,7 @@ def test_products_of_small_matrices_are_expanded_to_scalars():
     np.testing.assert_allclose(jax.jacfwd(lambda x: ScalarFunction(f)(ball, x))(x), exact / 0.4, rtol=1e-13, atol=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.filterwarnings("error")
 def test_lapack_calls_of_the_library_cause_no_warning():
     def solved(x):
@@ -508,7 +508,7 @@ FWD, REV = jax.jacfwd, jax.jacrev
 NESTED = [(FWD,), (REV,), (FWD, FWD), (FWD, REV), (REV, FWD), (FWD, FWD, FWD)]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("modes", NESTED, ids=lambda modes: "-".join(mode.__name__ for mode in modes))
 @pytest.mark.parametrize("shape", [once, in_a_loop])
 def test_value_and_derivative_in_one_program_agree_with_plain_jax(shape, modes, native):
@@ -521,7 +521,7 @@ def test_value_and_derivative_in_one_program_agree_with_plain_jax(shape, modes, 
     np.testing.assert_allclose(jax.jit(jax.vmap(ours))(vs), jax.jit(jax.vmap(plain))(vs), rtol=1e-13, atol=1e-14)
 
 
-@pytest.mark.slow_cases(all_but=["XLA-once"])
+@pytest.mark.weekly_cases(all_but=["XLA-once"])
 @pytest.mark.parametrize("shape", [once, in_a_loop])
 def test_value_and_derivative_in_one_program_with_linearize_and_vmap(shape, kernels):
     ours, plain = shape(_pair.in_forward_mode), shape(_pair.__wrapped__)

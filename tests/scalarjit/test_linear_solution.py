@@ -96,7 +96,7 @@ def by_plain_jax(name, f):
     return jax.jit(TRANSFORMATIONS[name](f))(*ARGUMENTS)
 
 
-@pytest.mark.slow_cases(all_but=["native-a batch in another-*", "native-alone-linearize"])
+@pytest.mark.weekly_cases(all_but=["native-a batch in another-*", "native-alone-linearize"])
 @pytest.mark.parametrize("name", TRANSFORMATIONS)
 @pytest.mark.parametrize(
     ("f", "g"),

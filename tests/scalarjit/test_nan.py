@@ -39,7 +39,7 @@ def flat(tree):
 
 ORDERS = [modes for n in (1, 2) for modes in itertools.product((jax.jacfwd, jax.jacrev), repeat=n)]
 # Of second derivatives, forward over reverse and reverse over reverse are enough for a plain run.
-ORDERS = [pytest.param(m, marks=pytest.mark.slow) if m[1:] and m[0] is jax.jacfwd else m for m in ORDERS]
+ORDERS = [pytest.param(m, marks=pytest.mark.weekly) if m[1:] and m[0] is jax.jacfwd else m for m in ORDERS]
 named = lambda modes: "-".join(mode.__name__ for mode in modes)  # noqa: E731
 
 
@@ -49,7 +49,7 @@ def derivative(modes, f):
     return jax.jit(f)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("modes", ORDERS, ids=named)
 def test_derivatives_of_valid_rows_contain_no_nan(modes):
     a, b = P["a"], P["b"]
@@ -61,7 +61,7 @@ def test_derivatives_of_valid_rows_contain_no_nan(modes):
         np.testing.assert_allclose(second, exact, rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("modes", ORDERS, ids=named)
 def test_derivatives_of_missing_rows_are_nan(modes):
     """Also where the cotangents of two rows, or the tangents of two parameters, would cancel."""
@@ -83,7 +83,7 @@ def test_derivatives_by_unrelated_arguments_are_zero():
     np.testing.assert_array_equal(x_dot[:2], np.zeros((2, 2)))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_derivatives_by_one_part_of_the_origin(mode):
     """Single numbers are one part of an origin, each other array is one; those that do not move take no part."""
@@ -154,7 +154,7 @@ def test_shared_values_of_a_batch_within_a_loop(mask, batched):
     np.testing.assert_array_equal(np.isnan(slopes), [[batched == "origin", True]])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("mask", [nan_where, nan_derivative_where])
 def test_one_part_of_the_origin_in_a_batch_within_a_loop(mask):
     """To the second derivative, along the part that all members share, and along each member's own."""

@@ -23,7 +23,7 @@ from jaxkane._scalarjit.scalar_function import ScalarFunction
 LARGEST = 19
 
 
-SINGLE = pytest.param(jnp.float32, marks=pytest.mark.slow)
+SINGLE = pytest.param(jnp.float32, marks=pytest.mark.weekly)
 
 
 @pytest.fixture(scope="module", params=[jnp.float64, SINGLE], ids=["float64", "float32"])
@@ -38,9 +38,9 @@ def every_operation(x):
 
 
 # Whoever is told that something cannot be part of one function, or of a kernel, compares XLA with itself.
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.filterwarnings("error:.*its description uses")
-@pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.weekly)], indirect=True)
 def test_every_operation_agrees_with_xla(plainly, kernels):
     x, expected = plainly
     program = ScalarFunction(every_operation)
@@ -53,7 +53,7 @@ def test_every_operation_agrees_with_xla(plainly, kernels):
             jax.tree.map(check, found[name], jax.tree.map(lambda a, n=n: a[:n], expected[name]))
 
 
-@pytest.mark.slow_cases(all_but=["native-float32"])
+@pytest.mark.weekly_cases(all_but=["native-float32"])
 @pytest.mark.filterwarnings("error:.*its description uses")
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32], ids=["float64", "float32"])
 def test_nan_and_signed_zeros_agree_with_xla(dtype, kernels):
@@ -192,7 +192,7 @@ def close(a, b):
     np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.optimized
 @pytest.mark.usefixtures("native")
 def test_the_bicycle_and_its_derivatives_agree_with_xla(bicycle):
@@ -245,7 +245,7 @@ def test_single_precision_without_x64():
     assert ride.status == jk.Status.COMPLETED
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.usefixtures("native")
 def test_the_commands_of_the_readme_work(capsys, monkeypatch):
     """All backends agree, and the commands for a wrong kernel print what they promise. Tolerance: 1e-12."""

@@ -58,7 +58,7 @@ print("right")
 """
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_threads_that_compile_at_once():
     run = subprocess.run([sys.executable, "-c", THREADS], capture_output=True, text=True, timeout=300, check=False)
     assert run.stdout.strip() == "right", (run.returncode, run.stderr[-2000:])

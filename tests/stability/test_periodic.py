@@ -82,7 +82,7 @@ def numbers(mu, guess=NEAR):
     return jnp.stack([orbit["x"], orbit.period, orbit.multipliers[0].real])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_van_der_pol():
     orbit = periodic(WithSections(1.0), NEAR, section="top", period=6.6)
     np.testing.assert_allclose([orbit["x"], orbit.period], MU_1[:2], rtol=1e-11)
@@ -93,7 +93,7 @@ def test_van_der_pol():
     assert "period 6.663286859 s, stable, largest multiplier 0.000859695" in repr(orbit)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_of_the_van_der_pol_orbit_in_both_modes_and_a_batch():
     for mode in (jax.jacfwd, jax.jacrev):
         slopes = jax.jit(mode(numbers))(1.0)
@@ -103,7 +103,7 @@ def test_derivatives_of_the_van_der_pol_orbit_in_both_modes_and_a_batch():
     np.testing.assert_allclose(found[0, 1], 6.31844320345411, rtol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_periodic_without_section_and_without_period():
     orbit = periodic(VanDerPol(1.0), NEAR)
     ride = orbit.ride
@@ -113,7 +113,7 @@ def test_periodic_without_section_and_without_period():
     np.testing.assert_allclose(orbit.multipliers, MU_1[2:], rtol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_multiple_shooting_finds_an_unstable_orbit_and_tiny_multiplier():
     """With -mu, time runs backwards: the multiplier is 1e37, and a simulation of the orbit does not return to it."""
     orbit = periodic(WithSections(5.0), NEAR, section="top", segments=40)
@@ -143,7 +143,7 @@ def forced(frequency, xp=np):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_forced_linear_oscillator():
     orbit = periodic(Oscillator(), REST, **FORCED)
     found = [orbit["x"], orbit["v"], orbit.period, jnp.abs(orbit.multipliers[1])]
@@ -151,7 +151,7 @@ def test_a_forced_linear_oscillator():
     assert np.isnan(orbit.trivial_multiplier)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_of_a_forced_orbit_include_those_of_its_period():
     def found(frequency):
         orbit = periodic(Oscillator(frequency=frequency), REST, **FORCED)
@@ -161,7 +161,7 @@ def test_derivatives_of_a_forced_orbit_include_those_of_its_period():
     np.testing.assert_allclose(slopes, jax.jacfwd(lambda w: forced(w, jnp))(1.3), rtol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_folds_of_duffings_oscillator():
     """At a fold one multiplier is 1, and their product is exp(-damping * period) everywhere."""
     system = Oscillator(cubic=1.0, amplitude=0.3, frequency=0.6)
@@ -184,7 +184,7 @@ def period_of_a_pendulum(angle):
     return 4 / np.sqrt(9.81) * ellipk(np.sin(np.asarray(angle) / 2) ** 2)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_orbits_of_a_conservative_system_require_a_fixed_quantity():
     pendulum, released = Pendulum(), jk.State([1.0], [0.0])
     orbit = periodic(pendulum, released, hold=("angle",), period=2.1)
@@ -194,7 +194,7 @@ def test_orbits_of_a_conservative_system_require_a_fixed_quantity():
         periodic(pendulum, released, period=orbit.period)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_family_of_a_conservative_system():
     orbit = periodic(Pendulum(), jk.State([0.5], [0.0]), hold=("angle",), period=2.0)
     found = family(Pendulum(), orbit, towards={"angle": 1}, until={"angle": 2.5})
@@ -203,14 +203,14 @@ def test_a_family_of_a_conservative_system():
         family(Pendulum(), orbit, towards={"rate": 1})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_rotating_pendulum_advances_by_one_turn_per_period():
     turn = {"angle": 2 * np.pi}
     orbit = periodic(Pendulum(), jk.State([0.0], [8.0]), hold={"rate": 8.0}, advance=turn, period=1.0)
     np.testing.assert_allclose(orbit.period, 4 / 8 * ellipk(4 * 9.81 / 64), rtol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_hopf_point_starts_a_family_of_limit_cycles():
     system = Circle(0.001)
     orbit = limit_cycle(system, equilibrium(system), {"x": 0.1}, parameter="mu")
@@ -242,7 +242,7 @@ class Excited(jk.System):
         return jk.Force(first * motion.N.x, motion["first"]), jk.Force(second * motion.N.x, motion["second"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_neimark_sacker_point():
     start = periodic(Excited(), jk.State([1.0, 0.0], [0.0, 0.0]), period=6.3)
     (point,) = family(Excited(), start, towards={"damping": -1}, until={"damping": -0.1}).bifurcations
@@ -260,7 +260,7 @@ class Pushed(Excited):
         return jk.Force(first * motion.N.x, motion["first"]), jk.Force(second * motion.N.x, motion["second"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_cyclic_coordinate_drifts():
     orbit = periodic(Pushed(), jk.State([0.3, 5.0], [0.0, 0.2]), period=6.3)
     np.testing.assert_allclose(orbit.multipliers, [0.5334880910911032, np.exp(-0.4 * np.pi)], rtol=1e-10)
@@ -287,7 +287,7 @@ class Bead(jk.System):
         return jk.weight(motion, -9.81 * motion.N.y)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_constraints_add_no_floquet_multipliers():
     released = jk.assemble(Bead(), {"x": np.sin(1.0), "y": -np.cos(1.0)}, {"v": 0.0})
     orbit = periodic(Bead(), released, hold=("x",), period=2.1)
@@ -308,7 +308,7 @@ def wheel(half, slope):
     return jnp.stack([orbit["rate"], orbit.multipliers[0].real])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_rimless_wheel():
     orbit = periodic(RimlessWheel(), jk.State([-0.32, 0.0], [1.2]), section="step")
     np.testing.assert_allclose([orbit["rate"], orbit.multipliers[0].real], wheel_by_formula(0.4, 0.08), rtol=1e-11)
@@ -316,14 +316,14 @@ def test_rimless_wheel():
     np.testing.assert_allclose(orbit.ride["angle"][-1], 0.08 + 0.4, rtol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_of_the_rimless_wheel_agree_with_the_closed_form():
     found = jax.jit(jax.jacrev(wheel, argnums=(0, 1)))(0.4, 0.08)
     expected = jax.jacfwd(wheel_by_formula, argnums=(0, 1))(0.4, 0.08)
     np.testing.assert_allclose(jnp.stack(found), jnp.stack(expected), rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_simplest_walker():
     """Fixed point and multipliers by an integration in 30 digits for feet without mass: the value at zero of a parabola
     through those of three small masses. The third multiplier is zero, because the swing leg after the strike does not
@@ -343,7 +343,7 @@ def test_simplest_walker():
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_compass_gait_and_its_period_doubling_are_found():
     guess = jk.State([-0.22, 0.32, 0.0], [1.09, 0.38])
     orbit = periodic(CompassGait(), guess, section="heel_strike")
@@ -363,7 +363,7 @@ def gait_of_two_steps(slope):
     return periodic(CompassGait(slope=slope), guess, section="heel_strike", returns=2, period=1.5)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_two_step_gait_beyond_the_period_doubling():
     slope = np.deg2rad(4.5)
     orbit = gait_of_two_steps(slope)
@@ -380,7 +380,7 @@ def test_a_two_step_gait_beyond_the_period_doubling():
     np.testing.assert_allclose(slope_of_period, (high - low) / 2e-4, rtol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_multipliers_over_two_steps_are_the_squares_of_those_over_one():
     guess = jk.State([-0.22, 0.32, 0.0], [1.09, 0.38])
     one, two = (periodic(CompassGait(), guess, section="heel_strike", returns=k) for k in (1, 2))
@@ -416,7 +416,7 @@ def test_invalid_options_raise(options, message):
         periodic(WithSections(), NEAR, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_guesses_without_a_periodic_orbit_raise():
     with pytest.raises(ValueError, match="the guess is an equilibrium or a steady motion"):
         periodic(WithSections(), REST, section="top", period=6.6)

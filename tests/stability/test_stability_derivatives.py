@@ -35,11 +35,11 @@ WAYS = {"eig": lambda A: eig(A).values, "eigvals": eigvals}
 QUICK = {("eig", "reverse over reverse"), ("eigvals", "forward over reverse")}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("way", "mode"),
     [
-        pytest.param(way, mode, marks=[] if (way, mode) in QUICK else pytest.mark.slow, id=f"{way}-{mode}")
+        pytest.param(way, mode, marks=[] if (way, mode) in QUICK else pytest.mark.weekly, id=f"{way}-{mode}")
         for way in WAYS
         for mode in MODES
     ],
@@ -54,7 +54,7 @@ def test_second_derivatives_of_eigenvalues_agree_with_closed_forms(way, mode):
             np.testing.assert_allclose(x, y, rtol=rtol, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_third_derivatives_and_eigenvectors_agree_with_differences():
     """Of a general matrix: a parameter moves all of it; vectors as LAPACK scales them."""
     rtol = 1e-7
@@ -89,7 +89,7 @@ COALESCING = [jnp.array([[1.0, coupled, 0.2], [0.0, 1.0, 0.3], [0.0, 0.0, 3.0]])
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "mode", [m if m == "reverse over reverse" else pytest.param(m, marks=pytest.mark.slow) for m in MODES]
+    "mode", [m if m == "reverse over reverse" else pytest.param(m, marks=pytest.mark.weekly) for m in MODES]
 )
 def test_a_separate_eigenvalue_is_differentiable_while_others_coalesce(mode):
     rtol = 1e-11
@@ -108,7 +108,7 @@ def test_a_separate_eigenvalue_is_differentiable_while_others_coalesce(mode):
         assert np.isfinite(eig(A).condition[0])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_unread_coalescing_eigenvalues_add_no_nan_in_reverse_mode():
     hessian_of_first = jax.jit(jax.hessian(lambda A: eigvals(A).real[0]))
     assert all(np.isfinite(hessian_of_first(A)).all() for A in COALESCING)
@@ -156,7 +156,7 @@ def standing(length, torque):
 LIMIT = 2.0 * 9.81 * 0.5  # [N m] that weight can balance at 0.5 m
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_an_equilibrium_that_is_not_found_has_no_derivative(derivative):
     value_and_slope = jax.jit(lambda *at: (standing(*at), derivative(standing, (0, 1))(*at)))
@@ -190,7 +190,7 @@ def softest(length, damper=1.0):
     return critical_speeds(Pushed(length=length, damper=damper), jnp.linspace(-20.0, 5.0, 6), at)["mode 1"]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_missing_critical_value_has_nan_derivatives():
     """Hanging, a spring of -m g l makes it unstable; with a damper that drives it, nothing makes it stable."""
     both = jax.jit(jax.value_and_grad(softest))
@@ -198,7 +198,7 @@ def test_a_missing_critical_value_has_nan_derivatives():
     assert np.isnan(both(0.5, -1.0)).all()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_critical_value_at_a_given_value_and_next_to_an_invalid_value():
     """Exactly at a given value the sign is that of rounding; beside a value without a motion nothing can be told."""
     hanging = jk.State(jnp.zeros(1), jnp.zeros(1))
@@ -216,7 +216,7 @@ def sprung(system, spring):
     return dataclasses.replace(system, spring=spring), jk.State(jnp.zeros(1), jnp.zeros(1))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_critical_values_do_not_depend_on_the_order_of_the_given_values():
     up = critical_speeds(Pushed(), jnp.array([-20.0, -3.0, 5.0]), sprung)
     np.testing.assert_allclose(up.values, [-LIMIT], rtol=1e-12)
@@ -231,7 +231,7 @@ def test_critical_values_do_not_depend_on_the_order_of_the_given_values():
             function(Pushed(), jnp.zeros((1, 3)), sprung)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_stability_change_without_axis_crossing_causes_a_warning():
     """Without a damper it becomes neutral; with a spring that passes its limit flatly, the crossing is too flat."""
     with pytest.warns(UserWarning, match="falls by 1 more than the detected"):
@@ -242,7 +242,7 @@ def test_a_stability_change_without_axis_crossing_causes_a_warning():
         critical_speeds(Pushed(), jnp.array([-1.0, 0.0, 1.0]), flat)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_an_invalid_parameter_gives_a_nan_linear_model_under_jit():
     """A length that passes zero is no way to become stable: alone that is an error."""
     hanging = jk.State(jnp.zeros(1), jnp.zeros(1))
@@ -286,7 +286,7 @@ def test_linearize_rejects_states_that_violate_the_constraints():
     assert np.isnan(jax.jit(lambda q: linearize(rod, jk.State(q, off.u), steady=False).A)(off.q)).all()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_family_of_steady_motions_that_solves_for_an_input():
     """The torque that holds a pendulum, as it is led aside: one equation fewer than unknowns."""
     found = family(Pushed(), equilibrium(Pushed()), towards={"angle": 1}, until={"angle": 1.0}, find=("torque",))

@@ -109,7 +109,9 @@ def test_non_finite_matrices_do_not_affect_other_batch_members():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(3, marks=pytest.mark.slow), 7])
+@pytest.mark.parametrize(
+    "n", [pytest.param(1, marks=pytest.mark.weekly), 2, pytest.param(3, marks=pytest.mark.weekly), 7]
+)
 def test_eigenvalues_of_a_batch_equal_those_of_its_members(n):
     """Whether by QR or by LAPACK, with one leading axis or two, in single precision too."""
     A = np.random.default_rng(n).standard_normal((2, CHUNK + 4, n, n))
@@ -123,7 +125,7 @@ def test_eigenvalues_of_a_batch_equal_those_of_its_members(n):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.weekly)], indirect=True)
 def test_eigenvalue_order_is_the_same_in_batches_members_and_derivatives(kernels):
     """Pendulums without and with damping, whose real parts are rounding errors or not: the values of a batch are those
     of its members and those beside a derivative, each in its place, and so are those of `eig`."""
@@ -150,7 +152,7 @@ def bicycles():
     return jax.jit(jax.vmap(lambda v: linearize(BIKE, straight_ahead(BIKE, v), states=LATERAL).A))(speeds)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_eigenvalues_of_a_batch_of_bicycles_agree_with_the_literature(bicycles, kernels):
     """Meijaard et al. (2007), Table 2, among three hundred others; and beside the double root, as LAPACK's."""
     atol, A = 1e-11, bicycles
@@ -166,8 +168,8 @@ def test_eigenvalues_of_a_batch_of_bicycles_agree_with_the_literature(bicycles, 
         np.testing.assert_allclose((pair[1] - pair[0]) ** 2, (other[1] - other[0]) ** 2, atol=1e-13)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.weekly
+@pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.weekly)], indirect=True)
 def test_derivatives_of_eigvals_and_eig_agree(kernels):
     rtol = 1e-12
     A = np.random.default_rng(0).standard_normal((CHUNK, 3, 3))
@@ -200,7 +202,7 @@ print("done")
 """
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.parametrize("way", ["native", "LAPACK"])
 def test_programs_in_several_threads_do_not_deadlock(way):
     """jaxlib's batched LAPACK waits in XLA's threads for XLA's threads: each of these programs once hung for ever."""

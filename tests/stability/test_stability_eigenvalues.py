@@ -58,7 +58,7 @@ def found():
     return eigenvalues_of_the_benchmark()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.optimized
 @pytest.mark.published
 def test_eigenvalues_of_the_benchmark_at_eleven_speeds(published):
@@ -73,7 +73,7 @@ def test_eigenvalues_of_the_benchmark_at_eleven_speeds(published):
     published(MEIJAARD, "eigenvalues of the bicycle from 0 to 10 m/s, Table 2 [1/s]", theirs, ours, 1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.optimized
 @pytest.mark.published
 def test_matrices_of_the_benchmark(published):
@@ -83,7 +83,7 @@ def test_matrices_of_the_benchmark(published):
     published(MEIJAARD, "matrices of the linear bicycle", theirs, [getattr(found, name) for name in names], 1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_modes_are_followed_and_named(found):
     """Capsize and castering decay, castering ever faster; the weave swings from 0.68 m/s on."""
     assert found.modes == ("weave", "weave", "capsize", "castering")
@@ -117,7 +117,7 @@ def test_crossing_modes_keep_their_columns():
     np.testing.assert_array_equal(tracked, lam[:, columns])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_of_eigenvalues_with_respect_to_all_parameters():
     rtol = 1e-7
 
@@ -129,7 +129,7 @@ def test_derivatives_of_eigenvalues_with_respect_to_all_parameters():
     agree(jax.jit(jax.jacrev(parts))(BIKE), differences(parts, 4e-4), rtol)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_coalescing_modes_have_nan_derivatives():
     """Not a silent zero: NaN for the two that meet, numbers for the others, and words."""
 
@@ -158,7 +158,7 @@ def test_coalescing_modes_have_nan_derivatives():
 # -- critical speeds
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.optimized
 @pytest.mark.published
 def test_weave_and_capsize_speeds(published, recwarn):
@@ -174,7 +174,7 @@ def test_weave_and_capsize_speeds(published, recwarn):
     assert not recwarn  # as many eigenvalues come to grow as pass the axis
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_eigenvalues_of_riding_backwards_are_those_of_reversed_time():
     """Each mode keeps its name: it was castering that capsized."""
     speeds = jnp.linspace(1.0, 10.0, 19)
@@ -186,7 +186,7 @@ def test_eigenvalues_of_riding_backwards_are_those_of_reversed_time():
     np.testing.assert_allclose(found.values, [-CAPSIZE, -WEAVE], rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_of_critical_speeds_with_respect_to_all_parameters():
     rtol = 1e-7
 
@@ -281,7 +281,7 @@ def every_crossing_is_found(seed):
         assert abs(slope - by_hand) <= 1e-6 * abs(by_hand) or np.linalg.norm(y) > 1e6
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(st.integers(0, 2**20))
 def test_every_crossing_of_a_random_pencil_is_found(seed):
@@ -289,7 +289,7 @@ def test_every_crossing_of_a_random_pencil_is_found(seed):
     every_crossing_is_found(seed)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @settings(max_examples=500, deadline=None)
 @given(st.integers(0, 2**32))
 def test_every_crossing_of_many_random_pencils_is_found(seed):
@@ -398,7 +398,7 @@ def test_a_conjugate_pair_is_continued_by_a_conjugate_pair():
     assert _assigned(np.ones((4, 4)) - np.eye(4), last, values).tolist() == [0, 1, 2, 3]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.filterwarnings("ignore:the modes .* cannot be identified")
 def test_an_unnamed_conjugate_pair_of_a_motorcycle_is_one_mode():
     """Sharp's motorcycle in steps of 10 m/s: the weave and the wobble are pairs at all speeds, the rear tyre is not."""
@@ -412,7 +412,7 @@ def test_an_unnamed_conjugate_pair_of_a_motorcycle_is_one_mode():
     assert "mode 1" in found.modes
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 @pytest.mark.filterwarnings("ignore:the modes .* cannot be identified")
 def test_mode_names_of_a_motorcycle_at_one_speed_and_in_coarse_steps():
     """What is named weave, wobble or capsize is it, and no pair has two names."""
@@ -452,7 +452,7 @@ class Inverted(jk.System):
         return jk.weight(motion, -9.81 * motion.N.y), jk.Torque(torque * motion.N.z, motion["rod"])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_critical_values_of_any_parameter_of_any_system():
     """It stands from a spring of m g l on; d/dlength is m g."""
     rtol = 1e-12

@@ -61,7 +61,7 @@ def test_default_states_and_outputs_of_dependent_speeds():
     assert repr(model).startswith("LinearModel(states: roll, steer, roll_rate")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_dependent_coordinates_follow_the_constraint():
     """Hanging: y_ddot = -(g / l) y - (d / m) y_dot + push / m; and a position that is curved, by a function."""
     atol = 1e-14
@@ -203,7 +203,7 @@ def test_to_control_preserves_names_and_requires_python_control(at_four, monkeyp
 # -- a turn
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_linear_model_of_a_steady_turn_is_the_return_map():
     """Deviations after 0.5 s on a hands-free turn: expm(A t) against central differences of simulated rides."""
     atol = 1e-6

@@ -112,7 +112,7 @@ def precession(g, nutation, spin):
     return (-b - jnp.sqrt(b**2 - 4 * a * c)) / (2 * a)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_steady_precession_of_the_top_and_its_derivatives():
     rtol = 1e-11
 
@@ -141,7 +141,7 @@ def test_steady_precession_of_the_top_and_its_derivatives():
     np.testing.assert_allclose(curvature, second, rtol=1e-8, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_fast_and_slow_precession_belong_to_one_family():
     """Followed at one nutation, the spin falls to its least value, where the two meet, and rises again."""
     rtol = 1e-10
@@ -176,7 +176,7 @@ def test_equilibria():
     np.testing.assert_array_equal(at.u, 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_trim_torques_for_a_given_lean_are_found():
     """Trim: turning at 3 m/s with a lean of 0.2 rad and a steer of 0.1 rad needs a roll and a steer torque."""
     atol = 1e-11
@@ -188,7 +188,7 @@ def test_trim_torques_for_a_given_lean_are_found():
     assert float(turn["drive_torque"]) == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_insufficient_or_invalid_hold_conditions_raise():
     with pytest.raises(ValueError, match=r"family of dimension 1, along which roll, steer, .* change\. Hold 1 more"):
         steady_turn(BIKE, {"roll": 0.1, "steer": 0.05}, {"rear_wheel_rate": -20.0})
@@ -216,7 +216,7 @@ def beside_capsize():
     return steady_turn(BIKE, {"steer": 0.01}, {"rear_wheel_rate": -20.08}, hold={"roll": 0.05})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_forward_handlebar_family_extends_from_capsize_to_rest(beside_capsize):
     """From the capsize speed, over a largest lean, to rest with the frame upright and the wheel turned by 76.76 deg."""
     atol = 1e-11
@@ -244,7 +244,7 @@ def test_rest_with_a_turned_front_wheel_is_an_equilibrium():
     assert residuals(jax.tree.map(lambda x: x[None], at)) < 1e-11
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_reversed_handlebar_family_extends_from_capsize_to_flat_spinning():
     atol = 1e-11
     q = jk.assemble(BIKE, {"steer": np.pi + 0.01, "roll": 0.02}).q
@@ -257,7 +257,7 @@ def test_reversed_handlebar_family_extends_from_capsize_to_flat_spinning():
     assert float(turns["yaw_rate"][-1]) > 4.0
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_pivoting_family_connects_two_limits():
     """The third family: other speeds are independent, since the rear wheel's does not determine the yaw rate there."""
     atol = 1e-11
@@ -316,7 +316,7 @@ class Skate(jk.System):
         return {"along": now.acceleration(motion["P"]).dot(motion.N.x), "rate": u[0]}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_with_speeds_preserves_states_inputs_and_units():
     rtol = 1e-6
     skate, start = Skate(), {"x_dot": 1.0}
@@ -342,7 +342,7 @@ class Row(jk.System):
     dependent_speeds = property(lambda self: tuple(f"v{i + 1}" for i in range(self.n)))
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_derivatives_of_a_steady_turn_agree_with_differences():
     rtol = 1e-7
 
@@ -359,7 +359,7 @@ def test_derivatives_of_a_steady_turn_agree_with_differences():
         np.testing.assert_allclose(found[:, i], (8 * (a - b) - (c - d)) / (12 * h), rtol=rtol)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_invalid_families_raise_by_name(beside_capsize):
     with pytest.raises(ValueError, match=r"`towards` must be one name with .*; did you mean .steer."):
         family(BIKE, beside_capsize, towards={"speed": 1})

@@ -180,7 +180,7 @@ def test_a_linear_model_uses_the_time_of_its_steady_motion():
     assert float(linearize(system, still).A[1, 0]) == pytest.approx(-1.0, rel=1e-14)
 
 
-@pytest.mark.slow_cases(all_but=["100000.0-10000000.0-10000.0"])
+@pytest.mark.weekly_cases(all_but=["100000.0-10000000.0-10000.0"])
 @pytest.mark.parametrize(("length", "mass", "time"), [(1.0, 1.0, 1.0), (1e-6, 1e-9, 1e-3), (1e5, 1e7, 1e4)])
 def test_a_family_with_trim_does_not_depend_on_the_units(length, mass, time):
     """The torques that hold a pendulum from hanging to 1 rad: -m g l sin(angle) times 3/2 and 1/2 (uniform links)."""

@@ -30,7 +30,7 @@ def rides():
     return jk.sweep.sweep(RING, starts(6), TS)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_members_equal_separate_simulations(rides):
     state = starts(6)
     assert rides.q.shape == (6, 6, 2)
@@ -44,7 +44,7 @@ def test_members_equal_separate_simulations(rides):
             np.testing.assert_allclose(q, alone.end.q, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_chunks_on_a_gpu_are_larger_and_one_batch(monkeypatch):
     sizes, solve = [], Task.solve
 
@@ -63,7 +63,7 @@ def test_chunks_on_a_gpu_are_larger_and_one_batch(monkeypatch):
     np.testing.assert_allclose(there.q, here.q, rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_input_samples_with_different_times_and_missing_values():
     ts, values = np.array([0.1, 0.4, 0.8]), np.array([1.0, -2.0, 0.5])
     names = {"shoulder_torque": np.outer([1.0, np.nan], np.ones(6))}
@@ -89,7 +89,7 @@ def test_a_member_with_an_impossible_body_is_invalid():
     assert np.isnan(swept.q[1]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_parameters_states_and_inputs_together_and_in_chunks():
     n = 70
     pendulums = DoublePendulum(mass=np.linspace(1.0, 2.0, n), length=1.0)
@@ -137,7 +137,7 @@ def test_invalid_arguments_are_rejected():
         jk.sweep.sweep(Ring(), starts(5), TS, {"brake": np.zeros((5, 1))})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_member_has_the_discontinuities_of_its_input():
     """So that its audit integrates the work from jump to jump."""
     rtol, ts = 1e-6, np.linspace(0.0, 1.0, 41)

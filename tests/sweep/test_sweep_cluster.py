@@ -60,7 +60,7 @@ def fallen(module, client):
     return jk.sweep.sweep(module.Drop(), start, TS, table=table, client=client, **STEPS)["x"][:, -1]
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_worker_with_a_different_global_value_is_rejected(module, client, monkeypatch):
     assert cloudpickle.loads(cloudpickle.dumps(module.Drop)) is module.Drop  # travels by its name
     np.testing.assert_allclose(fallen(module, client), 9.81 / 2, rtol=1e-7)

@@ -122,7 +122,7 @@ def test_values_in_the_closure_of_a_callback_are_part_of_the_digest(tmp_path):
         run(tmp_path, inputs=inputs(2.0), **few)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_digest_is_equal_in_another_process_and_differs_between_programs():
     code = """
 import jax, jax.numpy as jnp, numpy as np, dataclasses, jaxkane as jk

@@ -84,13 +84,13 @@ def same(a, b):
         assert x.tobytes() == y.tobytes()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_folder_contains_every_chunk_and_does_not_change_results(rides, folder):
     assert [path.name for path in chunks(folder)] == [f"chunk-{i:08d}.npz" for i in range(0, 600, 32)]
     same(rides, run())
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_killed_sweep_is_resumed(rides, folder, script, tmp_path):
     process = subprocess.Popen([sys.executable, script, tmp_path / "sweep", tmp_path / "q.npy"])
     wait_for_chunks(tmp_path / "sweep", 3, process)
@@ -170,7 +170,7 @@ def test_a_folder_with_other_files_is_rejected(tmp_path):
         run(tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_two_devices_give_identical_results(rides, script, tmp_path):
     flags = os.environ.get("XLA_FLAGS", "")  # the same code, to the last bit
     two = {**os.environ, "XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count=2"}
@@ -178,7 +178,7 @@ def test_two_devices_give_identical_results(rides, script, tmp_path):
     np.testing.assert_array_equal(np.load(tmp_path / "q.npy"), rides.q)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_dependent_coordinates_are_assembled_on_two_devices():
     code = """
 import jaxkane as jk, numpy as np, jax
@@ -213,7 +213,7 @@ np.testing.assert_allclose(rides.q[:, -1], np.stack([np.cos(angle), np.sin(angle
     assert run.returncode == 0, run.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_sweep_completes_after_a_worker_is_killed(rides, folder, tmp_path):
     distributed = pytest.importorskip("distributed")
     workers = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "host": "127.0.0.1"}

@@ -73,7 +73,7 @@ def test_xarray(rides):
     assert (data["status"] == jk.Status.COMPLETED).all()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_table_with_labels_and_an_initial_state_function():
     table = {"rider": ["a", "b", "c"], "push": [0.1, 0.2, 0.3], "length": [1, 2, 3]}
 
@@ -100,7 +100,7 @@ def test_dependent_coordinates_are_assembled_for_each_parameter_value():
         np.testing.assert_allclose([y, x], [0.3, (length**2 - 0.3**2) ** 0.5], rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_dependent_coordinates_are_recomputed_for_each_member():
     bicycle = WhippleBicycle.benchmark()
     upright = jk.State(np.zeros(8), np.array([0.0, -15.0, 0.0]))
@@ -112,7 +112,7 @@ def test_dependent_coordinates_are_recomputed_for_each_member():
         jk.sweep.sweep(bicycle, upright, [0.0, 0.01], table={"pitch": [0.0, 0.1]})
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_sweeps_have_derivatives():
     rtol = 1e-6
 

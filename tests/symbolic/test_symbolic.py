@@ -29,7 +29,7 @@ def numbers_of(system):
 
 
 FAST = ["DoublePendulum", "SpinningTop", "Bob", "Odd"]
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in CATALOG if name not in FAST]
+SLOW = [pytest.param(name, marks=pytest.mark.weekly) for name in CATALOG if name not in FAST]
 
 
 @pytest.mark.slow
@@ -72,7 +72,7 @@ def test_symbolic_equations_agree_with_the_numerical_ones(name):
 
 PRINTED = ["DoublePendulum", "RotatingFrameAndBar", "SpinningTop"]
 LONG = ["SpatialDoublePendulum"]  # on which `simplify` takes minutes; `test_book` compares its numbers
-MORE = [pytest.param(name, marks=pytest.mark.slow) for name in test_book.PRINTED if name not in PRINTED + LONG]
+MORE = [pytest.param(name, marks=pytest.mark.weekly) for name in test_book.PRINTED if name not in PRINTED + LONG]
 
 
 def elementwise(f):
@@ -250,7 +250,7 @@ def test_a_linear_model_with_dependent_coordinates():
     assert_close(B, [[0.0], [0.5 * 16.0 / 25.0]], 1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_the_linear_model_of_the_bicycle_in_its_speed():
     rtol = 1e-12
     bicycle = CATALOG["WhippleBicycle"].example()

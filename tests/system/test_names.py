@@ -57,7 +57,7 @@ class Undeclared(OnACircle):
     dependent_coordinates = ()
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_dicts_are_accepted_for_coordinates_and_speeds():
     circle, at, moving = OnACircle(), {"y": -0.8, "x": 0.6}, {"x_dot": 0.5}
     q, u = np.array([0.6, -0.8]), np.array([0.5])

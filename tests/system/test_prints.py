@@ -102,7 +102,7 @@ def test_steady_motions_and_linear_models_print_values_and_eigenvalues():
     assert repr(batch).endswith("A: f64[3,2,2]")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_families_print_the_range_of_each_quantity():
     class Stiffening(Cart):
         def loads(self, t, q, u, motion, inputs):
@@ -114,7 +114,7 @@ def test_families_print_the_range_of_each_quantity():
     assert repr(turns.motion(-1)).startswith("SteadyMotion(x=0.5 m, x_dot=0 m/s, pull=4.125 N;")
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_eigenvalues_of_a_bicycle_print_the_first_and_the_last():
     bicycle = bicycles.Bicycle.benchmark()
     lines = repr(stability.eigenvalues(bicycle, np.linspace(0.0, 10.0, 41))).splitlines()

@@ -108,7 +108,7 @@ def test_load_cells_in_a_joint():
         jk.outputs(broken, 0.0, [0.0, 0.0], [0.0, 0.0])
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_a_mounting_rotation_is_differentiable_at_zero():
     def matrix(r):
         N, _ = jk.inertial()

@@ -179,7 +179,7 @@ def test_a_single_moment_of_inertia_about_another_point():
         jk.mass_matrix(Wheel(moment=0.1), *at)
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_conversion_to_degrees_follows_the_declared_units():
     class Cart(jk.System):
         coordinates, speeds, inputs = ("q0", "q1"), ("u0", "u1"), ("push",)

@@ -1,0 +1,332 @@
+"""Small mutations of the library, and the tests that find them. Run this script by hand; pytest does not collect it.
+
+    python tests/mutations.py                    all mutations, with the tests that are not slow
+    python tests/mutations.py --only 7 riders    mutations by their number or by a part of their name
+    python tests/mutations.py --all              also with the slow tests
+    python tests/mutations.py --list             the mutations, and whether each fits the source
+
+Each mutation changes one place in a copy of `src`: a sign, an index, a term, a comparison. Pytest then runs the nearest
+test files with this copy until a test fails. A mutation that survives shows a fault that no test would find. The old
+text of a mutation must occur once in its file. If the source has changed, change the mutation too.
+
+The script uses its own folder of compiled programs, or that of JAXKANE_TEST_CACHE. The first run compiles everything
+and takes longer.
+"""
+
+import argparse
+import concurrent.futures
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import psutil
+
+ROOT = Path(__file__).resolve().parents[1]
+CACHE = "JAXKANE_TEST_CACHE"
+LONGEST = 600.0  # s; a mutation can cause an endless loop
+
+
+class Mutation(NamedTuple):
+    """A change of one place of the library.
+
+    Fields:
+
+    - `name`: the fault, in words.
+    - `file`: the source file, in `src/jaxkane`.
+    - `old`, `new`: the text to replace, which must occur once, and its replacement.
+    - `near`: test files or folders in `tests` that are most likely to find the fault, the cheapest first, with spaces.
+    """
+
+    name: str
+    file: str
+    old: str
+    new: str
+    near: str
+
+
+# fmt: off
+MUTATIONS = (
+    # -- Kane's equations, constraints, assembly
+    Mutation("rates of momenta: the factors of omega x p are exchanged", "_kane/kanes_method.py",
+             "cross(omega, x)) for x_dot", "cross(x, omega)) for x_dot",
+             "catalog/test_laws.py"),
+    Mutation("least change of coordinates: the change is not scaled by the weights", "_kane/constraint_residuals.py",
+             "return (y.T @ (Q * weights[None])).T", "return (y.T @ Q).T",
+             "kane/test_constraints.py kane/test_units.py estimate/test_filter.py"),
+    Mutation("assembly: coordinates that the constraints do not determine are accepted", "_kane/consistent_state.py",
+             "converged = finite & is_met & implied_is_met & is_determined",
+             "converged = finite & is_met & implied_is_met",
+             "kane/test_assembly.py kane/test_checks.py kane/test_constraints.py joints"),
+    # -- Kinematics
+    Mutation("frames by a function: the angular velocity has the other sign", "_system/kinematics.py",
+             "0.5 * (skew[k, j] - skew[j, k])", "0.5 * (skew[j, k] - skew[k, j])",
+             "system/test_kinematics.py"),
+    # -- Jumps, held inputs, steps
+    Mutation("jumps: a sample at the time of a jump has the state before it", "_integrate/loop.py",
+             "cut = cut - 16 * rounding(", "cut = cut + 16 * rounding(",
+             "integrate/test_jumps.py integrate/test_contact_laws.py"),
+    Mutation("held inputs: the end of a fixed step uses the value before it", "_integrate/inputs.py",
+             "jnp.where(at > end - margin, end + margin, moved)", "jnp.where(at > end - margin, end - margin, moved)",
+             "integrate/test_zero_order_hold.py integrate/test_dense_samples.py integrate/test_steps.py"),
+    Mutation("step control: the way to a discontinuity is not divided in half", "_integrate/step_control.py",
+             "jnp.where(t1 >= stop, stop, jnp.minimum(t1, halfway))", "jnp.where(t1 >= stop, stop, t1)",
+             "integrate/test_steps.py integrate/test_dense_samples.py integrate/test_zero_order_hold.py"),
+    # -- Loads, sensors
+    Mutation("Bouc-Wen: the sign of the rate instead of that of rate times extension", "loads/_laws.py",
+             "along = share * jnp.sign(v * z)", "along = share * jnp.sign(v)",
+             "loads/test_elements.py"),
+    Mutation("sensors: the rounding of an encoder has a derivative", "sensors.py",
+             "jax.lax.stop_gradient(jnp.round(steps) - steps)", "(jnp.round(steps) - steps)",
+             "system/test_sensors.py"),
+    # -- Compiler
+    Mutation("derivatives of programs: one rule for operations with different parameters", "_scalarjit/jaxpr.py",
+             "key = (equation.primitive, parameters, differentiated, types, settings())",
+             "key = (equation.primitive, differentiated, types, settings())",
+             "scalarjit/test_function.py scalarjit/test_linear_solution.py catalog/test_derivatives.py"),
+    Mutation("cache key: methods of two objects have the same key", "_scalarjit/cache_key.py",
+             "return (id(x.__self__), id(x.__func__)), weakref", "return id(x.__func__), weakref",
+             "scalarjit/test_cache_key.py scalarjit/test_cache.py"),
+    Mutation("linear solves: an exchange of rows does not change the sign of the determinant",
+             "_scalarjit/components.py",
+             "_chosen(is_larger, mul(-1.0, det), det)", "_chosen(is_larger, det, det)",
+             "scalarjit/test_scalars_linear.py"),
+    # -- Fits
+    Mutation("priors: that of a trial is counted in each of its windows", "fit/problem/model.py",
+             "of_trial = jnp.where(window.first, b / n.trial_deviation, 0.0)", "of_trial = b / n.trial_deviation",
+             "fit/test_linear.py fit/test_groups.py fit/test_uncertainty.py fit/test_transcriptions.py"),
+    Mutation("statistics: the covariance takes priors for data", "fit/result/statistics.py",
+             "return variance * inverse + (1.0 - variance) * inverse @ of_priors @ inverse",
+             "return variance * inverse",
+             "fit/test_linear.py fit/test_uncertainty.py"),
+    Mutation("process noise: the information has no factor sqrt(2) for standard deviations", "fit/solve/kalman.py",
+             "2**0.5 * s_dot / s[:, None], priors_dot", "s_dot / s[:, None], priors_dot",
+             "fit/test_noise.py"),
+    Mutation("delays: the slope between unequal intervals has exchanged weights", "fit/problem/sensor_dynamics.py",
+             "(d[:-1] * h[1:] + d[1:] * h[:-1])", "(d[:-1] * h[:-1] + d[1:] * h[1:])",
+             "fit/test_delayed_signal.py"),
+    Mutation("groups: the likelihood of deviations is not restricted", "fit/solve/mixed_effects.py",
+             "nu = problem.size[0] - problem.size[1]\n\n    def criterion", "nu = problem.size[0]\n\n    def criterion",
+             "fit/test_groups.py"),
+    Mutation("cross-validation: the interval is that of a mean, not that of the next trial", "fit/result/validation.py",
+             "* (1 + 1 / K) ** 0.5", "* (1 / K) ** 0.5",
+             "fit/test_validation.py fit/test_coverage.py fit/test_linear.py"),
+    Mutation("forward selection: an estimate on the wrong side has a small p-value", "fit/extend/search.py",
+             "return score.p / 2 if inside else 1.0 - score.p / 2", "return score.p / 2",
+             "fit/test_forward_selection.py"),
+    # -- Filters, optimal control, stability
+    Mutation("Kalman filter: Potter's update divides by s^2", "estimate/_square_root.py",
+             "jnp.outer(moved, f) / (s * (s + r))", "jnp.outer(moved, f) / s**2",
+             "estimate/test_filter.py"),
+    Mutation("multipliers of collocation: those of fixed variables are zero", "collocation/_solve.py",
+             "of_bounds[fixed] = -lagrangian_gradient(program, solution)[fixed]", "of_bounds[fixed] = 0.0",
+             "collocation/test_known_solutions.py collocation/test_plans.py"),
+    Mutation("eigenvalues: the smaller root of a block suffers from cancellation", "stability/_matrix_eigenvalues.py",
+             "far = jnp.where(p < 0, p - root, p + root)", "far = p + root",
+             "stability/test_stability_eig.py stability/test_stability_eigenvalues.py"),
+    Mutation("equilibrium: a motion that belongs to a family is accepted", "stability/_steady.py",
+             "good = (r <= tolerance) & (slopes[-1] > tolerance)", "good = r <= tolerance",
+             "stability/test_stability_steady.py stability/test_stability_units.py"),
+    # -- Bicycles, import, export, sweeps
+    Mutation("riders: the product of inertia is moved with the other sign", "bicycles/_rider.py",
+             "Ixz - m * x * z", "Ixz + m * x * z",
+             "bicycles/test_bicycle_riders.py"),
+    Mutation("URDF: an inertia is turned backwards", "convert/_urdf_file.py",
+             "else R @ I @ R.T", "else R.T @ I @ R",
+             "convert/test_urdf.py"),
+    Mutation("C: the larger of NaN and a number is the number", "export/_source.py",
+             "return a != a || (a == b ? !signbit(a) : a > b) ? a : b;",
+             "return (a == b ? !signbit(a) : a > b) ? a : b;",
+             "export/test_export.py"),
+    Mutation("FMU: the state after a jump is not continued to the present time", "export/fmu_steps_template.c",
+             "m->now.y[i] = after[i] - shift * rate[i];", "m->now.y[i] = after[i];",
+             "export/test_fmu.py"),
+    Mutation("sweeps: new parameters do not change dependent coordinates", "sweep/_members.py",
+             "if system.dependent_coordinates and (q or parameters):", "if system.dependent_coordinates and q:",
+             "sweep/test_sweep_tables.py sweep/test_sweep.py"),
+    # -- Faults that survived all tests in an earlier release
+    Mutation("events: the last crossing of a cubic instead of the first", "_integrate/events.py",
+             "for i in reversed(range(3)):", "for i in range(3):",
+             "integrate/test_events.py"),
+    Mutation("tyres: the relaxation has the other sign of camber", "bicycles/_tyre_laws.py",
+             "lag = deflection / self.relaxation_length - self.equivalent(camber)",
+             "lag = deflection / self.relaxation_length + self.equivalent(camber)",
+             "bicycles/test_bicycle_tyres.py bicycles/test_bicycles.py"),
+    Mutation("common subexpressions: a - b is taken for b - a", "_scalarjit/jaxpr.py",
+             "*(_bits(x) if is_literal(x) else id(x) for x in xs), _parameters_of",
+             "*sorted((_bits(x) if is_literal(x) else id(x) for x in xs), "
+             "key=str if equation.primitive.name == 'sub' else lambda _: 0), _parameters_of",
+             "scalarjit/test_function.py scalarjit/test_linear_solution.py scalarjit/test_numpy_backend.py"),
+    Mutation("collocation: the range at an end replaces the bounds along the motion", "_collocate/transcription.py",
+             "lower[at], upper[at] = max(low, lower[at]), min(high, upper[at])", "lower[at], upper[at] = low, high",
+             "collocation"),
+    Mutation("collocation: states that no rate uses need not be periodic", "_collocate/transcription.py",
+             "if k >= n_q or k in used)", "if k in used)",
+             "collocation"),
+    Mutation("mesh: intervals are merged at the tolerance instead of a tenth of it", "collocation/_mesh.py",
+             "** (order + 1) < 0.1 * tolerance:", "** (order + 1) < tolerance:",
+             "collocation"),
+    Mutation("mesh: the error of the cost is not multiplied by the length of the interval", "collocation/_mesh.py",
+             "return np.abs(exact - coarse) * steps", "return np.abs(exact - coarse)",
+             "collocation"),
+    Mutation("orbits: the trivial multiplier compares with the segment before", "stability/_orbit_equations.py",
+             "after = jnp.roll(f, -1, axis=0)", "after = jnp.roll(f, 1, axis=0)",
+             "stability/test_periodic.py"),
+    Mutation("orbits: the first return may be far from the start", "stability/_periodic.py",
+             "found = [i for i in crossed if near[i]]", "found = crossed",
+             "stability/test_periodic.py"),
+    Mutation("contacts: the friction of two corners is not proportional to their limits", "_kane/unilateral.py",
+             "shares = jnp.clip(limits / jnp.where(largest > 0, largest, 1.0), 1e-8, 1.0)",
+             "shares = jnp.ones_like(limits)",
+             "kane/test_unilateral.py integrate/test_contact_systems.py integrate/test_contact_laws.py"),
+    Mutation("contacts: all sliding contacts stop when one does", "_integrate/contact_jumps.py",
+             "stops |= jnp.any(stops) & is_slow & (memory.states == SLIDES) & ~bearing",
+             "stops |= jnp.any(stops) & (memory.states == SLIDES) & ~bearing",
+             "integrate/test_contact_systems.py integrate/test_contact_laws.py integrate/test_contact_options.py"),
+    Mutation("contacts: sticking is limited by the kinetic friction", "_kane/unilateral.py",
+             "(force - self.slip.static * L[:, 0])", "(force - self.friction * L[:, 0])",
+             "kane/test_unilateral.py integrate/test_contact_laws.py integrate/test_contact_systems.py"),
+)
+# fmt: on
+
+
+def why_it_does_not_fit(mutation: Mutation, source: Path) -> str:
+    """Why a mutation of the library in `source` is not possible; an empty text if it is."""
+    path = source / "jaxkane" / mutation.file
+    if not path.is_file():
+        return f"there is no file {mutation.file}"
+    text = path.read_text(encoding="utf-8")
+    n = text.count(mutation.old)
+    if n != 1:
+        return f"its old text occurs {n} times in {mutation.file} instead of once. Change the mutation"
+    if path.suffix == ".py":
+        try:
+            compile(text.replace(mutation.old, mutation.new), str(path), "exec")
+        except SyntaxError as error:
+            return f"its new text is not valid: {error}"
+    missing = [name for name in mutation.near.split() if not (ROOT / "tests" / name).exists()]
+    return f"there are no tests {', '.join(missing)}" if missing else ""
+
+
+def environment_of(copy: Path, cache: str) -> dict[str, str]:
+    """The environment in which Python imports the library from a copy of `src`."""
+    return os.environ | {"PYTHONPATH": str(copy), CACHE: cache}
+
+
+def check_import(copy: Path, cache: str) -> None:
+    """Assert that the copy has precedence over the installed library."""
+    command = [sys.executable, "-c", "import jaxkane; print(jaxkane.__file__)"]
+    run = subprocess.run(command, env=environment_of(copy, cache), cwd=ROOT, capture_output=True, text=True, check=True)
+    file = run.stdout.split()[-1]
+    assert Path(file).is_relative_to(copy), f"jaxkane is imported from {file} instead of {copy}"
+
+
+class Outcome(NamedTuple):
+    """The result of the tests of one mutation.
+
+    - `kind`: "killed", "survived" or "not tested". `text`: by which test, or why.
+    - `seconds`: of processor time.
+    """
+
+    kind: str
+    text: str
+    seconds: float
+
+
+def tested(mutation: Mutation, tests: list[str], with_slow: bool, cache: str) -> Outcome:
+    """The outcome of the nearest tests with one mutation."""
+    with tempfile.TemporaryDirectory(prefix="jaxkane-mutation-") as folder:
+        copy = Path(folder) / "src"
+        # With the compiled modules: their times are those of the source files, so Python uses all but the mutated one.
+        shutil.copytree(ROOT / "src", copy)
+        path = copy / "jaxkane" / mutation.file
+        text = path.read_text(encoding="utf-8")
+        path.write_text(text.replace(mutation.old, mutation.new), encoding="utf-8")
+        options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "-m", "" if with_slow else "not slow"]
+        command = [sys.executable, "-m", "pytest", *options, *tests]
+        with open(Path(folder) / "output", "w+", encoding="utf-8") as output:
+            code, seconds = _finished(command, environment_of(copy, cache), output)
+            output.seek(0)
+            lines = output.read().splitlines()
+    last = lines[-1].strip("= ") if lines else "no output"
+    failed = [line.split(" - ")[0].split(" ", 1)[1] for line in lines if line.startswith(("FAILED ", "ERROR "))]
+    if code is None:
+        return Outcome("killed", f"by a time-out of {LONGEST:g} s", seconds)
+    if failed and "::" not in failed[0]:  # the tests cannot be imported, perhaps also without the mutation
+        return Outcome("not tested", f"({failed[0]} cannot be imported)", seconds)
+    if code not in (0, 5):  # 5: all tests are slow
+        return Outcome("killed", f"by {failed[0] if failed else f'the exit code {code} ({last})'}", seconds)
+    return Outcome("survived", f"({last})", seconds)
+
+
+def _finished(command: list[str], environment: dict[str, str], output) -> tuple[int | None, float]:
+    """The exit code of a process, None after a time-out, and the processor time of it and its children."""
+    process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
+    end, late = time.monotonic() + LONGEST, False
+    while True:
+        pid, status, usage = os.wait4(process.pid, os.WNOHANG)
+        if pid:
+            process.returncode = os.waitstatus_to_exitcode(status)
+            return None if late else process.returncode, usage.ru_utime + usage.ru_stime
+        if not late and time.monotonic() > end:
+            late, started = True, psutil.Process(process.pid)
+            for each in (*started.children(recursive=True), started):
+                each.kill()
+        time.sleep(0.1)
+
+
+def chosen(only: list[str] | None) -> list[tuple[int, Mutation]]:
+    """The mutations with their numbers, all or those with one of the numbers or a part of the names."""
+    numbered = [*enumerate(MUTATIONS, start=1)]
+    found = []
+    for each in only or ():
+        matches = [(i, m) for i, m in numbered if (str(i) == each if each.isdigit() else each in m.name)]
+        if not matches:
+            sys.exit(f"--only: no mutation is {each!r}. See --list.")
+        found += [match for match in matches if match not in found]
+    return numbered if only is None else found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", nargs="+", metavar="NAME_OR_NUMBER", help="mutations by number or part of the name")
+    parser.add_argument("--all", action="store_true", help="run the slow tests too")
+    parser.add_argument("--list", action="store_true", help="list the mutations and check that they fit the source")
+    parser.add_argument("--tests", nargs="+", metavar="PATH", help="run these tests instead of the nearest ones")
+    parser.add_argument("--jobs", type=int, default=1, help="number of mutations at a time")
+    options = parser.parse_args()
+    mutations = chosen(options.only)
+    wrong = [(i, m.name, why) for i, m in mutations if (why := why_it_does_not_fit(m, ROOT / "src"))]
+    if options.list:
+        for i, m in mutations:
+            print(f"{i:3} {m.name}\n    {m.file}; {m.near}")
+    for i, name, why in wrong:
+        print(f"Mutation {i} ({name}) does not fit: {why}.", file=sys.stderr)
+    if wrong or options.list:
+        sys.exit(1 if wrong else 0)
+    cache = os.environ.get(CACHE) or str(Path(tempfile.gettempdir()) / "jaxkane-mutation-programs")
+    with tempfile.TemporaryDirectory(prefix="jaxkane-mutation-") as folder:
+        shutil.copytree(ROOT / "src", Path(folder) / "src")
+        check_import(Path(folder) / "src", cache)
+    outcomes = []
+
+    def run(numbered: tuple[int, Mutation]) -> None:
+        i, mutation = numbered
+        tests = options.tests or [str(Path("tests") / name) for name in mutation.near.split()]
+        outcome = tested(mutation, tests, options.all, cache)
+        outcomes.append(outcome)
+        print(f"{i:3} {mutation.name}: {outcome.kind} {outcome.text}, {outcome.seconds:.0f} s", flush=True)
+
+    with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
+        list(pool.map(run, mutations))
+    kinds = [outcome.kind for outcome in outcomes]
+    counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in ("killed", "survived", "not tested"))
+    print(f"{counts}; {sum(outcome.seconds for outcome in outcomes):.0f} s of processor time")
+
+
+if __name__ == "__main__":
+    main()
