@@ -10,6 +10,7 @@ How to run them:
     JAXKANE_TEST_CACHE=0          keeps none, and leaves XLA as a user has it
     pytest -m ""                  the slow ones too
     pytest -m "slow and not weekly"  the slow ones that CI runs
+    JAXKANE_TEST_COSTS=FILE       writes the CPU seconds of each test
     JAXKANE_VALIDATION=docs/validation.md pytest -m published    writes the table of published figures
 """
 
@@ -21,6 +22,7 @@ import shutil
 import tempfile
 from typing import NamedTuple
 
+import costs
 import jax
 import numpy as np
 import psutil
@@ -58,6 +60,7 @@ def pytest_configure(config):
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")
     touched.watch(config)
+    costs.watch(config)
     # A trace makes a million small objects, most of which live on: to look through all of them again and again took a
     # tenth of the tests' time.
     gc.set_threshold(100_000, 50, 50)
