@@ -1,5 +1,6 @@
 """Optimal control problems whose solutions are known, from formulas and publications."""
 
+import dataclasses
 import math
 
 import jax.numpy as jnp
@@ -35,6 +36,57 @@ def test_least_energy_from_rest_to_rest():
     assert plan.multipliers["x"][-1] == pytest.approx(24.0, abs=1e-6)
     assert plan.multipliers["v"][-1] == pytest.approx(-12.0, abs=1e-6)
     np.testing.assert_allclose(plan.multipliers.costate["x"], -24.0, atol=1e-6)
+
+
+def test_a_range_at_the_end_does_not_replace_the_bounds_along_the_motion():
+    """The spring pulls the sled back, so the least effort has a negative velocity at the end unless a bound holds."""
+    atol = 1e-6
+    problem = Problem(
+        Sled(stiffness=4.0), 1.0, controls=["force"], cost=effort, start={"x": 1.0, "v": 0.0}, end={"v": (-1.0, 1.0)},
+        within={"v": (0.0, None)},
+    )  # fmt: skip
+    plan = solve(problem, intervals=5, tolerance=None)
+    assert plan.ok
+    assert np.min(plan["v"]) >= -atol
+
+
+class Metered(Sled):
+    """The impulse of the force is a state that no rate depends on."""
+
+    states = ("impulse",)
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return {"impulse": now["force"]}
+
+
+def test_states_that_no_rate_depends_on_are_periodic():
+    """The impulse has the same value at both ends, so the mean force is zero. Without this link the force would be 1,
+    and the cost 0."""
+    atol = 1e-8
+    problem = Problem(Metered(stiffness=4.0), 1.0, controls=["force"], cost=lambda t, now: (now["force"] - 1.0) ** 2)
+    plan = solve(Phases([problem], [None]), intervals=1, method="trapezoid", tolerance=None)
+    assert plan.ok
+    assert plan.cost == pytest.approx(1.0, abs=atol)
+    assert float(plan["impulse"][-1]) == pytest.approx(float(plan["impulse"][0]), abs=atol)
+
+
+def test_errors_of_the_cost_are_those_of_its_integral():
+    """Simpson's rule for the integral of t^4 over an interval of length h exceeds it by h^5 / 120. The sled stays at
+    rest, so its states have no errors. The error of each interval is relative to the whole cost."""
+    rtol = 1e-6
+    problem = Problem(
+        Sled(), 1.0, controls=["force"], cost=lambda t, now: t**4 + now["force"] ** 2, start=REST, end=REST
+    )
+    even = solve(problem, intervals=2, tolerance=None)
+    mesh = np.array([0.0, 0.2, 1.0])
+    errors = np.diff(mesh) ** 5 / 120
+    errors /= 1 / 5 + errors.sum()
+    plan = solve(
+        problem, dataclasses.replace(even, mesh=mesh), intervals=2, tolerance=1.1 * errors.max(), max_intervals=2
+    )
+    assert plan.ok, plan.reason
+    np.testing.assert_allclose(plan.mesh, mesh)
+    np.testing.assert_allclose(plan.errors, errors, rtol=rtol)
 
 
 @pytest.mark.slow

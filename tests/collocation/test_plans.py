@@ -13,6 +13,7 @@ from mechanisms import RodOnPin, Sled
 import jaxkane as jk
 from jaxkane.collocation import Phases, Problem, continuation, solve
 from jaxkane.collocation._guess import detours
+from jaxkane.collocation._mesh import refined
 from jaxkane.collocation._solve import _guessed
 from jaxkane.fit.inverse.kinematics import kinematic_samples
 
@@ -213,6 +214,15 @@ def test_copies_of_plans(plan):
         np.testing.assert_array_equal(other["x"], plan["x"])
         assert other.cost == plan.cost
         assert other.multipliers["x"][-1] == plan.multipliers["x"][-1]
+
+
+@pytest.mark.parametrize(("expected", "n_intervals"), [(0.3, 2), (0.09, 1)])
+def test_intervals_are_merged_below_a_tenth_of_the_tolerance(expected, n_intervals):
+    """The error of a method of order 4 grows with the fifth power of the length, so that of two equal intervals is 32
+    times that of each. `expected`: the error of the merged interval over the tolerance."""
+    tolerance, order = 1e-6, 4
+    errors = np.full(2, expected * tolerance / 2 ** (order + 1))
+    assert len(refined(np.array([0.0, 0.5, 1.0]), errors, tolerance, order)) - 1 == n_intervals
 
 
 @pytest.mark.weekly

@@ -9,7 +9,10 @@ from scipy.integrate import solve_ivp
 
 import jaxkane as jk
 from jaxkane._kane.api import checked_arrays
-from jaxkane._kane.unilateral import OPEN, SLIDES, STICKS, contact_impact, contact_impact_at
+from jaxkane._kane.right_hand_side import outputs_in_contact
+from jaxkane._kane.unilateral import OPEN, SLIDES, STICKS, Slip, contact_impact, contact_impact_at
+from jaxkane._system.system import packed
+from jaxkane.catalog import RockingBlock
 
 RTOL = 1e-12
 compiled = jax.jit(contact_impact)
@@ -81,6 +84,77 @@ def test_both_corners_of_a_wide_block_stick():
     np.testing.assert_allclose(result.impulses, [[0.1, -0.15], [0.5, -0.15]], atol=RTOL)
     assert result.states.tolist() == [STICKS, STICKS]
     assert not result.unique
+
+
+POINTS = np.eye(4), [[[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]]
+"""The mass matrix and the normal and tangential velocities of two independent points of 1 kg."""
+
+
+def test_one_point_stops_in_an_impact_and_the_other_slides_on():
+    """Both have the normal impulse 1. The first one needs the impulse 0.2 of friction to stop, the other one 2."""
+    u, result = strike(*POINTS, [-1.0, 0.2, -1.0, 2.0], 0.0, 0.5)
+    np.testing.assert_allclose(u, [0.0, 0.0, 0.0, 1.5], atol=RTOL)
+    np.testing.assert_allclose(result.impulses, [[1.0, -0.2], [1.0, -0.5]], atol=RTOL)
+    assert result.states.tolist() == [STICKS, SLIDES]
+
+
+def contact_forces(M, C, f, mu, static, slips=(0.0, 0.0)):
+    """The forces and accelerations of two contacts for the applied forces f. `slips`: signs, 0 for a contact at rest.
+
+    The equations are those of an impact, with accelerations instead of velocities.
+    """
+    C, slips = jnp.asarray(C), jnp.asarray(slips)
+    Y = jnp.linalg.solve(M, C.reshape(4, -1).T)
+    G, a = (C.reshape(4, -1) @ Y).reshape(2, 2, 2, 2), C @ jnp.linalg.solve(M, jnp.asarray(f))
+    both = jnp.ones(2, bool)
+    slip = Slip(slips != 0, slips[:, None], jnp.broadcast_to(jnp.asarray(static, float), (2,)), both)
+    return compiled(G, a, jnp.zeros(2), jnp.full(2, mu), both, slip=slip)
+
+
+def test_friction_of_two_corners_is_proportional_to_their_limits():
+    """A block at rest is pushed at its mass centre. Moments about it: (N_right - N_left) b = F h."""
+    b, h, weight, push, static = 0.6, 0.3, 10.0, 2.0, np.array([0.5, 0.8])
+    result = contact_forces(*block(b, h), [push, -weight, 0.0], 0.5, static)
+    normal = 0.5 * (weight + np.array([-1.0, 1.0]) * push * h / b)
+    limits = static * normal
+    np.testing.assert_allclose(result.impulses, np.stack([normal, -push * limits / limits.sum()], axis=1), rtol=RTOL)
+    assert result.states.tolist() == [STICKS, STICKS]
+
+
+class PushedBlock(RockingBlock):
+    """A horizontal force acts on its mass centre."""
+
+    inputs = ("push",)
+
+    def loads(self, t, q, u, motion, inputs):
+        N = motion.N
+        return jk.weight(motion, -self.gravity * N.y), jk.Force(inputs["push"] * N.x, motion["block"])
+
+
+def test_friction_of_both_corners_of_a_block_system_is_proportional_to_their_limits():
+    """The same in the equations of motion of a system, whose corners have the same coefficient of friction."""
+    b, h, weight, push = 0.2, 0.6, 9.81, 1.0
+    state = jk.State(jnp.array([0.0, h, 0.0]), jnp.zeros(3), None, jnp.array([STICKS, 0.0, STICKS, 0.0]))
+    outputs = outputs_in_contact(PushedBlock(friction=0.5), jnp.zeros(()), packed(state), {"push": jnp.array(push)})[1]
+    for name, side in (("left", -1.0), ("right", 1.0)):
+        normal = 0.5 * (weight + side * push * h / b)
+        np.testing.assert_allclose(outputs[f"{name}.normal"], normal, rtol=RTOL)
+        np.testing.assert_allclose(outputs[f"{name}.friction"], -push * normal / weight, rtol=RTOL)
+
+
+def test_a_contact_sticks_up_to_its_static_friction():
+    """Forces of 4 N and 6 N. Kinetic friction 3 N, static friction 5 N."""
+    result = contact_forces(*POINTS, [-10.0, 4.0, -10.0, 6.0], 0.3, 0.5)
+    np.testing.assert_allclose(result.impulses, [[10.0, -4.0], [10.0, -3.0]], rtol=RTOL)
+    np.testing.assert_allclose(result.velocities, [[0.0, 0.0], [0.0, 3.0]], atol=RTOL)
+    assert result.states.tolist() == [STICKS, SLIDES]
+
+
+def test_one_point_is_at_rest_and_the_other_slides_on():
+    """The friction of the sliding point is the kinetic one, although a smaller force acts on it."""
+    result = contact_forces(*POINTS, [-10.0, 2.0, -10.0, 2.0], 0.3, 0.5, slips=(0.0, 1.0))
+    np.testing.assert_allclose(result.impulses, [[10.0, -2.0], [10.0, -3.0]], rtol=RTOL)
+    assert result.states.tolist() == [STICKS, SLIDES]
 
 
 def test_an_open_contact_transmits_no_impulse():
