@@ -169,6 +169,7 @@ def test_unidentifiable_base_parameters_are_reported_and_keep_their_values():
     assert np.isinf(found.deviations[list(found.texts).index("link2.Izz")])
 
 
+@pytest.mark.slow
 def test_invalid_samples_are_rejected():
     truth, at = swings()
     first = lambda n: KinematicSamples(at.t[:n], at.q[:n], at.u[:n], at.u_dot[:n])  # noqa: E731

@@ -70,7 +70,6 @@ def test_equals_simulation_if_inputs_are_known():
         assert found.standard_errors[name] == pytest.approx(formal, rel=0.05)
 
 
-@pytest.mark.weekly
 def test_equals_the_kalman_filter_if_an_input_is_unknown():
     """A quarter of a standard error; standard errors within 15 %: observed and expected curvature differ."""
     trial = record(2, density=0.3)

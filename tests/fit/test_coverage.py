@@ -335,7 +335,6 @@ def test_the_bootstrap_of_many_trials_agrees_with_the_jackknife():
     assert "Bootstrap of 60 trials" in repr(draws)
 
 
-@pytest.mark.slow
 def test_intervals_by_held_out_scatter_equal_those_of_a_mean():
     """With one parameter and trials alike, each trial has an estimate of its own, and that of all is their mean."""
     rng, T = np.random.default_rng(6), 5

@@ -539,7 +539,6 @@ def test_a_pair_is_selected_if_neither_term_is_accepted_alone():
         forward_selection(loaded(trials[:1]), "damping", exchange=True)
 
 
-@pytest.mark.weekly
 def test_a_parameter_with_a_lower_bound_has_a_one_sided_test():
     before = loaded(carts(lambda x, v: 0.006 * v, sigma=0.02))
     both = row_of(forward_selection(before, "damping", refits=0), "damping")
@@ -551,6 +550,7 @@ def test_a_parameter_with_a_lower_bound_has_a_one_sided_test():
     assert other.bound_violations
 
 
+@pytest.mark.slow
 def test_trials_are_held_out_by_label():
     """A cubic spring stands in for drag as long as all amplitudes are alike."""
     trials = carts(lambda x, v: 0.5 * v, n=6, size=lambda i: 1.0 + i % 2, amplitude=lambda i: 1 + i % 2)

@@ -67,7 +67,6 @@ def mixed():
     return trials, fit(Track(), trials, (Free("gain", each="rider", prior="normal"), "drift"), **EXACT)
 
 
-@pytest.mark.weekly
 def test_a_distribution_over_groups_maximizes_the_restricted_likelihood(mixed):
     trials, found = mixed
     best = optimize.minimize_scalar(

@@ -132,7 +132,6 @@ def test_the_likelihood_equals_that_of_the_linear_gaussian_model(case):
     np.testing.assert_allclose(slopes, differences, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.weekly
 def test_the_information_matrix_is_the_fisher_information_on_average(case):
     """1/2 tr (C^-1 dC C^-1 dC) + dm^T C^-1 dm, of all measurements at once."""
     _, y, problem = case

@@ -174,6 +174,7 @@ BY_MU_V_W = {
 
 
 @pytest.mark.weekly_cases("sphere")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", BACKSPIN)
 def test_a_ball_with_backspin_slides_and_then_rolls(kind):
     atol, slope_atol = 1e-10, 1e-8

@@ -110,7 +110,6 @@ def test_a_diffrax_controller_still_locates_events():
     assert float(ride.t_end) == pytest.approx(3.0, abs=1e-9)
 
 
-@pytest.mark.slow
 def test_ode_term_can_be_passed_to_diffrax():
     system, state = jk.catalog.DoublePendulum(), jk.State(jnp.array([1.0, -0.5]), jnp.zeros(2))
     term, args = jk.ode_term(system, {"elbow_torque": lambda t, s: 0.3 * jnp.sin(t)})

@@ -262,7 +262,6 @@ def test_results_are_differentiable_by_the_first_and_last_time(jacobian):
     np.testing.assert_allclose(slopes[:, 0], -u_end, rtol=1e-6)  # where nothing depends on the time itself
 
 
-@pytest.mark.slow
 def test_a_step_ends_at_a_discontinuity_or_halfway_to_it():
     stops = Discontinuities(jnp.array([0.5, 1.0]), jumps=False, restart=False)
     for length in (0.1, 0.3, 0.5 - 1e-9, 0.5, 0.7, 1.2):

@@ -50,7 +50,6 @@ def test_the_solution_and_its_derivative_by_a_delay_are_exact():
     assert float(reverse) == pytest.approx(float(slope[-1]), rel=1e-9)
 
 
-@pytest.mark.weekly
 def test_fixed_steps_that_end_at_the_samples_are_exact():
     push = jk.Samples(ts, values, zero_order_hold=True)
     ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())

@@ -91,7 +91,6 @@ def test_omitted_coordinates_are_solved_for():
     np.testing.assert_array_equal(jk.assemble(OnACircle(), {"x": 0.6, "y": 0.8}, free=()).q, [0.6, 0.8])
 
 
-@pytest.mark.weekly
 @pytest.mark.parametrize("given", [{"x": 2.0}, {"x": 1.0}])  # no such place; a place where y has no derivative
 def test_derivatives_are_nan_if_assembly_fails(given):
     found = jax.jit(lambda x: jk.assemble(OnACircle(), {"x": x}).q[1])

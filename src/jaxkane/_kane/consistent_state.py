@@ -59,7 +59,7 @@ class AssemblyProblem(NamedTuple):
         quaternions = euler_parameters(system) if isinstance(q, Mapping) else []
         guess = {names[four[3]]: 1.0 for four in quaternions if names[four[3]] not in named}
         if free is not None:
-            free = as_names(free)
+            free = as_names(free, "free")
             refuse_unknown(free, names, f"{type(system).__name__} has no coordinate", "it has")
             return cls(tuple(c for c in names if c in free), named, guess, lenient=True)
         left_out = [c for c in names if c not in named]
@@ -371,7 +371,7 @@ def assemble(
     check_is_system(system)
     name = type(system).__name__
     check_time(name, t)
-    problem, touching = AssemblyProblem.of(system, q, free), as_names(touching)
+    problem, touching = AssemblyProblem.of(system, q, free), as_names(touching, "touching")
     if touching:
         problem = problem.for_contacts(system, q, free)
     q0 = as_array(problem.guess | dict(q) if isinstance(q, Mapping) else q, system.coordinates, f"{name}: q")

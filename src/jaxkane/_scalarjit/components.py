@@ -75,7 +75,11 @@ def several(values: PyTree, n: int, what: str) -> tuple[Any, ...]:
 
 def positive(value: Component, what: str) -> Component:
     """`value`. **Raises:** `ValueError` for a concrete number that is not positive."""
-    if is_exact(component(value)) and not value > 0:
+    try:
+        number = component(value)
+    except TypeError as error:
+        raise TypeError(f"{what} must be one number{str(error).partition('one number')[2]}") from None
+    if is_exact(number) and not value > 0:
         raise ValueError(f"{what} must be positive, got {value}.")
     return value
 

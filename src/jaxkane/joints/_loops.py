@@ -75,7 +75,7 @@ def _checked_choices(structure: Structure, choices: LoopChoices) -> LoopChoices:
         wrong = [name for name in names if name not in known]
         if wrong:
             raise ValueError(f"`{what}`: " + str(not_there(wrong[0], known, kind).args[0]))
-    dependent = None if choices.dependent is None else as_names(choices.dependent)
+    dependent = None if choices.dependent is None else as_names(choices.dependent, "dependent")
     both = [name for name in dependent or () if name in choices.independent]
     if both:
         raise ValueError(f"`dependent` and `independent` both name {both[0]!r}. Name it in one of them.")

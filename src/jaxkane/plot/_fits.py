@@ -48,7 +48,7 @@ def fits(
     else:
         chosen = [_number(names, trial) for trial in ([trials] if isinstance(trials, (str, int)) else trials)]
     all_channels = list(fit.problem.channels)
-    channels = all_channels if channels is None else list(as_names(channels))
+    channels = all_channels if channels is None else list(as_names(channels, "channels"))
     refuse_unknown(channels, all_channels, "fits: the fit has no channel")
     if not channels:
         raise ValueError(f"fits: `channels` is empty; {hint([], all_channels)}")
@@ -128,7 +128,7 @@ def residuals(
     """
     names = list(fit.trial_names)
     chosen = names if trials is None else [names[_number(names, trial)] for trial in trials]
-    channels = list(fit.problem.channels) if channels is None else list(as_names(channels))
+    channels = list(fit.problem.channels) if channels is None else list(as_names(channels, "channels"))
     refuse_unknown(channels, fit.problem.channels, "residuals: the fit has no channel")
     quantity, every = _quantity(fit, over), fit.residuals
     axes = panels(axes, len(channels), size=(6.4, 1.9), sharex=True)

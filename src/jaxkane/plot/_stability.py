@@ -42,7 +42,7 @@ def mode_shapes(
     **Returns:** the axes (n_drawn,).
     """
     lam, X, labels, names, where = _one_point(eigenvalues, vectors, states, at, modes)
-    chosen = labels if only is None else as_names(only)
+    chosen = labels if only is None else as_names(only, "only")
     refuse_unknown(chosen, labels, "mode_shapes: the model has no state")
     rows = [i for i, state in enumerate(labels) if state in chosen]
     drawn = [k for k in range(len(lam)) if lam[k].imag >= -1e-9 * abs(lam[k])]
@@ -88,8 +88,8 @@ def _one_point(model: Any, vectors: Any, states: Any, at: float | None, modes: A
         raise ValueError(
             f"mode_shapes: vectors must be (n_states, n) for eigenvalues (n,), got {X.shape} and {lam.shape}."
         )
-    states = [f"state {i + 1}" for i in range(X.shape[0])] if states is None else list(as_names(states))
-    names = [""] * len(lam) if modes is None else list(as_names(modes))
+    states = [f"state {i + 1}" for i in range(X.shape[0])] if states is None else list(as_names(states, "states"))
+    names = [""] * len(lam) if modes is None else list(as_names(modes, "modes"))
     if len(states) != X.shape[0] or len(names) != len(lam):
         raise ValueError(
             f"mode_shapes: got {len(states)} states and {len(names)} names of modes for vectors of shape {X.shape}. "
@@ -263,7 +263,7 @@ def _table(values: Any, eigenvalues: Any, modes: Sequence[str] | None) -> tuple[
         raise ValueError(
             "All eigenvalues are NaN, because no steady motion exists at these values. Choose other values."
         )
-    names = [""] * lam.shape[1] if modes is None else list(as_names(modes))
+    names = [""] * lam.shape[1] if modes is None else list(as_names(modes, "modes"))
     if len(names) != lam.shape[1]:
         raise ValueError(f"There are {lam.shape[1]} modes but {len(names)} names: {', '.join(names)}.")
     return x, lam, names

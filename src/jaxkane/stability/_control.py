@@ -33,7 +33,7 @@ def lqr(
     **Raises:** `ValueError` for wrong shapes, if these inputs cannot stabilize the model, and if the solution does not
     satisfy the equation.
     """
-    names = model.inputs if inputs is None else as_names(inputs)
+    names = model.inputs if inputs is None else as_names(inputs, "inputs")
     A = np.asarray(model.A, float)
     B = np.asarray(model.B, float)[:, [place(model.inputs, k, "input") for k in names]]
     Q, R = _weights(Q, len(A), "Q", "states"), _weights(R, B.shape[1], "R", "inputs")

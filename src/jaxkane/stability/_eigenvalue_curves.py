@@ -147,7 +147,7 @@ def names_of_modes(
     - `clear`, `number` (n,): as from `track_modes`.
     - `modes`: names given by the user, or None.
     """
-    names = as_names(modes) if modes is not None else None if groups is None else mode_names(states, groups)
+    names = as_names(modes, "modes") if modes is not None else None if groups is None else mode_names(states, groups)
     # Under a trace a name cannot depend on values, so each column has its own number.
     numbered = [f"mode {int(i) + 1}" for i in (number if is_concrete(number) else range(len(states)))]
     if names is not None and len(names) != len(states):
@@ -199,7 +199,7 @@ def motion_family(system: System, values: Numbers, motion: MotionAt, states: Seq
     if values.ndim > 1:
         raise ValueError(f"The values of the parameter must have the shape (m,), got {values.shape}.")
     groups = _Groups(getattr(system, "mode_groups", {})) if is_straight else None
-    return values, motion, None if states is None else as_names(states), groups
+    return values, motion, None if states is None else as_names(states, "states"), groups
 
 
 def parameter_label(system: System, motion: Any) -> str:

@@ -155,12 +155,12 @@ def linearize(
     check_system(system, t, q)
     origin = (system, t, q, u, x, w)
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q).shape[0]
-    dependent = system.dependent_coordinates if dependent is None else as_names(dependent)
+    dependent = system.dependent_coordinates if dependent is None else as_names(dependent, "dependent")
     check_dependent(system, dependent, n_h)
     if is_concrete(*origin):
         check_steady(*origin, steady)
     states = _state_names(system, states, dependent)
-    rows = states if outputs is None else as_names(outputs)
+    rows = states if outputs is None else as_names(outputs, "outputs")
     functions = dict(outputs) if isinstance(outputs, Mapping) else {}
     own = output_names(system) if outputs is not None else ()
     known = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states, *own)
@@ -202,7 +202,7 @@ def _state_names(system: System, states: Sequence[str] | None, dependent: tuple[
         cyclic = cyclic_coordinates(system)
         return (*(c for c in free if c not in cyclic), *system.speeds, *system.states)
     known = (*free, *system.speeds, *system.states)
-    states = as_names(states)
+    states = as_names(states, "states")
     unknown = [k for k in states if k not in known]
     if unknown:
         raise ValueError(
@@ -352,7 +352,7 @@ def with_speeds(system: System, speeds: Sequence[str]) -> System:
     **Raises:** `ValueError` for other names, or another number of them.
     """
     everything = (*system.speeds, *system.dependent_speeds)
-    speeds = as_names(speeds)
+    speeds = as_names(speeds, "speeds")
     if len(set(speeds)) != len(system.speeds) or not set(speeds) <= set(everything) or len(speeds) != len(set(speeds)):
         raise ValueError(
             f"{type(system).__name__}: `speeds` must name {len(system.speeds)} different speeds of "

@@ -226,7 +226,7 @@ def orbit_equations(
     name = f"periodic({type(system).__name__})"
     entries = (*system.coordinates, *system.speeds, *system.states)
     t = jnp.asarray(t, y.dtype)
-    values = dict(hold) if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold))
+    values = dict(hold) if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold, "hold"))
     refuse_unknown(values, entries, f"{name}: `hold` must name coordinates, independent speeds or states; unknown:")
     places = {key: entries.index(key) for key in values}
     targets = [y[i] if values[key] is None else jnp.asarray(values[key], y.dtype) for key, i in places.items()]

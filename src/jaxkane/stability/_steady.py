@@ -109,7 +109,7 @@ def equilibrium(
 
     **Raises:** `ValueError` as `steady_turn`.
     """
-    hold = hold if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold))
+    hold = hold if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold, "hold"))
     check_is_system(system)
     refuse_multipliers(system)
     return steady_turn(system, q, None, inputs, hold={**dict.fromkeys(system.speeds, 0.0), **hold}, find=find, t=t)
@@ -150,14 +150,14 @@ def steady_turn(
     name = type(system).__name__
     check_is_system(system)
     refuse_multipliers(system)
-    values = dict(hold) if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold))
+    values = dict(hold) if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold, "hold"))
     texts = [k for k, x in values.items() if not (x is None or is_one_number(x))]
     if texts:
         raise TypeError(f"{name}: {', '.join(texts)} in `hold` must be a number or None, got {values[texts[0]]!r}.")
     q = as_array({} if q is None else q, system.coordinates, f"{name}: q")
     u = as_array({} if u is None else u, system.speeds, f"{name}: u").astype(q.dtype)
     known = {k: jnp.asarray(x, q.dtype) for k, x in checked_values(system, inputs).items()}
-    find = as_names(find)
+    find = as_names(find, "find")
     unknown = sorted(set(find) - set(system.inputs))
     if unknown:
         raise ValueError(f"{name} has no input {', '.join(unknown)} to find; {hint(unknown, system.inputs, 'it has')}")
