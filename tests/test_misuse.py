@@ -245,9 +245,7 @@ def test_reading_a_structural_zero_raises_an_explanation():
     ("t", "error", "match"),
     [
         (float("nan"), ValueError, "the time t = nan is not finite"),
-        ("x", TypeError, r"the time `t` must be one number \[s\], got 'x'"),
         (None, TypeError, r"the time `t` must be one number \[s\], got None"),
-        (np.zeros(2), TypeError, r"the time `t` must be one number"),
         (1j, TypeError, r"the time `t` must be one number"),
     ],
 )

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from ._scalarjit.components import Component, positive
 from ._system.kinematics import Frame, Point, Vector
 from ._system.motion import Body, point_of
+from .loads._laws import check_numbers
 
 Named = dict[str, Component]
 
@@ -78,6 +79,7 @@ def encoder(
     - `resolution`: in the unit of the reading, positive. None is an ideal encoder. The derivative ignores the rounding.
         In a fit, omit it and use resolution / sqrt(12) as `sigma`.
     """
+    check_numbers("encoder", angle=angle, zero=zero, ratio=ratio)
     reading = ratio * (angle - zero)
     if resolution is None:
         return reading
@@ -120,6 +122,7 @@ def camera(
     - `focal_length`: in pixels.
     - `principal_point`: (u0, v0) in pixels.
     """
+    check_numbers("camera", focal_length=focal_length)
     x, y, z = point_of(point).position_from(center).components_in(frame)
     is_seen = jnp.asarray(z) > 0
     depth = jnp.where(is_seen, z, jnp.ones_like(z))
@@ -167,6 +170,7 @@ def low_pass(signal: Component, x: Any, time_constant: Component) -> tuple[tuple
     **Returns:** the rates of the states for `state_rates`, and the output for `outputs` or `loads`.
     """
     (x,) = _states(x, (1,), "low_pass")
+    check_numbers("low_pass", signal=signal, x=x)
     positive(time_constant, "low_pass: the time constant")
     return ((signal - x) / time_constant,), x
 
@@ -188,6 +192,7 @@ def low_pass_second_order(
     **Returns:** as `low_pass`.
     """
     x1, x2 = _states(x, (2,), "low_pass_second_order")
+    check_numbers("low_pass_second_order", signal=signal, x=x1, damping=damping)
     w = 2.0 * jnp.pi * positive(frequency, "low_pass_second_order: the frequency")
     return (x2, w * w * (signal - x1) - 2.0 * damping * w * x2), x1
 
@@ -210,6 +215,7 @@ def delayed(signal: Component, x: Any, delay: Component) -> tuple[tuple[Componen
     **Returns:** as `low_pass`.
     """
     x = _states(x, (1, 2), "delayed")
+    check_numbers("delayed", signal=signal, x=x[0])
     positive(delay, "delayed: the delay")
     if len(x) == 1:
         return (2.0 / delay * (signal - x[0]),), 2.0 * x[0] - signal

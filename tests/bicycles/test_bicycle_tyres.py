@@ -1,5 +1,7 @@
 """Tyres that slip: the limit of ideal rolling, Sharp's motorcycle, energy, forces in turns, rest, going backwards."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -292,6 +294,27 @@ def test_tyre_forces_balance_the_centripetal_acceleration_in_a_steady_turn():
     total = float(sum(masses.values()) * bicycle.g)
     np.testing.assert_allclose(-force[2], total, rtol=1e-10)
     np.testing.assert_allclose(force[:2] + tyres, needed, atol=1e-10 * total)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        LateralSlip(9000.0, 900.0, relaxation_length=0.1),
+        MagicFormula(12.0, 1.1, camber_ratio=0.1, relaxation_length=0.1),
+    ],
+    ids=["linear", "magic formula"],
+)
+def test_a_relaxed_force_approaches_the_force_without_relaxation(law):
+    """At the deflection whose rate is zero. Without relaxation, slip at small speeds is regularized, here by 2e-6."""
+    rtol = 3e-6
+    velocity, speed, camber, load = 0.2, 5.0, -0.3, 400.0
+    without = dataclasses.replace(law, relaxation_length=None)
+    # The rate is linear in the deflection.
+    at = [law.deflection_rate(velocity, speed, camber, deflection) for deflection in (0.0, 1.0)]
+    deflection = at[0] / (at[0] - at[1])
+    relaxed = law.force(law.slip(velocity, speed, camber, deflection), load, camber)
+    expected = without.force(without.slip(velocity, speed, camber, None), load, camber)
+    np.testing.assert_allclose(relaxed, expected, rtol=rtol)
 
 
 @pytest.mark.weekly

@@ -375,6 +375,17 @@ def test_an_event_without_speeds_does_not_evaluate_accelerations():
     assert events_of(Particle(ends="roof"), TS[0], start).read_rates
 
 
+@pytest.mark.parametrize(
+    ("sign", "way", "first"), [(1, 1, 0.2), (1, -1, 0.5), (1, 0, 0.2), (-1, -1, 0.2), (-1, 1, 0.5)]
+)
+def test_the_first_of_two_crossings_in_the_direction_of_a_cubic(sign, way, first):
+    """The roots 0.2, 0.5 and 0.8 are crossed in alternating directions."""
+    atol = 1e-3
+    p = sign * np.poly([0.2, 0.5, 0.8])
+    ends = p[3], p[2], p.sum(), 3 * p[0] + 2 * p[1] + p[2], float(way)
+    np.testing.assert_allclose(first_crossing(*(jnp.array([x]) for x in ends)), first, atol=atol)
+
+
 @pytest.mark.slow
 def test_the_first_crossing_of_cubics():
     """Against the roots of random cubics, among them those that start on zero, and those that come back at once."""

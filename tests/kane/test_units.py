@@ -147,7 +147,7 @@ def test_assembly_in_float32_does_not_depend_on_the_units(make):
         assert (best.rank, best.current) == (2, system.dependent_speeds)
 
 
-@pytest.mark.weekly
+@pytest.mark.slow_cases(all_but=["slider_crank-options1"])
 @pytest.mark.parametrize(
     ("make", "options"),
     [

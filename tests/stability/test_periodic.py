@@ -82,7 +82,7 @@ def numbers(mu, guess=NEAR):
     return jnp.stack([orbit["x"], orbit.period, orbit.multipliers[0].real])
 
 
-@pytest.mark.weekly
+@pytest.mark.slow
 def test_van_der_pol():
     orbit = periodic(WithSections(1.0), NEAR, section="top", period=6.6)
     np.testing.assert_allclose([orbit["x"], orbit.period], MU_1[:2], rtol=1e-11)
@@ -143,7 +143,7 @@ def forced(frequency, xp=np):
     )
 
 
-@pytest.mark.weekly
+@pytest.mark.slow
 def test_a_forced_linear_oscillator():
     orbit = periodic(Oscillator(), REST, **FORCED)
     found = [orbit["x"], orbit["v"], orbit.period, jnp.abs(orbit.multipliers[1])]
@@ -308,7 +308,7 @@ def wheel(half, slope):
     return jnp.stack([orbit["rate"], orbit.multipliers[0].real])
 
 
-@pytest.mark.weekly
+@pytest.mark.slow
 def test_rimless_wheel():
     orbit = periodic(RimlessWheel(), jk.State([-0.32, 0.0], [1.2]), section="step")
     np.testing.assert_allclose([orbit["rate"], orbit.multipliers[0].real], wheel_by_formula(0.4, 0.08), rtol=1e-11)
@@ -388,9 +388,38 @@ def test_multipliers_over_two_steps_are_the_squares_of_those_over_one():
     np.testing.assert_allclose(np.sort_complex(two.multipliers), np.sort_complex(one.multipliers**2), atol=1e-10)
 
 
-def test_returns_to_a_section_without_a_jump():
-    orbit = periodic(WithSections(1.0), NEAR, section="top", returns=2)
+def test_two_returns_to_a_section_in_five_segments():
+    orbit = periodic(WithSections(1.0), NEAR, section="top", returns=2, segments=5)
     np.testing.assert_allclose(orbit.period, 2.0 * MU_1[1], rtol=1e-11)
+    np.testing.assert_allclose(orbit.trivial_multiplier, 1.0, rtol=1e-9)
+
+
+class ThirdHarmonic(Excited):
+    """A limit cycle x = cos t excites a second oscillator, for which y = sin 3t."""
+
+    def loads(self, t, q, u, motion, inputs):
+        x, v, y, w = q["x"], u["v"], q["y"], u["w"]
+        first, second = v * (1.0 - x**2 - v**2) - x, 3.0 * (4.0 * x**3 - 3.0 * x) - w - 9.0 * y
+        return jk.Force(first * motion.N.x, motion["first"]), jk.Force(second * motion.N.x, motion["second"])
+
+
+@pytest.mark.slow
+def test_an_orbit_that_crosses_its_start_plane_three_times_per_period():
+    """The plane is orthogonal to the flow (0, 3, -1, 0). Two of the crossings are far from the start."""
+    orbit = periodic(ThirdHarmonic(), jk.State([1.0, 0.0], [0.0, 3.0]))
+    np.testing.assert_allclose(orbit.period, 2 * np.pi, rtol=1e-9)
+
+
+class Ratchet(Pushed):
+    """A coordinate that drifts, and an event that reads it in its condition only."""
+
+    def events(self, t, q, u):
+        return {"top": jk.falling(u["v"]), "tooth": jk.falling(u["v"] - 9.0, when=q["y"])}
+
+
+def test_a_coordinate_in_the_condition_of_an_event_must_be_periodic():
+    with pytest.raises(ValueError, match="y"):
+        periodic(Ratchet(), jk.State([0.3, 5.0], [0.0, 0.2]), section="top", period=6.3)
 
 
 # -- bad input

@@ -188,7 +188,7 @@ def test_trim_torques_for_a_given_lean_are_found():
     assert float(turn["drive_torque"]) == 0.0
 
 
-@pytest.mark.weekly
+@pytest.mark.slow
 def test_insufficient_or_invalid_hold_conditions_raise():
     with pytest.raises(ValueError, match=r"family of dimension 1, along which roll, steer, .* change\. Hold 1 more"):
         steady_turn(BIKE, {"roll": 0.1, "steer": 0.05}, {"rear_wheel_rate": -20.0})

@@ -218,7 +218,7 @@ class Problem:
             return {name: _pair(f"`controls` of {name!r}", b or (None, None)) for name, b in given.items()}
         if not isinstance(given, (str, Sequence)):
             raise TypeError(f"Problem: `controls` must be names, or a dict from names to bounds; got {given!r}.")
-        names = as_names(given)
+        names = as_names(given, "controls")
         if len(set(names)) < len(names):
             raise ValueError(f"Problem: `controls` contains a name twice: {', '.join(names)}.")
         return dict.fromkeys(names, (-math.inf, math.inf))

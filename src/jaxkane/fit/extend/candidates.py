@@ -92,7 +92,7 @@ def checked_terms(fit: Fit, candidates: Candidates, remove: str | Sequence[str] 
     """
     items, system = (candidates,) if isinstance(candidates, Candidate) else as_items(candidates), fit.problem.system
     candidates = tuple(_candidate(fit, item) for item in items)
-    remove = as_names(remove)
+    remove = as_names(remove, "remove")
     refuse_unknown(remove, fit.names, "`remove` contains unknown names:", "the fit has")
     base, removable = [], []
     for item in fit.problem.specification.free:

@@ -113,9 +113,9 @@ def checked_trials(system: System, trials: Sequence[Trial]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(channel for trial in trials for channel in trial.measured))
 
 
-def deviations_by_name(names: Names) -> dict[str, float | None]:
+def deviations_by_name(names: Names, argument: str = "unknown") -> dict[str, float | None]:
     """Each name with its standard deviation, or None."""
-    return dict(names) if isinstance(names, Mapping) else dict.fromkeys(as_names(names))
+    return dict(names) if isinstance(names, Mapping) else dict.fromkeys(as_names(names, argument))
 
 
 def checked_names(system: System, what: str, names: Any, known: Sequence[str]) -> dict[str, float]:
@@ -123,7 +123,7 @@ def checked_names(system: System, what: str, names: Any, known: Sequence[str]) -
 
     **Raises:** `ValueError` for an unknown name, or a standard deviation that is not positive.
     """
-    names = deviations_by_name(names)
+    names = deviations_by_name(names, what)
     wrong = [name for name in names if name not in known]
     if wrong:
         raise ValueError(
