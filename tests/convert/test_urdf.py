@@ -2,6 +2,7 @@
 
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -250,6 +251,7 @@ MIMIC = ONE.replace("</joint>", '<mimic joint="{}"/></joint>')
         (ONE.replace('value="2.0"', 'value="-2"'), r"link 'arm': the mass is -2.0 kg; it must not be negative"),
         (ONE.replace('value="2.0"', 'value="2,0"'), "must be a finite number"),
         (ONE.replace('<mass value="2.0"/>', ""), "link 'arm': <inertial> has no <mass>"),
+        (ONE.replace("</inertial>", "</inertial><inertial/>"), r"link 'arm': the link has 2 <inertial>\. Keep one"),
         (ONE.replace('iyy="0.03"', ""), "link 'arm': <inertia> has no iyy"),
         (ONE.replace('axis xyz="0 0 1"', 'axis xyz="0 0"'), "joint 'j': <axis xyz=\"0 0\"> must be 3 finite numbers"),
         (ONE.replace('axis xyz="0 0 1"', 'axis xyz="0 0 0"'), "joint 'j': the axis is zero"),
@@ -289,6 +291,38 @@ def test_meshes_comments_and_extensions_are_ignored():
     text = text.replace("visual>", "collision>").replace("</robot>", "<transmission/><gazebo/></robot>")
     with pytest.warns(UserWarning, match="contacts; transmissions; extensions of Gazebo"):
         jk.convert.from_urdf("\ufeff\n" + text)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace(
+            "</robot>", '<ros2_control><param min="${-2*pi}">${x}</param></ros2_control></robot>'
+        ),
+        lambda text: text.replace("<robot", '<robot xmlns="http://example.org"'),
+        lambda text: '\n<?xml version="1.0"?>\n' + text,
+    ],
+    ids=["macro in an element that is not read", "default namespace", "empty first line"],
+)
+def test_files_that_other_programs_read_are_read(change):
+    system, expected = jk.convert.from_urdf(change(ONE)), jk.convert.from_urdf(ONE)
+    assert jax.tree.leaves(system) == jax.tree.leaves(expected)
+    assert system.structure == expected.structure
+
+
+def test_a_gimbal_without_mass_has_moments_of_inertia():
+    """Accelerations by Pinocchio 4.1."""
+    inertial = '<inertial><mass value="{}"/><origin xyz="{}"/><inertia ixx="{}" iyy="{}" izz="{}"/></inertial>'
+    text = (
+        '<robot name="r"><link name="base"/>'
+        f'<link name="gimbal">{inertial.format(0, "0 0 0", 0.002, 0.003, 0.004)}</link>'
+        f'<link name="arm">{inertial.format(2, "0.1 0 0.2", 0.02, 0.03, 0.04)}</link>'
+        '<joint name="a" type="continuous"><parent link="base"/><child link="gimbal"/><axis xyz="0 1 0"/></joint>'
+        '<joint name="b" type="continuous"><parent link="gimbal"/><child link="arm"/><axis xyz="1 0 0"/></joint>'
+        "</robot>"
+    )
+    found = jk.accelerations(jk.convert.from_urdf(text), 0.0, [0.3, -0.4], [0.2, 0.5])
+    np.testing.assert_allclose(found, [22.516, -11.081], atol=5e-4)
 
 
 def test_a_urdf_file_is_read_and_its_names_are_converted(tmp_path):

@@ -18,6 +18,10 @@ from ._reading import check_distinct, without_dots
 
 Element = ElementTree.Element
 
+_XACRO = (
+    "The model contains macros of xacro. Expand them first: `xacro robot.urdf.xacro > robot.urdf`, "
+    "or `pip install xacro`."
+)
 KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 
 
@@ -95,24 +99,32 @@ def read_urdf(text: str) -> UrdfFile:
 
 
 def _robot(text: str) -> Element:
-    if re.search(r"<xacro:|\$\{", re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)):
-        raise ValueError(
-            "The model contains macros of xacro. Expand them first: `xacro robot.urdf.xacro > robot.urdf`, "
-            "or `pip install xacro`."
-        )
+    """The root element. Its tags have no namespaces."""
+    if "<xacro:" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
+        raise ValueError(_XACRO)
     try:
-        robot = ElementTree.fromstring(re.sub(r"<(/?)\w+:", r"<\1", text))  # extensions with an undeclared prefix
+        # Extensions may have an undeclared prefix.
+        robot = ElementTree.fromstring(re.sub(r"<(/?)\w+:", r"<\1", text.lstrip()))
     except ElementTree.ParseError as error:
         raise ValueError(f"The model is not a URDF: {error}. Check whether the file is complete.") from error
+    for element in robot.iter():
+        element.tag = element.tag.rpartition("}")[2]
     if robot.tag != "robot":
         raise ValueError(f"The model is not a URDF: its root must be <robot>, got <{robot.tag}>.")
+    # Other elements, such as those of ros2_control, are not read.
+    read = [x for part in (*robot.findall("link"), *robot.findall("joint")) for x in part.iter()]
+    if any("${" in value for x in (robot, *read) for value in x.attrib.values()):
+        raise ValueError(_XACRO)
     return robot
 
 
 def _inertial(link: Element, label: str) -> Inertial | None:
-    inertial = link.find("inertial")
-    if inertial is None:
+    found = link.findall("inertial")
+    if len(found) > 1:
+        raise ValueError(f"{label}: the link has {len(found)} <inertial>. Keep one.")
+    if not found:
         return None
+    inertial = found[0]
     mass, tensor = inertial.find("mass"), inertial.find("inertia")
     if mass is None or tensor is None:
         missing = "mass" if mass is None else "inertia"

@@ -280,9 +280,10 @@ def _link(link: Link, values: dict[str, Any]) -> LinkStructure:
             "(parent=None). For free motion relative to a moving link, chain three sliders and a ball joint."
         )
     if link.mass is not None:
-        values[f"mass.{link.name}"] = link.mass
-        values |= components(f"center.{link.name}", link.center)
-        values |= _moments(link)
+        moments = _moments(link)
+        if not (moments and is_structural_zero(link.mass)):  # a gimbal may have moments of inertia only
+            values[f"mass.{link.name}"] = link.mass
+        values |= components(f"center.{link.name}", link.center) | moments
     return LinkStructure(
         link.name, link.parent, _matrix(link.orientation, link.name), tuple(types), link.mass is not None
     )
