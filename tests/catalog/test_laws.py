@@ -9,7 +9,6 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import jaxkane as jk
-from jaxkane._kane.kanes_method import KaneEquations
 from jaxkane.catalog import CATALOG
 
 T = 0.3  # [s]: by then the engines of Example 5 have changed their speed
@@ -26,15 +25,18 @@ class Example:
         self.inputs = {name: float(x) for name, x in zip(self.system.inputs, INPUTS, strict=False)}
         self.at = (self.system, T, self.q, self.u)
         self.u_dot = jk.accelerations(*self.at, self.inputs)
-        self.q_dot = jnp.stack(KaneEquations(*self.at).q_dot)
+        self.q_dot = jk.coordinate_rates(*self.at)
 
     def along_motion(self, f):
         """f(t, q, u) and its time derivative."""
         return jax.jvp(f, (jnp.array(T), self.q, self.u), (jnp.array(1.0), self.q_dot, self.u_dot))
 
+    def all_speeds(self, t, q, u):
+        """The independent and the dependent speeds."""
+        return jnp.concatenate([u, jk.dependent_speeds(self.system, t, q, u)])
+
     def motion(self, t, q, u):
-        now = KaneEquations(self.system, t, q, u)
-        return now.motion(now.t, now.q, now.u_all)
+        return self.system.motion(t, q, self.all_speeds(t, q, u))
 
     def velocities(self, t, q, u):
         """(b, 2, 3) in N: of the mass centres, and angular."""
@@ -53,8 +55,10 @@ class Example:
 
     def loads(self, u, inputs):
         """Forces and torques (l, 3), and the velocities they work on (l, 3), in N."""
-        now = KaneEquations(self.system, T, self.q, u, inputs)
-        loads = now.loads(now.motion(now.t, now.q, now.u_all))
+        u_all, motion = self.all_speeds(T, self.q, u), self.motion(T, self.q, u)
+        values = dict.fromkeys(self.system.inputs, 0.0) | inputs
+        loads = self.system.loads(T, self.q, u_all, motion, values)
+        loads = jax.tree.leaves(loads, is_leaf=lambda x: isinstance(x, jk.Force | jk.Torque))
         if not loads:
             return jnp.zeros((0, 3)), jnp.zeros((0, 3))
         in_N = lambda x: x.to(x.frame.root)  # noqa: E731
@@ -85,15 +89,16 @@ def assert_close(a, b, rtol, scale=None):
 
 
 def test_the_example_state_satisfies_the_configuration_constraints(example):
-    system, q = example.system, KaneEquations(*example.at)
+    system, q = example.system, example.q
     assert len(example.entry.q) == len(system.coordinates)
     assert len(example.entry.u) == len(system.speeds)
-    assert_close(np.array([float(x) for x in q.configuration(T, q.q)]), 0.0, 1e-14, scale=1.0)
+    assert_close(np.array([float(x) for x in system.configuration_constraints(T, q)]), 0.0, 1e-14, scale=1.0)
 
 
 # Laws that only some entries can obey: those with constraints of the configuration, and with dependent speeds.
-CONSTRAINED = [k for k, entry in CATALOG.items() if len(entry.example().configuration_constraints(T, entry.q))]
-DEPENDENT = [k for k, entry in CATALOG.items() if entry.example().dependent_speeds]
+CLASSES = {name: getattr(jk.catalog, name) for name in CATALOG}
+CONSTRAINED = [k for k, x in CLASSES.items() if x.configuration_constraints is not jk.System.configuration_constraints]
+DEPENDENT = [k for k, x in CLASSES.items() if x.dependent_speeds]
 
 
 def test_the_entries_include_constrained_systems():
@@ -105,8 +110,8 @@ def test_the_entries_include_constrained_systems():
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_coordinate_rates_satisfy_the_configuration_constraints(name):
     example = _example(name)
-    now = KaneEquations(*example.at)
-    _, h_dot = example.along_motion(lambda t, q, u: jnp.stack(now.configuration(t, tuple(q))))
+    system = example.system
+    _, h_dot = example.along_motion(lambda t, q, u: jnp.stack([*system.configuration_constraints(t, q)]))
     assert_close(h_dot, 0.0, 1e-13, scale=np.abs(example.q_dot).max())
 
 
@@ -114,8 +119,8 @@ def test_coordinate_rates_satisfy_the_configuration_constraints(name):
 @pytest.mark.parametrize("name", DEPENDENT)
 def test_dependent_speeds_satisfy_the_constraints_and_match_their_accelerations(name):
     example = _example(name)
-    now = KaneEquations(*example.at)
-    assert_close(jnp.stack(now.residuals(now.t, now.q, now.u_all)), 0.0, 1e-13, scale=np.abs(now.u_all).max())
+    u_all, motion = example.all_speeds(*example.at[1:]), example.motion(*example.at[1:])
+    assert_close(jnp.stack([*motion.constraints]), 0.0, 1e-13, scale=np.abs(u_all).max())
     u_dep, u_dep_dot = example.along_motion(lambda t, q, u: jk.dependent_speeds(example.system, t, q, u))
     assert u_dep.shape == (len(example.system.dependent_speeds),)
     assert_close(jk.dependent_accelerations(*example.at, example.inputs), u_dep_dot, 1e-11)

@@ -24,7 +24,6 @@ from jaxkane.fit import (
     minimize,
     multi_start,
 )
-from jaxkane.fit._bicycle import bicycle_priors
 
 SIGMA = {"roll": 0.005, "steer": 0.005, "roll_rate": 0.03, "steer_rate": 0.05}
 
@@ -90,10 +89,14 @@ def test_estimated_bodies_of_a_bicycle_are_physically_possible(unstable):
 def test_priors_of_a_file(tmp_path):
     path = tmp_path / "Bicycle.txt"
     path.write_text("mB = 85.0+/-0.5\nzB = -0.9+/-0.0\n")
-    assert bicycle_priors(path) == {"mB": (85.0, 0.5)}
+    t = np.linspace(0.0, 1.0, 11)
+    ride = Trial(t, {"roll": 0.1 * t}, sigma=1.0, initial={"speed": 5.0})
+    options = {"priors": path, "simulation": Simulation(step=0.1)}
+    problem = bicycle_problem(ride, WhippleBicycle.benchmark(), ("mB", "zB"), **options)
+    assert dict(problem.specification.priors) == {"mB": (85.0, 0.5)}
     path.write_text("mB = 8_5.0+/-0.5\n")
     with pytest.raises(ValueError, match=r"line 1: 'mB = 8_5.*is not of the form"):
-        bicycle_priors(path)
+        bicycle_problem(ride, WhippleBicycle.benchmark(), ("mB", "zB"), **options)
 
 
 @pytest.fixture(scope="module")

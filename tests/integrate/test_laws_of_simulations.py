@@ -324,8 +324,8 @@ def test_results_do_not_depend_on_the_start_of_the_clock(name):
 
 UNITS = {
     "mm, t, ms": Units(1e3, 1e-3, 1e3),
-    "small numbers": Units(1e-6, 1e-3, 1e-6),
-    "large numbers": Units(1e6, 1e3, 1e6),
+    "short lengths": Units(1e-12, 1e-3, 1e3),
+    "long lengths": Units(1e9, 1e3, 1e-3),
 }
 
 

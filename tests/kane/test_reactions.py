@@ -8,7 +8,6 @@ from sympy_systems import FIGURES, FourBarLinkage, RollingDiscDependent
 
 import jaxkane as jk
 from jaxkane import constraint_forces, constraint_multipliers
-from jaxkane._kane.kanes_method import KaneEquations
 from jaxkane._kane.reactions import Reactions
 from jaxkane.catalog import CATALOG
 
@@ -19,8 +18,7 @@ def momentum_rate(system, q, u, inputs=None, bodies=slice(None)):
     """d/dt of the linear momentum (3,) of some bodies, in N, by differentiation along the motion."""
 
     def momentum(t, q, u):
-        now = KaneEquations(system, t, q, u)
-        motion = now.motion(now.t, now.q, now.u_all)
+        motion = system.motion(t, q, jnp.concatenate([u, jk.dependent_speeds(system, t, q, u)]))
         return sum(jnp.asarray(b.mass, float) * b.center.velocity.to(motion.N) for b in motion.bodies[bodies])
 
     u_dot = jk.accelerations(system, 0.0, q, u, inputs)

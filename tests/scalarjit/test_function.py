@@ -186,6 +186,13 @@ def test_common_subexpressions_and_unused_operations_are_removed():
     assert names.count("sin") == 1
 
 
+def test_operations_with_exchanged_operands_are_different():
+    f = ScalarFunction(lambda a, b: jnp.stack([a - b, b - a, a / b, b / a, jnp.arctan2(a, b), jnp.arctan2(b, a)]))
+    a, b = 1.0, 4.0
+    expected = [a - b, b - a, a / b, b / a, np.arctan2(a, b), np.arctan2(b, a)]
+    np.testing.assert_allclose(f(jnp.array(a), jnp.array(b)), expected, rtol=1e-14)
+
+
 def test_a_function_is_traced_once():
     calls = []
 

@@ -1,6 +1,7 @@
 """Linear models about steady motions: against the literature, closed forms, and the motion itself."""
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
 
@@ -225,13 +226,23 @@ def test_linear_model_of_a_steady_turn_is_the_return_map():
     np.testing.assert_allclose(np.stack(columns, axis=1), exact, atol=atol * np.abs(exact).max())
 
 
+@functools.cache
+def ahead():
+    """The bicycle at 4 m/s."""
+    return straight_ahead(BIKE, 4.0)
+
+
 CASES = {
-    "a class for a system": (lambda: linearize(type(BIKE), AHEAD), TypeError, "instance of a System"),
+    "a class for a system": (lambda: linearize(type(BIKE), ahead()), TypeError, "instance of a System"),
     "text for a motion": (lambda: linearize(BIKE, "ahead"), TypeError, "`motion` must be a State"),
     "another system's steady motion": (lambda: linearize(BIKE, AT_REST), ValueError, "belongs to another system"),
-    "a state named twice": (lambda: linearize(BIKE, AHEAD, states=("roll", "roll")), ValueError, "roll is named twice"),
+    "a state named twice": (
+        lambda: linearize(BIKE, ahead(), states=("roll", "roll")),
+        ValueError,
+        "roll is named twice",
+    ),
     "an output that is two numbers": (
-        lambda: linearize(BIKE, AHEAD, outputs={"both": lambda t, q, u: jnp.stack([q["roll"], q["steer"]])}),
+        lambda: linearize(BIKE, ahead(), outputs={"both": lambda t, q, u: jnp.stack([q["roll"], q["steer"]])}),
         TypeError,
         "output 'both' must be one number",
     ),
@@ -248,7 +259,7 @@ CASES = {
         "positive number of values to keep; got 0",
     ),
     "a state for a steady motion": (
-        lambda: stability.family(BIKE, AHEAD, towards={}),
+        lambda: stability.family(BIKE, ahead(), towards={}),
         TypeError,
         "must be a SteadyMotion",
     ),
@@ -265,7 +276,6 @@ CASES = {
     ),
     "no system": (lambda: stability.cyclic_coordinates(None), TypeError, "instance of a System"),
 }
-AHEAD = straight_ahead(BIKE, 4.0)
 AT_REST = stability.SteadyMotion(
     *(jnp.zeros(n) for n in (2, 2, 0, 0)), {}, 0.0, 0.0, (("theta1", "theta2"), ("theta1_dot", "theta2_dot"), (), ())
 )

@@ -16,8 +16,6 @@ from jaxkane._kane.checks import check_system
 from jaxkane._kane.constraint_residuals import configuration_residual
 from jaxkane._scalarjit.digest import digest
 
-distributed = pytest.importorskip("distributed")
-
 TS = np.linspace(0.0, 1.0, 3)
 STEPS = {"step": 0.5, "solver": diffrax.Midpoint()}  # exact for what falls freely
 
@@ -49,6 +47,7 @@ def module(monkeypatch):
 
 @pytest.fixture(scope="module")
 def client():
+    distributed = pytest.importorskip("distributed")  # takes a second
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     options = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
     with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:

@@ -156,23 +156,17 @@ class Filtered(jk.System):
         return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
 
     def filters(self, x, signal):
+        second, pade = ([x[name] for name in pair] for pair in (("first", "second"), ("two", "three")))
         low = sensors.low_pass(signal, x["low"], 0.2)
-        second = sensors.low_pass_second_order(signal, x["first", "second"], 3.0)
-        return [low, second, sensors.delayed(signal, x["one"], 0.1), sensors.delayed(signal, x["two", "three"], 0.1)]
+        second = sensors.low_pass_second_order(signal, second, 3.0)
+        return [low, second, sensors.delayed(signal, x["one"], 0.1), sensors.delayed(signal, pade, 0.1)]
 
     def state_rates(self, t, q, u, x, motion, now):
         return [rate for rates, _ in self.filters(x, now["signal"]) for rate in rates]
 
     def outputs(self, t, q, u, motion, now):
-        x = jk_values(self.states, now)
-        y = [output for _, output in self.filters(x, now["signal"])]
+        y = [output for _, output in self.filters(now, now["signal"])]
         return dict(zip(("low pass", "butterworth", "pade 1", "pade 2"), y, strict=True))
-
-
-def jk_values(names, now):
-    from jaxkane._system.system import NamedVector
-
-    return NamedVector([now[name] for name in names], names)
 
 
 def test_filters_have_their_transfer_functions():
