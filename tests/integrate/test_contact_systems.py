@@ -66,6 +66,7 @@ def test_derivatives_of_a_rocking_block():
     np.testing.assert_allclose(jax.jit(jax.jacfwd(sixth))(p), expected, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_both_corners_of_a_wide_block_stick():
     """It falls on its whole base and stays there. Its Delassus matrix is singular: four rows, three speeds."""
     wide = RockingBlock(0.6, 0.3, friction=2.0)

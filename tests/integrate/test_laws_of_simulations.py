@@ -1,13 +1,14 @@
 """Laws of simulations, over a table of small systems: derivatives, clock, units, loop, batches and files.
 
 Each law is a property of all simulations. A program is compiled once and shared by the laws. Compilation takes seconds,
-so the plain tests use four systems for eight features. The slow tests use one system for each feature.
+so the plain tests use three systems for seven features. The slow tests use one system for each feature. For contacts,
+`test_contact_laws.py` has plain tests of the same laws.
 
 | system | forward | reverse | clock | units | loop of diffrax | batch | file | float32 |
 |---|---|---|---|---|---|---|---|---|
 | event, hold, dependent, state | plain | plain | plain | plain | plain | plain | plain | plain |
 | jump, linear | plain | slow | plain | plain | | slow | slow | |
-| contact | plain | slow | plain | plain | | slow | slow | |
+| contact | slow | weekly | slow | slow | | weekly | weekly | |
 | multipliers | plain | slow | plain | plain | slow | slow | slow | |
 | event | slow | slow | slow | slow | slow | slow | slow | |
 | jump | slow | slow | slow | slow | | slow | slow | |
@@ -208,7 +209,7 @@ CASES = {
 }
 HAS_JUMPS = ("jump, linear", "contact", "jump")
 ENDS = ("event, hold, dependent, state", "event")
-SINGLE = ("event", "jump", "hold", "linear", "dependent", "state")
+SINGLE = ("contact", "event", "jump", "hold", "linear", "dependent", "state")
 
 # Powers of two, so that no time is rounded after 1.7e9 s.
 TS = np.array([0.0, 0.09375, 1.0])  # [s]
@@ -294,7 +295,8 @@ def test_forward_derivatives_equal_central_differences(name):
         np.testing.assert_allclose(slope, (after - before) / (2 * h), rtol=rtol, atol=rtol * np.abs(values).max())
 
 
-@pytest.mark.slow_cases("jump, linear", "contact", "multipliers", *SINGLE)
+@pytest.mark.weekly_cases("contact")
+@pytest.mark.slow_cases("jump, linear", "multipliers", *SINGLE)
 @pytest.mark.parametrize("name", CASES)
 def test_reverse_derivatives_equal_forward_derivatives(name):
     """Of a sum of all values with unequal weights: one row is compiled in less time than a matrix."""
@@ -353,7 +355,8 @@ def test_the_loop_of_diffrax_gives_the_same_results(name):
     np.testing.assert_allclose(numbers_of(name, ride), solved(name)[1], rtol=rtol)
 
 
-@pytest.mark.slow_cases("jump, linear", "contact", "multipliers", *SINGLE)
+@pytest.mark.weekly_cases("contact")
+@pytest.mark.slow_cases("jump, linear", "multipliers", *SINGLE)
 @pytest.mark.parametrize("name", CASES)
 def test_a_batch_equals_its_members_and_its_saved_files(name, tmp_path, monkeypatch):
     rtol = 1e-9  # of members; files are equal to the last bit
