@@ -161,7 +161,7 @@ MUTATIONS = (
              "*(_bits(x) if is_literal(x) else id(x) for x in xs), _parameters_of",
              "*sorted((_bits(x) if is_literal(x) else id(x) for x in xs), "
              "key=str if equation.primitive.name == 'sub' else lambda _: 0), _parameters_of",
-             "catalog/test_laws.py scalarjit/test_function.py scalarjit/test_linear_solution.py"),
+             "scalarjit/test_function.py catalog/test_laws.py scalarjit/test_linear_solution.py"),
     Mutation("collocation: the range at an end replaces the bounds along the motion", "_collocate/transcription.py",
              "lower[at], upper[at] = max(low, lower[at]), min(high, upper[at])", "lower[at], upper[at] = low, high",
              "collocation"),

@@ -410,7 +410,7 @@ def test_an_orbit_that_crosses_its_start_plane_three_times_per_period():
     np.testing.assert_allclose(orbit.period, 4 * np.pi, rtol=1e-9)
 
 
-def test_a_crossing_of_the_start_plane_far_from_the_start_is_no_return():
+def test_a_crossing_of_the_start_plane_far_from_the_start_is_not_a_return():
     """From inside the limit cycle, the motion crosses the plane v = 0 downwards near x = 2 in each turn."""
     with pytest.raises(ValueError, match=r"the simulation of the guess ends at [0-9.]* s: max steps"):
         periodic(VanDerPol(1.0), jk.State([0.2], [0.0]), max_steps=300)
