@@ -199,7 +199,7 @@ def why_it_does_not_fit(mutation: Mutation, source: Path) -> str:
     """Why a mutation of the library in `source` is not possible; an empty text if it is."""
     path = source / "jaxkane" / mutation.file
     if not path.is_file():
-        return f"there is no file {mutation.file}"
+        return f"{mutation.file} does not exist"
     text = path.read_text(encoding="utf-8")
     n = text.count(mutation.old)
     if n != 1:
@@ -210,7 +210,7 @@ def why_it_does_not_fit(mutation: Mutation, source: Path) -> str:
         except SyntaxError as error:
             return f"its new text is not valid: {error}"
     missing = [name for name in mutation.near.split() if not (ROOT / "tests" / name).exists()]
-    return f"there are no tests {', '.join(missing)}" if missing else ""
+    return f"these tests do not exist: {', '.join(missing)}" if missing else ""
 
 
 def environment_of(copy: Path, cache: str) -> dict[str, str]:

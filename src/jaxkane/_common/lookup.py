@@ -29,8 +29,8 @@ def hint(wrong: str | Iterable[str], known: Iterable[str], have: str = "there ar
     return f"{have} {', '.join(known[:_LISTED]) or 'none'}{more}."
 
 
-def as_names(given: str | Iterable[str], argument: str = "names") -> tuple[str, ...]:
-    """A tuple of names. A single name may be given as a string. `argument` is the name for an error message."""
+def as_names(given: str | Iterable[str], argument: str) -> tuple[str, ...]:
+    """A tuple of names. A single name may be given as a string. `argument` is its name in an error message."""
     names = (given,) if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
     if not all(isinstance(name, str) for name in names):
         raise TypeError(f"`{argument}` must be a name or a sequence of names, got {given!r}. Names must be strings.")

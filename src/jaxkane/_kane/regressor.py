@@ -61,7 +61,7 @@ class BodyParameters(NamedTuple):
 
     def only(self, names: Sequence[str] | str) -> BodyParameters:
         """The body with only these of its parameters."""
-        names = as_names(names)
+        names = as_names(names, "names")
         known = [name.rpartition(".")[2] for name in self.names]
         refuse_unknown(names, known, f"`bodies`: {self.name} has no parameter", "it has")
         chosen = [i for i, name in zip(self.indices, known, strict=True) if name in names]
@@ -102,7 +102,7 @@ def regressor_model(system: System, bodies: Bodies) -> RegressorModel:
     """
     chosen, leaves = _BODIES.get(structure_of(system), lambda: _bodies_of(system))
     if bodies is not None:
-        names, parameters = as_names(bodies), bodies if isinstance(bodies, Mapping) else {}
+        names, parameters = as_names(bodies, "bodies"), bodies if isinstance(bodies, Mapping) else {}
         known = [body.name for body in chosen]
         refuse_unknown(names, known, f"{type(system).__name__} has no body with a mass named", "it has")
         twice = sorted({name for name in names if names.count(name) > 1})

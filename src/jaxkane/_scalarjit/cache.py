@@ -147,16 +147,16 @@ class _Limit:
     def __init__(self, mappings: int = 4000) -> None:
         self.mappings, self.has_warned = mappings, False
         self.dropped: set[int] = set()
-        self._expected: float = math.inf  # upper bound of the mappings now, from the last reading
+        self._expected: float = math.inf  # mappings now, if all programs since the last reading are large
         self._lock = threading.Lock()
 
     def check(self, new: int) -> None:
         """`new`: the hash of the key of a program that will be compiled."""
+        self._expected += _MAPPINGS_OF_A_PROGRAM
         if not self._lock.acquire(blocking=False):  # another thread runs this check
             return
         try:
             # To list 4000 mappings takes 10 ms or more, so they are read only if the limit may have been reached.
-            self._expected += _MAPPINGS_OF_A_PROGRAM
             if self._expected <= self.mappings and new not in self.dropped:
                 return
             used, most = memory_mappings()

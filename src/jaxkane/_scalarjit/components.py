@@ -46,15 +46,16 @@ Inputs: TypeAlias = Mapping[str, Any] | Callable[..., Any] | None
 ZERO3: Triple = (0.0, 0.0, 0.0)
 
 
-def component(value: Component) -> Component:
-    """`value` as a component: Python and NumPy numbers become exact floats, arrays do not change."""
+def component(value: Component, what: str = "A component, an angle, a rate or a mass") -> Component:
+    """`value` as a component: Python and NumPy numbers become exact floats, arrays do not change. `what` is the
+    beginning of the message for other values."""
     if isinstance(value, float):
         return value
     if isinstance(value, (int, np.number)) and not isinstance(value, bool):
         return float(value)
     shape, kind = getattr(value, "shape", None), getattr(getattr(value, "dtype", None), "kind", "")
     if shape != () or kind in tuple("cUSOmM"):
-        raise TypeError(f"A component, an angle, a rate or a mass must be one number, got {_described(value, shape)}")
+        raise TypeError(f"{what} must be one number, got {_described(value, shape)}")
     return jnp.asarray(value) if isinstance(value, np.ndarray) else value
 
 
@@ -75,11 +76,7 @@ def several(values: PyTree, n: int, what: str) -> tuple[Any, ...]:
 
 def positive(value: Component, what: str) -> Component:
     """`value`. **Raises:** `ValueError` for a concrete number that is not positive."""
-    try:
-        number = component(value)
-    except TypeError as error:
-        raise TypeError(f"{what} must be one number{str(error).partition('one number')[2]}") from None
-    if is_exact(number) and not value > 0:
+    if is_exact(component(value, what)) and not value > 0:
         raise ValueError(f"{what} must be positive, got {value}.")
     return value
 

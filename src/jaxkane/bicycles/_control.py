@@ -79,7 +79,7 @@ class ScheduledGains(Part):
     """
 
     at: tuple[float, ...] = eqx.field(static=True, converter=lambda at: tuple(np.asarray(at, dtype=float).tolist()))
-    measured: tuple[str, ...] = eqx.field(static=True, converter=as_names)
+    measured: tuple[str, ...] = eqx.field(static=True, converter=lambda names: as_names(names, "measured"))
     gains: Float[Array, "n m"] = eqx.field(converter=to_float)
     follow: Float[Array, " n"] = eqx.field(converter=to_float)
     command: str = eqx.field(static=True, default=STEER)
@@ -189,7 +189,7 @@ def scheduled_lqr(
             f"scheduled_lqr: the {type(bicycle).__name__} already has a controller. Remove it by "
             "bicycle.with_parts(control=None)."
         )
-    names = bicycle.lateral if states is None else as_names(states)
+    names = bicycle.lateral if states is None else as_names(states, "states")
     gains, follow = [], []
     for v in np.asarray(speeds, dtype=float):
         model = linearize(bicycle, straight_ahead(bicycle, v), states=names)

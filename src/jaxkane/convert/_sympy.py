@@ -76,7 +76,7 @@ def from_sympy(
     """
     sympy = imported()
     motions = prescribed_motions(sympy, prescribed or {}, name)
-    data = model_data(sympy, model, as_names(dependent), name, tuple(motions))
+    data = model_data(sympy, model, as_names(dependent, "dependent"), name, tuple(motions))
     if origin is not None and not data.bodies:
         raise ValueError(
             f"{name}: positions from {origin} are not available, because this Lagrangian has no bodies. Omit `origin`, "

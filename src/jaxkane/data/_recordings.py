@@ -160,7 +160,7 @@ def robot_bicycle(channels: Sequence[str] = ("steer", "roll_rate"), *, file: Fil
         **{name: (name, 0.03) for name in ("gyro_y", "gyro_z")},
         **{name: (name, 0.5) for name in ("acc_x", "acc_y", "acc_z")},
     }
-    channels = as_names(channels)
+    channels = as_names(channels, "channels")
     refuse_unknown(channels, list(every), "robot_bicycle: no channel")
     return _recording(
         "robot_bicycle",

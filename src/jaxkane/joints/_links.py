@@ -46,6 +46,7 @@ class Link:
         four Euler parameters (scalar last), a sequence and its angles, e.g. ("3-1-2", (a, b, c)) [rad], or a (3, 3)
         matrix whose columns are the link's axes in the parent.
     - `mass` [kg], `center` [m]: mass and mass centre. A link without a mass is a frame that carries others.
+        A mass of zero is permitted if the link has moments of inertia.
     - `inertia` [kg m^2]: about the mass centre, along the link's axes: three principal moments, or a (3, 3) matrix.
 
     Numbers become parameters: `mass.forearm`, `center.forearm.z`, `inertia.forearm.xx`, `position.forearm.z`. A zero

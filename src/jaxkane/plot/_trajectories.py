@@ -74,7 +74,9 @@ def trajectories(
     angle.
     """
     trajectory = as_trajectory(trajectory)
-    groups = [as_names(group) for group in ([names] if isinstance(names, str) else names or trajectory.names[0])]
+    groups = [
+        as_names(group, "names") for group in ([names] if isinstance(names, str) else names or trajectory.names[0])
+    ]
     drawn = [name for group in groups for name in group]
     units_by_name = {name: unit_of(name, dict(trajectory.units) | dict(units or {})) for name in drawn}
     values = {name: np.asarray(trajectory[name], dtype=float) for name in drawn}

@@ -123,13 +123,13 @@ def linearize(
         )
     at_motion = _FormulasAtMotion(formulas, dict(at or {}))
     names = (*system.coordinates, *system.speeds)
-    dependent = system.dependent_coordinates if dependent is None else as_names(dependent)
+    dependent = system.dependent_coordinates if dependent is None else as_names(dependent, "dependent")
     refuse_unknown(
         dependent, system.coordinates, f"{formulas.name}: `dependent` contains unknown names:", "the coordinates are"
     )
     free = [x for x in names if x not in dependent]
     cyclic = cyclic_coordinates(system) if states is None or steady else ()
-    states = tuple(x for x in free if x not in cyclic) if states is None else as_names(states)
+    states = tuple(x for x in free if x not in cyclic) if states is None else as_names(states, "states")
     refuse_unknown(states, free, f"{formulas.name}: not a possible state:", "independent coordinates and speeds are")
     if steady:
         at_motion.check_steady(cyclic)

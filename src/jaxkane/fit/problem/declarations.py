@@ -93,7 +93,7 @@ class CalibrationTerm(Named):
     def channels(self) -> tuple[str, ...]:
         """The names of the inputs, channels or states."""
         try:
-            return as_names(self.what)
+            return as_names(self.what, "what")
         except TypeError:
             raise TypeError(
                 f"{type(self).__name__}({self.what!r}): the first argument must be the name of a channel, an input, a "

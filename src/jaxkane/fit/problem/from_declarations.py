@@ -529,7 +529,7 @@ def _of_body(system: System, item: Inertia):
     leaves = jax.tree.leaves(system)
     values = [0.0 if s is None else float(np.ravel(leaves[s[0]])[s[1][0]]) for s in spots]
     values[0] = values[0] if spots[0] is not None else 1.0
-    fixed = as_names(item.fixed)
+    fixed = as_names(item.fixed, "fixed")
     unknown = sorted(set(fixed) - {name for name in names[:4] if name})
     if unknown:
         raise ValueError(

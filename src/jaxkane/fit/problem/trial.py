@@ -146,7 +146,8 @@ class Trial:
                 )
             return values.to_numpy(dtype=float, na_value=np.nan)
 
-        groups = [x if isinstance(x, Mapping) else {n: n for n in as_names(x)} for x in (measured, inputs, initial)]
+        columns = {"measured": measured, "inputs": inputs, "initial": initial}
+        groups = [x if isinstance(x, Mapping) else {n: n for n in as_names(x, key)} for key, x in columns.items()]
         channels, signals, known = ({key: samples(c) for key, c in group.items()} for group in groups)
         return cls(samples(time), channels, signals, sigma=sigma, initial=known, name=name, labels=labels)
 

@@ -138,7 +138,7 @@ def design(
                 f"design: `{name}` is not supported, because a design assumes white normal errors. Omit it."
             )
     problem = Problem.of(system, plan.trial(coefficients), free, **options)
-    names, about = problem.parameters.names, as_names(about or ())
+    names, about = problem.parameters.names, as_names(about or (), "about")
     refuse_unknown(about, names, "`about` contains unknown names:", "the free parameters are")
     places = np.array([names.index(name) for name in about or names])
     if problem.model.settings.step is None:
