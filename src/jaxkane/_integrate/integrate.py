@@ -46,16 +46,19 @@ from .inputs import (
     for_fixed_steps,
     inputs_are_valid,
     inputs_at,
+    is_samples,
     mask_invalid_inputs,
     restore_times,
     samples_of,
 )
 from .jumps import JumpTable, impulses_at, stages_of, state_after, without_derivative_at
 from .loop import Jump, JumpRecord, Jumps, Steps, diffrax_loop, fast_loop, is_supported
+from .probe import Probing, as_integers, direction_of, generic
 from .settings import Settings, with_scan_kind, with_tolerances
 from .solvers import StepwiseInputs, UnrolledERK, is_explicit, last_stage_is_spare
 from .status import Status
-from .step_control import SHARE, StepSizeController, evenly_spread, first_step
+from .step_control import FEWEST_STEPS, SHARE, StepSizeController, evenly_spread, first_step
+from .tangents import with_own_tangents
 from .trajectory import InputDiscontinuities, Trajectory
 
 
@@ -85,7 +88,53 @@ def solve(
 
     **Returns:** a `Trajectory` with the times `origin + taus`.
     """
-    signals, fixed = restore_times(signals), settings.step is not None
+    signals = restore_times(signals)
+    if settings.adjoint is not None:
+        return _solved(system, state, origin, taus, signals, discontinuities, closures, settings)
+    if closures:
+        signals = _with_captured_numbers(system, state, origin, signals)
+
+    def run(arguments: Any, moved: Any, reverse: bool) -> Trajectory:
+        arguments, (settings, closures) = arguments
+        adjoint = diffrax.RecursiveCheckpointAdjoint() if reverse else diffrax.ForwardMode()
+        settings = dataclasses.replace(settings, adjoint=adjoint, progress=settings.progress and moved is None)
+        return _solved(*arguments, closures, settings, moved)
+
+    arguments = system, state, origin, taus, signals, discontinuities
+    how = (
+        "controlled"
+        if settings.controls_tangents
+        else "steps of the motion"
+        if settings.step is None
+        else "fixed steps"
+    )
+    return dataclasses.replace(with_own_tangents(run, arguments, (settings, closures)), adjoint=how)
+
+
+def _with_captured_numbers(system: System, state: State, t: Array, signals: Any) -> Any:
+    """The signals. Numbers that a function of them captures from outside, traced ones, become numbers of the signal."""
+    context = InputState(state.q, state.u, state.x, t, system)
+
+    def converted(f: Any) -> Any:
+        return eqx.filter_closure_convert(f, t, context) if callable(f) and not is_samples(f) else f
+
+    return converted(signals) if callable(signals) else {name: converted(f) for name, f in signals.items()}
+
+
+def _solved(
+    system: System,
+    state: State,
+    origin: Array,
+    taus: Array,
+    signals: Any,
+    discontinuities: Array | None,
+    closures: Any,
+    settings: Settings,
+    moved: Any = None,
+) -> Trajectory:
+    """`solve` with an adjoint of diffrax. `moved`: the arguments with True for each number that is differentiated, if
+    the errors of tangents are controlled."""
+    fixed = settings.step is not None
     signals = for_fixed_steps(signals) if fixed else signals
     follows_from = parts_of((system, state, origin, taus, signals, discontinuities, closures))
     others_are_valid = inputs_are_valid(signals)
@@ -137,6 +186,8 @@ def solve(
         events=events_of(system, origin, state),
         settings=settings,
     )
+    if moved is not None and not fixed:
+        problem = problem._replace(args_dot=direction_of(problem.args, moved[0], any(jax.tree.leaves(moved[4]))))
     determined = None
     if touches is not None:
         problem, determined = problem.with_found_contacts(touches)
@@ -171,6 +222,7 @@ class Problem(NamedTuple):
     - `taus` (n_t,): the requested times since the start [s]. `valid`: whether the simulation may begin.
     - `args`: the arguments of the right-hand side. `discontinuities`: where steps end, or None.
     - `events`: the event functions. `settings`: the options of `simulate`.
+    - `args_dot`: the direction in which `args` move if the errors of tangents are controlled, else None.
     """
 
     system: System
@@ -181,6 +233,7 @@ class Problem(NamedTuple):
     discontinuities: Discontinuities | None
     events: Events
     settings: Settings
+    args_dot: Any = None
 
     @property
     def constrained(self) -> bool:
@@ -193,9 +246,10 @@ class Problem(NamedTuple):
         t, state = self.args.origin, unpacked(self.system, self.start)
         return rates_are_native(self.args.system, t, self.start, inputs_at(self.system, self.args.signals, t, state))
 
-    def rates(self) -> Callable[..., Any]:
+    def rates(self, forward: bool | None = None) -> Callable[..., Any]:
         settings = self.settings
-        return _rates(settings.stabilize if self.constrained else 0.0, settings.is_forward)
+        forward = settings.is_forward if forward is None else forward
+        return _rates(settings.stabilize if self.constrained else 0.0, forward)
 
     def steps(self) -> Steps:
         """The states at the requested times, and where the steps end."""
@@ -212,7 +266,7 @@ class Problem(NamedTuple):
         if is_supported(solver, controller, settings.adjoint, settings.progress):
             n_impulses = len(self.events.layout.names) * (1 + self.events.layout.d)
             jumps = Jumps(self.jump, settings.max_jumps, n_impulses) if self.events.continue_ else None
-            return fast_loop(*how, *limits, jumps)
+            return fast_loop(*how, *limits, jumps, errors=self.errors_of_tangent(solver, controller, jumps))
         if self.events.continue_:
             raise ValueError(
                 f"{type(self.system).__name__} has contacts, or an event that changes the state (`then`). This needs "
@@ -220,6 +274,18 @@ class Problem(NamedTuple):
                 "'both', and a solver that is not implicit-explicit."
             )
         return diffrax_loop(*how, *limits, settings.progress)
+
+    def errors_of_tangent(self, solver: Any, controller: StepSizeController, jumps: Jumps | None) -> Array | None:
+        """The errors of a tangent in all steps, None if they are not controlled."""
+        if self.args_dot is None:
+            return None
+        n = self.start.size - self.events.layout.memory_size  # the states of contacts have no tangent
+        probing = Probing(self.rates(True), generic(self.start, n), self.args_dot)
+        controller, start, args, taus, valid = constant((controller, self.start, self.args, self.taus[-1:], self.valid))
+        how = probing.rates, solver, controller, start, args, taus, diffrax.ForwardMode(), self.settings.max_steps
+        errors = fast_loop(*how, valid, jumps, probing).errors
+        assert errors is not None
+        return as_integers(errors)
 
     def controller(self, rates: Callable[..., Any]) -> StepSizeController:
         system, settings, events = self.system, self.settings, self.events
@@ -238,7 +304,7 @@ class Problem(NamedTuple):
             atol=as_number(settings.atol),
             step=evenly_spread(self.taus[-1], as_number(settings.step)) if fixed else None,
             first=first_step(self.taus),
-            longest=as_number(jnp.inf if settings.max_step is None else settings.max_step),
+            longest=self.taus[-1] / FEWEST_STEPS if settings.max_step is None else as_number(settings.max_step),
             duration=self.taus[-1],
             discontinuities=found,
             event_values=quantities if may_end else None,

@@ -17,6 +17,7 @@ from jaxtyping import Array
 
 from .._scalarjit.nan import constant
 from .discontinuities import rounding
+from .probe import Probe, Probing, read_errors
 from .settings import with_scan_kind
 from .solvers import rates_at_ends
 from .status import Status
@@ -94,6 +95,7 @@ class Steps(NamedTuple):
     - `state`: the state of the controller.
     - `taken`, `accepted`: numbers of steps.
     - `jumps`: the jumps, or None if no event changes the state.
+    - `errors`: the errors of the tangent in all steps if it moves with the motion, or None.
     """
 
     motion: Array
@@ -105,6 +107,7 @@ class Steps(NamedTuple):
     taken: Array
     accepted: Array
     jumps: JumpRecord | None = None
+    errors: Array | None = None
 
 
 class Carry(NamedTuple):
@@ -120,6 +123,7 @@ class Carry(NamedTuple):
     - `steps` (2,): numbers of steps, taken and accepted.
     - `motion` (n_t, n), `count`: the saved states, and their number.
     - `jumps`: the jumps so far, or None.
+    - `probe`: the tangent whose error is controlled, or None.
     """
 
     t0: Array
@@ -134,6 +138,7 @@ class Carry(NamedTuple):
     motion: Array
     count: Array
     jumps: JumpRecord | None
+    probe: Probe | None
 
 
 class AtJump(NamedTuple):
@@ -168,23 +173,34 @@ def fast_loop(
     max_steps: int | None,
     may_begin: Array,
     jumps: Jumps | None,
+    probing: Probing | None = None,
+    errors: Array | None = None,
 ) -> Steps:
-    """The steps of `diffeqsolve`, to the last digit. No steps are taken unless the simulation `may_begin`."""
+    """The steps of `diffeqsolve`, to the last digit. No steps are taken unless the simulation `may_begin`.
+
+    `probing`: move a tangent with the motion, and let steps be so short that its error meets the tolerance too.
+    `errors`: take the errors of this tangent from an earlier loop.
+    """
     kind = _KINDS[type(adjoint)]
     checkpoints = getattr(adjoint, "checkpoints", None)
     kind = "lax" if max_steps is None and checkpoints is None else kind
     solver = solver if kind == "checkpointed" else with_scan_kind(solver, kind)
-    term = diffrax.ODETerm(rates)  # pyright: ignore[reportArgumentType]
+    term: Any = diffrax.ODETerm(rates) if probing is None else probing.term  # pyright: ignore[reportArgumentType]
     start, order = jnp.zeros_like(controller.duration), solver.error_order(term)
     end, state = controller.init(term, start, controller.duration, y0, None, args, solver.func, order)
+    begin, probe = (y0, None) if probing is None else probing.start(y0, max_steps)
     needs_rates = bool(controller.events.names) and rates_at_ends(solver)
     restart = controller.discontinuities is not None and controller.discontinuities.restart
     carry = Carry(
-        start, end, y0, jnp.zeros_like(y0) if needs_rates else None, solver.init(term, start, end, y0, args), state,
-        jnp.array(False) if restart else None, may_begin, jnp.zeros(2, int), jnp.zeros((len(ts), *y0.shape), y0.dtype),
-        jnp.zeros((), int), None if jumps is None else JumpRecord.empty(jumps.most, y0, jumps.n_impulses),
+        start, end, begin, jnp.zeros_like(y0) if needs_rates else None, solver.init(term, start, end, begin, args),
+        state, jnp.array(False) if restart else None, may_begin, jnp.zeros(2, int),
+        jnp.zeros((len(ts), *y0.shape), y0.dtype), jnp.zeros((), int),
+        None if jumps is None else JumpRecord.empty(jumps.most, y0, jumps.n_impulses), probe,
     )  # fmt: skip
     n_events = len(controller.events.names)
+
+    def motion_of(y: Any) -> Any:
+        return y if probing is None else y[..., 0, :]
 
     def step(c: Carry) -> Carry:
         # False must be a Python constant here: as an array, the loop would carry it and evaluate both cases.
@@ -193,18 +209,24 @@ def fast_loop(
         if not getattr(solver, "always_succeeds", False):
             failed = result != diffrax.RESULTS.successful
             y1, error = jax.tree.map(lambda x: jnp.where(failed, jnp.inf, x), (y1, error))
+        probe, error_of_tangent = c.probe, None if errors is None else read_errors(errors, c.steps[0], y0.dtype)
+        if probing is not None and probe is not None:
+            error_of_tangent, probe = probing.step(probe, y1, error, c.steps[0])
         keep, t0, t1, jumped, state, ended = controller.adapt_step_size(
-            c.t0, c.t1, c.y, y1, args, error, order, c.controller_state
-        )
+            c.t0, c.t1, motion_of(c.y), motion_of(y1), args, None if error is None else motion_of(error), order,
+            c.controller_state, error_of_tangent,
+        )  # fmt: skip
 
         def chosen(new: Any, old: Any) -> Any:
             return jax.tree.map(functools.partial(jnp.where, keep), new, old)
 
-        k: Any = constant(dense["k"]) if needs_rates else None
+        k: Any = constant(motion_of(dense["k"])) if needs_rates else None
         interpolation = solver.interpolation_cls(t0=c.t0, t1=c.t1, **dense)
         running, y_next = ended == diffrax.RESULTS.successful, chosen(y1, c.y)
         rates_next = chosen(k[-1], k[0]) / (c.t1 - c.t0) if needs_rates else None
         solver_state, record, cut = chosen(solver_state, c.solver_state), c.jumps, None
+        if probing is not None and probe is not None and c.probe is not None:
+            probe = probe._replace(size=chosen(probe.size, c.probe.size))
         if jumps is not None and c.jumps is not None:
             # The loop runs once if a jump is due. In a batch it runs if a jump is due in any member: a condition would
             # be evaluated in every step.
@@ -215,12 +237,13 @@ def fast_loop(
 
             def jumped_at(a: AtJump, jumps: Jumps = jumps) -> AtJump:
                 now, start = ControllerState.unpacked(a.controller_state[0], n_events), jnp.where(keep, c.t1, c.t0)
-                jump, fits = jumps.jump(start, a.y, now.jump, now.reach), a.jumps.count < jumps.most
+                jump, fits = jumps.jump(start, motion_of(a.y), now.jump, now.reach), a.jumps.count < jumps.most
                 # A state that is not finite must not reach the solver.
                 is_possible = jump.status == float(Status.COMPLETED)
                 jump = jump._replace(after=jnp.where(fits & is_possible, jump.after, jump.before))
                 end, changed = controller.after_jump(a.controller_state, jump.t, jump.after, args)
-                restarted = solver.init(term, jump.t, end, jump.after, args)
+                y = jump.after if probing is None or probe is None else probing.again(jump.after, probe)
+                restarted = solver.init(term, jump.t, end, y, args)
                 after = ControllerState.unpacked(changed[0], n_events)
                 status = jnp.where(is_possible, after.status, jump.status)
                 status = jnp.where(fits, status, float(Status.MAX_JUMPS))
@@ -231,9 +254,7 @@ def fast_loop(
                 begin = jnp.where(is_last, controller.duration, jump.t)
                 record = a.jumps.with_(jump.t, now.jump, jump.before, jump.after, jump.smooth, jump.impulses)
                 rates_after = None if a.rates is None else jnp.zeros_like(a.rates)
-                return AtJump(
-                    jnp.zeros_like(a.is_due), begin, end, jump.after, rates_after, restarted, changed, goes_on, record
-                )
+                return AtJump(jnp.zeros_like(a.is_due), begin, end, y, rates_after, restarted, changed, goes_on, record)
 
             after = loop(lambda a: a.is_due, jumped_at, base, 1, 1, lambda a: a.jumps.buffers)
             t0, cut = jnp.where(base.is_due, after.t, t0), constant(after.t)
@@ -249,25 +270,30 @@ def fast_loop(
             return due if cut is None else due & (ts[kept[1]] < cut)
 
         def sampled(kept: tuple[Array, Array]) -> tuple[Array, Array]:
-            return kept[0].at[kept[1]].set(interpolation.evaluate(ts[kept[1]])), kept[1] + 1
+            return kept[0].at[kept[1]].set(motion_of(interpolation.evaluate(ts[kept[1]]))), kept[1] + 1
 
         motion, count = loop(is_due, sampled, (c.motion, c.count), len(ts), len(ts), lambda kept: kept[0])
         steps = c.steps + jnp.stack([jnp.ones_like(count), keep.astype(count.dtype)])
         return Carry(
             t0, t1, y_next, rates_next, solver_state, state, chosen(jumped, c.made_jump) if restart else None,
-            running if max_steps is None else running & (steps[0] < max_steps), steps, motion, count, record,
+            running if max_steps is None else running & (steps[0] < max_steps), steps, motion, count, record, probe,
         )  # fmt: skip
 
     loop = functools.partial(_while_loop, kind)
 
     def buffers(c: Carry) -> Any:
         # Not `c.jumps is None`: equinox calls this with wrapped leaves.
-        return [c.motion, *(() if jumps is None else c.jumps.buffers)]  # pyright: ignore[reportOptionalMemberAccess]
+        more = [*(() if jumps is None else c.jumps.buffers), *(() if probing is None else [c.probe.errors])]  # pyright: ignore[reportOptionalMemberAccess]
+        return [c.motion, *more]
 
     last = loop(lambda c: c.running, step, carry, max_steps, checkpoints, buffers)
     reached = jnp.arange(len(ts)) < last.count
     state = ControllerState.unpacked(last.controller_state[0], n_events)
-    return Steps(last.motion, reached, last.t0, last.y, last.rates, state, last.steps[0], last.steps[1], last.jumps)
+    errors = None if last.probe is None else last.probe.errors
+    return Steps(
+        last.motion, reached, last.t0, motion_of(last.y), last.rates, state, last.steps[0], last.steps[1], last.jumps,
+        errors,
+    )  # fmt: skip
 
 
 def diffrax_loop(

@@ -1,4 +1,4 @@
-"""The options of `simulate`, their checks, and the mode in which a simulation will be differentiated."""
+"""The options of `simulate`, and their checks."""
 
 from __future__ import annotations
 
@@ -15,24 +15,10 @@ import numpy as np
 import optimistix as optx
 from jax.typing import DTypeLike
 
-from .._scalarjit.compat import (
-    MISSING,
-    Tracer,
-    as_lowering,
-    is_moved_forward,
-    is_moved_forward_below,
-    is_no_tangent,
-    new_primitive,
-    nothing_is_traced,
-)
+from .._scalarjit.compat import Tracer
 
-ADJOINTS = {
-    "auto": diffrax.RecursiveCheckpointAdjoint,
-    "reverse": diffrax.RecursiveCheckpointAdjoint,
-    "forward": diffrax.ForwardMode,
-    "both": diffrax.DirectAdjoint,
-}
-
+ADJOINTS = "auto", "reverse", "forward", "both"
+"""All mean the same: every simulation supports both modes. The last three were necessary in earlier versions."""
 
 _ADJOINT = f"`adjoint` must be one of {', '.join(ADJOINTS)}, or an adjoint of diffrax; got {{!r}}."
 
@@ -43,6 +29,7 @@ class Settings(eqx.Module):
     Attributes:
 
     - `rtol`, `atol`, `step`, `max_step`: numbers, or arrays if they may change without recompilation.
+    - `adjoint`: None for an operation with derivatives of its own (see `with_own_tangents`).
     - `max_steps`: None for an unlimited number.
     - `rising`: whether the times were already checked to increase.
     - `check_bodies`: whether a simulation of bodies with an impossible inertia is invalid.
@@ -55,7 +42,7 @@ class Settings(eqx.Module):
     step: Any
     max_step: Any
     controller: diffrax.AbstractStepSizeController | None
-    adjoint: diffrax.AbstractAdjoint
+    adjoint: diffrax.AbstractAdjoint | None
     max_steps: int | None = eqx.field(static=True)
     max_jumps: int = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
@@ -65,9 +52,15 @@ class Settings(eqx.Module):
     check_bodies: bool = eqx.field(static=True, default=False)
 
     @property
+    def controls_tangents(self) -> bool:
+        """Whether the errors of tangents are controlled: not with fixed steps, nor in the loop of diffrax."""
+        has_one_term = self.solver.term_structure is diffrax.AbstractTerm
+        return self.adjoint is None and self.step is None and self.controller is None and has_one_term
+
+    @property
     def is_forward(self) -> bool:
         """Whether only forward mode is supported."""
-        return isinstance(self.adjoint, ADJOINTS["forward"])
+        return isinstance(self.adjoint, diffrax.ForwardMode)
 
 
 def settings_for(
@@ -111,10 +104,7 @@ def settings_for(
     if isinstance(controller, diffrax.ConstantStepSize | diffrax.StepTo):
         raise ValueError(f"controller={type(controller).__name__}(...) has fixed steps. Pass `step`, e.g. step=1e-3.")
     if isinstance(adjoint, diffrax.ImplicitAdjoint):
-        raise ValueError(
-            "adjoint=ImplicitAdjoint() differentiates a steady state, not a simulation. Use adjoint='reverse', or "
-            "'forward' for few parameters."
-        )
+        raise ValueError("adjoint=ImplicitAdjoint() differentiates a steady state, not a simulation. Omit it.")
     for label, number in (("rtol", rtol), ("atol", atol), ("step", step), ("max_step", max_step)):
         if number is not None and not isinstance(number, Tracer):
             _check_number(label, number, lambda x: x > 0, "positive and finite")
@@ -131,7 +121,7 @@ def settings_for(
         step=step,
         max_step=max_step,
         controller=controller,
-        adjoint=ADJOINTS[adjoint]() if isinstance(adjoint, str) else _whole_adjoint(adjoint, **given),
+        adjoint=None if isinstance(adjoint, str) else _whole_adjoint(adjoint, **given),
         max_steps=None if max_steps is None else int(max_steps),
         max_jumps=int(max_jumps),
         progress=progress,
@@ -240,108 +230,3 @@ def with_array_tolerances(settings: Settings, dtype: DTypeLike) -> Settings:
 
     values = {name: getattr(settings, name) for name in ("rtol", "atol", "step", "max_step")}
     return dataclasses.replace(settings, **{name: x if x is None else array(x) for name, x in values.items()})
-
-
-def resolve_adjoint(settings: Settings, adjoint: Any, arguments: Any) -> tuple[Settings, Any]:
-    """The settings, and the arguments of a simulation, guarded against forward mode if they are for reverse mode.
-
-    With `adjoint="auto"`, forward mode is chosen inside of `jax.jvp` or `jax.jacfwd`.
-    """
-    if adjoint == "auto" and any(map(is_moved_forward, jax.tree.leaves(arguments))):
-        settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
-    if isinstance(settings.adjoint, ADJOINTS["reverse"]) and not nothing_is_traced():
-        if any(map(is_moved_forward_below, jax.tree.leaves(arguments))):
-            _refuse_forward()
-        arguments = _guarded(_for_reverse, arguments)
-    return settings, arguments
-
-
-def guard_result(settings: Settings, trajectory: Any) -> Any:
-    """A trajectory, guarded against reverse mode if it is for forward mode.
-
-    The result is guarded, not the arguments: reverse mode starts at the result, and the loop would raise first.
-    """
-    return _guarded(_for_forward, trajectory) if settings.is_forward and not nothing_is_traced() else trajectory
-
-
-def _guarded(guard: Callable[[Any], Any], values: Any) -> Any:
-    return values if MISSING else jax.tree.map(lambda x: guard(x) if eqx.is_inexact_array(x) else x, values)
-
-
-def without_derivatives(settings: Settings) -> Settings:
-    """The settings outside of all transformations, without derivatives: a smaller program, the same numbers."""
-    if nothing_is_traced() and isinstance(settings.adjoint, ADJOINTS["reverse"]):
-        return dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
-    return settings
-
-
-def _refuse_forward(*_: Any) -> Any:
-    raise TypeError(
-        "A simulation for reverse mode is differentiated in forward mode (jax.jvp, jax.jacfwd, jax.linearize, "
-        'jax.hessian). Pass simulate(..., adjoint="forward"). If the function was compiled or linearized before, as '
-        'in jax.jacfwd(jax.jit(f)), "auto" cannot detect the mode. For a second derivative use jacfwd(jacfwd(f)).'
-    )
-
-
-def _refuse_reverse(*_: Any) -> Any:
-    raise TypeError(
-        "A simulation for forward mode, or a derivative of a simulation, is differentiated in reverse mode (jax.grad, "
-        'jax.jacrev, jax.vjp). For a first derivative use jax.grad(f) with adjoint="reverse" or "auto". For a second '
-        'derivative use jacfwd(jacfwd(f)) with adjoint="forward" or "auto".'
-    )
-
-
-def _guard(name: str, evaluate: Any, transpose: Any, batch: Any) -> Any:
-    """The identity. Its tangents pass through an operation of JAX with these rules, which raise in the wrong mode.
-
-    An operation is necessary because a program may be traced before, e.g. by `jax.jit`. The mode is then known only
-    when JAX differentiates the traced program.
-    """
-
-    def jvp(primals: Any, tangents: Any) -> Any:
-        (x_dot, x), (x_ddot, _) = primals, tangents
-        return on_tangents.bind(x_dot, x), [x_ddot] if is_no_tangent(x_ddot) else on_tangents.bind(x_ddot, x)
-
-    # Linear in the first argument (the tangent). The second argument is the point.
-    on_tangents: Any = None if MISSING else new_primitive(
-        name,
-        evaluate=evaluate,
-        shapes=lambda x_dot, x: [x_dot],
-        jvp=jvp,
-        transpose=transpose,
-        batch=lambda values, dims: (on_tangents.bind(*batch(values, dims)), [dims[0]]),
-        traced=evaluate,
-        lower_on_cpu=as_lowering(evaluate),
-    )  # fmt: skip
-
-    @jax.custom_jvp
-    def guarded(x: Any) -> Any:
-        return x
-
-    @guarded.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        return primals[0], on_tangents.bind(tangents[0], primals[0])[0]
-
-    return guarded
-
-
-def _refuse_many_directions(values: Any, dims: Any) -> Any:
-    if dims[0] is not None and dims[1] is None:  # many directions at one point: jax.jacfwd
-        _refuse_forward()
-    return values
-
-
-@jax.custom_jvp
-def _cotangent(ct: Any) -> Any:
-    return ct
-
-
-_cotangent.defjvp(lambda primals, tangents: _refuse_reverse())
-
-_for_reverse = _guard(
-    "reverse_mode_only",
-    _refuse_forward,
-    lambda cotangents, x_dot, x: [ct if is_no_tangent(ct) else _cotangent(ct) for ct in cotangents] + [None],
-    _refuse_many_directions,
-)
-_for_forward = _guard("forward_mode_only", lambda x_dot, x: [x_dot], _refuse_reverse, lambda values, dims: values)

@@ -27,7 +27,7 @@ from .._system.system import State, System
 from .events import events_of
 from .inputs import as_signals, inputs_at, is_coarse, is_samples, share_times, since, time_array, times_since
 from .integrate import refuse_captured, solve
-from .settings import guard_result, resolve_adjoint, settings_for, with_array_tolerances, without_derivatives
+from .settings import settings_for, with_array_tolerances
 from .status import Status
 from .trajectory import Trajectory
 
@@ -124,14 +124,10 @@ def simulate(
         check_bodies=not is_concrete(system),
     )
     given = checked_discontinuities(discontinuities, first_of(ts), dtype)
-    arguments = (system, state, origin, taus, share_times(since(first_of(ts), signals, dtype)), given)
-    arguments = arguments, captured_tracers(signals)
-    settings, (arguments, closures) = resolve_adjoint(settings, adjoint, arguments)
-    name_of_adjoint = type(settings.adjoint).__name__
-    settings = with_array_tolerances(without_derivatives(settings), dtype)
-    *arguments, given = arguments
-    trajectory = guard_result(settings, solve(*arguments, settings, given, closures=closures))
-    trajectory = dataclasses.replace(trajectory, adjoint=name_of_adjoint, **on_clock(ts, trajectory))
+    settings, relative = with_array_tolerances(settings, dtype), share_times(since(first_of(ts), signals, dtype))
+    closures = captured_tracers(signals)
+    trajectory = solve(system, state, origin, taus, relative, settings, given, closures=closures)
+    trajectory = dataclasses.replace(trajectory, **on_clock(ts, trajectory))
     if is_concrete(trajectory.status) and int(trajectory.status) == Status.NO_SOLUTION:
         values = values_of(system, state.x, inputs_at(system, signals, origin, state))
         raise ValueError(

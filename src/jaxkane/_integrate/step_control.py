@@ -135,15 +135,18 @@ class StepSizeController(diffrax.AbstractAdaptiveStepSizeController[Array, None]
         y_error: Any,
         error_order: Any,
         controller_state: Any,
+        error_of_tangent: Array | None = None,
     ) -> tuple[Any, Array, Array, Any, Any, diffrax.RESULTS]:
-        """Whether a step from (t0, y0) to (t1, y1_candidate) is accepted, and the next step: see diffrax."""
+        """Whether a step from (t0, y0) to (t1, y1_candidate) is accepted, and the next step: see diffrax.
+
+        `error_of_tangent`: the error of a tangent, relative to its size, or None."""
         y1, (state, inner_state) = y1_candidate, controller_state
-        chosen, measured = None, constant((y0, y1, y_error))
+        chosen, measured = None, constant((y0, y1, y_error, error_of_tangent))
         if self.inner is not None:
             keep, start, end, _, inner_state, _ = self.inner.adapt_step_size(
                 t0, t1, y0, y1, args, y_error, error_order, inner_state
             )
-            chosen, measured = constant((keep, end - start)), (*constant((y0, y1)), None)
+            chosen, measured = constant((keep, end - start)), (*constant((y0, y1)), None, None)
         decide = _decide if y0.size <= LARGEST_SUM else _decide.__wrapped__
         decision = decide(
             self._numbers(), constant(state), t0, t1, self._values(t0, t1, y1, args), measured, chosen,
@@ -176,6 +179,13 @@ class StepSizeController(diffrax.AbstractAdaptiveStepSizeController[Array, None]
             return None
         return self.event_values(*constant((t1, y1, args if t0 is t1 else args.in_step(t0, t1))))
 
+
+FEWEST_STEPS = 50
+"""The fewest steps of a simulation with error control. Where a motion rests, its error says nothing about longer steps:
+they would pass over a force that begins later."""
+
+TANGENT = 10.0
+"""The permitted error of a tangent in a step, relative to its largest size so far, is this multiple of `rtol`."""
 
 SHARE = 5e-3
 """The end of a fixed step and a sample are regarded as simultaneous within this share of the step."""
@@ -269,7 +279,7 @@ def _decide(
     t0: Array,
     t1: Array,
     end: EventValues | None,
-    measured: tuple[Array, Array, Any],
+    measured: tuple[Array, Array, Any, Array | None],
     chosen: tuple[Array, Array] | None,
     exponent: Array,
     stop_after_t0: Array | None,
@@ -277,14 +287,14 @@ def _decide(
 ) -> Decision:
     before, duration = ControllerState.unpacked(packed, len(control.events.names)), control.duration
     before = before._replace(jump=jnp.full_like(before.jump, -1.0))
-    y0, y1, error = measured
+    _, y1, *_ = measured
     length = jax.lax.stop_gradient(t1 - t0)
     shortest = _shortest(t1, duration)
     if control.step is not None:
         keep = jnp.all(jnp.isfinite(y1))
         h, too_short = _to_next(control.step, t1), ~keep
     else:
-        keep, h = _by_error(control, length, y0, y1, error, exponent) if chosen is None else chosen
+        keep, h = _by_error(control, length, *measured, exponent) if chosen is None else chosen
         h = jnp.minimum(h, control.longest)
         too_short, h = ~keep & (h < shortest), jnp.maximum(h, shortest)
         if end is not None and before.start is not None:
@@ -329,7 +339,13 @@ def _to_next(step: Array, t: Array) -> Array:
 
 
 def _by_error(
-    control: StepSizeController, h: Array, y0: Array, y1: Array, error: Array, exponent: Array
+    control: StepSizeController,
+    h: Array,
+    y0: Array,
+    y1: Array,
+    error: Array,
+    error_of_tangent: Array | None,
+    exponent: Array,
 ) -> tuple[Array, Array]:
     """Whether a step of the length h is accepted, and the length of the next one.
 
@@ -340,6 +356,8 @@ def _by_error(
     y1 = jnp.where(jnp.any(jnp.isnan(y1)), y0, y1)
     scaled = error / (control.atol + control.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1)))
     e = jnp.sqrt(jnp.mean(scaled * scaled))
+    if error_of_tangent is not None:
+        e = jnp.maximum(e, error_of_tangent / (TANGENT * jnp.maximum(control.rtol, 100 * jnp.finfo(e.dtype).eps)))
     e = jnp.where(e < jnp.inf, e, jnp.inf)  # NaN rates make an infinite error
     keep = e < 1
     factor = jnp.clip(0.9 * e**exponent, jnp.where(keep, 1.0, 0.2), jnp.where(keep, 10.0, 0.9))

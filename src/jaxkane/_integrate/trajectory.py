@@ -49,7 +49,9 @@ class Trajectory(eqx.Module):
         simulation ended at the last time or by an event; the time of an event depends on the parameters. Otherwise
         their derivatives are NaN.
     - `stats`: numbers of steps taken, accepted and rejected.
-    - `adjoint`: how the simulation is differentiated.
+    - `adjoint`: how the simulation is differentiated: "controlled" if the errors of derivatives are controlled too,
+        "fixed steps", or "steps of the motion" (with `controller` or a solver of several terms); or the name of an
+        adjoint of diffrax.
     - `units`: pairs of a name and its unit, as the system declares them.
     - `discontinuities`: where inputs are discontinuous, and their values on both sides, for `audit`; else None.
     - `jumps`: the jumps of the state, a `JumpTable`; None if the system has neither contacts nor events with `then`.

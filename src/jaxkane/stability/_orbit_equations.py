@@ -172,16 +172,14 @@ class OrbitEquations(eqx.Module):
         assert ride.end is not None
         return jnp.where(ride.ok, packed_motion(ride.end), jnp.nan)
 
-    def simulate(
-        self, args: OrbitArguments, y: Array, ts: Array, adjoint: Any = "forward", jumping: bool = False
-    ) -> Trajectory:
+    def simulate(self, args: OrbitArguments, y: Array, ts: Array, jumping: bool = False) -> Trajectory:
         """A simulation that does not end at the section, or ends there before its jump. With `jumping` it continues."""
         system = args.system if jumping else with_section(args.system, self.section, self.jumps)
         if self.constrained:  # `simulate` refuses a state that violates the constraints
             n_q = len(system.coordinates)
             y = jnp.concatenate([projected(system, ts[0], y[:n_q]), y[n_q:]])
         options = {"rtol": self.rtol, "atol": self.atol, "solver": self.solver, "max_steps": self.max_steps}
-        return simulate(system, unpacked(system, y), ts, args.inputs, adjoint=adjoint, **options)
+        return simulate(system, unpacked(system, y), ts, args.inputs, **options)
 
     def _ends(self, f: Any, segments: Array) -> Any:
         """f(segment, last) of all segments. They share one program, but the last one has its own if it ends by a

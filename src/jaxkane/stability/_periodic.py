@@ -693,7 +693,7 @@ def _ride(equations: OrbitEquations, z: Array, args: OrbitArguments) -> Trajecto
     # A ride to a jump ends just before it: a sample at its time would be on either side.
     last = 1.0 - 1e-9 if equations.jumps else 1.0
     ts = args.t + jnp.linspace(0.0, last, 201, dtype=z.dtype) * T
-    return equations.simulate(args, y, ts, adjoint="auto", jumping=equations.jumps and equations.returns > 1)
+    return equations.simulate(args, y, ts, jumping=equations.jumps and equations.returns > 1)
 
 
 def _no_orbit(name: str, equations: OrbitEquations, entries: tuple[str, ...], found: _Found) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import sys
 import warnings
@@ -17,7 +16,7 @@ from tqdm import tqdm
 
 from .._common.lookup import refuse_unknown
 from .._integrate.integrate import refuse_captured
-from .._integrate.settings import resolve_adjoint, settings_for, without_derivatives
+from .._integrate.settings import settings_for
 from .._integrate.simulate import as_state, checked_times, clock_of
 from .._integrate.status import Status
 from .._integrate.trajectory import Trajectory
@@ -136,12 +135,8 @@ def sweep(
     if not is_concrete(members, shared, ts, closures):  # inside jit, grad or vmap
         if folder is not None or client is not None:
             raise ValueError("sweep: `folder` and `client` cannot be used inside jit, grad or vmap.")
-        adjoint, arguments = options.get("adjoint", "auto"), (members, shared, origin, taus, closures)
-        settings, (members, shared, origin, taus, closures) = resolve_adjoint(settings, adjoint, arguments)
-        task = Task(shared, origin, taus, settings, reduce, task.mesh, closures)
         return Sweep.of(task.solve(members, n), axes, ts, reduce is not None)
 
-    task = dataclasses.replace(task, settings=without_derivatives(settings))
     size = n if n <= GROUP else GROUP * -(-min(chunk, n) // GROUP)
     files = like = None
     if folder is not None:

@@ -100,7 +100,6 @@ class Simulation:
             solver=solver,
             # A placeholder: `Model.simulate` replaces it by the step of each window.
             step=1.0 if fixed else None,
-            adjoint="forward",
             # With a fixed step, the default is the number of steps in a window.
             max_steps=self.max_steps if self.max_steps is not None or fixed else 8192,
         )
