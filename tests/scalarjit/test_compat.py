@@ -14,7 +14,7 @@ from jaxkane._scalarjit import compat as internals
 from jaxkane._scalarjit.scalar_function import ScalarFunction
 
 USED = {
-    "jax.extend.core": "ClosedJaxpr Jaxpr JaxprEqn Primitive jaxpr_as_fun get_opaque_trace_state",
+    "jax.extend.core": "ClosedJaxpr Jaxpr JaxprEqn Primitive jaxpr_as_fun",
     "jax.interpreters.ad": "Zero instantiate_zeros is_undefined_primal primitive_jvps primitive_transposes",
     "jax.interpreters.batching": "primitive_batchers",
     "jax.interpreters.mlir": "lower_fun register_lowering",

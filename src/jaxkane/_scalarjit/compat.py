@@ -4,11 +4,8 @@ Each feature has a fallback. If a release removes a feature, results stay right;
 
 | feature | without it |
 |---|---|
-| jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `MISSING` states the reason; right-hand sides are plain JAX
-|
+| jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `MISSING` states the reason; rates are plain JAX, errors of derivatives are not controlled |
 | the frontend attribute that makes one function of a program | XLA splits the program as any other |
-| tracers of a derivative in forward mode | forward mode needs `adjoint="forward"` |
-| the state of traces | simulations are compiled with derivatives that are not needed, a tenth slower at first |
 | `_filter_jit_cache` of equinox | compiled programs are never freed |
 | `reset_cache`, equinox's setting for its checks | programs are stored only if the environment sets it from the start |
 | `eval_context` | a sweep on a cluster may be refused, because programs that were first traced in a check differ |
@@ -252,23 +249,6 @@ def new_variable(like: Variable) -> Variable:
     return Var(like.aval)
 
 
-def is_moved_forward(x: Any) -> bool:
-    """Whether `x` is being differentiated in forward mode (`jax.jvp`, `jax.jacfwd`) and will not be transposed."""
-    try:
-        from jax.interpreters.ad import JVPTracer
-        from jax.interpreters.partial_eval import JaxprTracer
-    except ImportError:
-        return False
-    while isinstance(x, Tracer) and not isinstance(x, JVPTracer) and hasattr(x, "val"):
-        x = x.val  # of a batch
-    return isinstance(x, JVPTracer) and not isinstance(x.tangent, JaxprTracer)
-
-
-def is_moved_forward_below(x: Any) -> bool:
-    """Whether `x` is being differentiated, and this derivative in forward mode again: `jax.hessian`."""
-    return is_moved_forward(getattr(x, "primal", None))
-
-
 def is_under_way(x: Tracer) -> bool:
     """Whether the trace of a tracer is not finished. After its end every operation raises an exception."""
     try:
@@ -313,18 +293,6 @@ def concretely() -> contextlib.AbstractContextManager[Any]:
     except ImportError:
         return jax.ensure_compile_time_eval()
     return eval_context()
-
-
-def nothing_is_traced() -> bool:
-    """Whether no trace is active, so that the current computation cannot be differentiated."""
-    try:
-        from jax.core import eval_context
-        from jax.extend.core import get_opaque_trace_state
-    except ImportError:
-        return False
-    with eval_context():
-        plain = get_opaque_trace_state()
-    return get_opaque_trace_state() == plain
 
 
 def on_device(x: Any, dtype: Any = None) -> jax.Array:

@@ -1,0 +1,128 @@
+"""Derivatives where the motion, or a part of it, rests: its own error says nothing about their steps."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.linalg
+
+import jaxkane as jk
+
+A = np.array([[0.0, 1.0], [-1.0, -0.2]])  # of the oscillator below
+
+
+class Oscillator(jk.System):
+    """A block of 1 kg on a spring, beside a second block on a stiff spring."""
+
+    damping: jk.Scalar = jk.parameter(0.2)
+    force: jk.Scalar = jk.parameter(0.0)
+    stiffness: jk.Scalar = jk.parameter(400.0)
+    amplitude: jk.Scalar = jk.parameter(0.0)
+    inputs = ("push",)
+    coordinates, speeds = ("x", "y"), ("v", "w")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        x, y = O.moving(q["x"] * N.x, u["v"] * N.x), O.moving(q["y"] * N.y, u["w"] * N.y)
+        return jk.Motion([jk.Body(1.0, 0.0, x, name="slow"), jk.Body(1.0, 0.0, y, name="fast")])
+
+    def loads(self, t, q, u, motion, inputs):
+        slow = self.force + inputs["push"] - q["x"] - self.damping * u["v"]
+        fast = self.amplitude * jnp.sin(30.0 * t) - self.stiffness * q["y"]
+        return [jk.Force(slow * motion.N.x, motion["slow"]), jk.Force(fast * motion.N.y, motion["fast"])]
+
+
+def end(p, scale=1.0, tolerance=None, **options):
+    """x(10) and y(10), from the start, the force, the amplitude and the size of an input that is zero."""
+    state = jk.State(p[:2], jnp.zeros(2))
+    wave = lambda t, state: p[4] * jnp.sin(30.0 * t)  # noqa: E731
+    options |= {} if tolerance is None else {"rtol": tolerance, "atol": tolerance}
+    ride = jk.simulate(Oscillator(force=p[2], amplitude=p[3]), state, [0.0, 10.0], {"push": wave}, **options)
+    return jnp.stack([ride["x"][-1], ride["y"][-1]])
+
+
+def right():
+    """The matrix of derivatives of `end` at any point, because the equations are linear."""
+    w = 30.0
+    forced = scipy.integrate.solve_ivp(
+        lambda t, z: A @ z + [0.0, np.sin(w * t)], (0, 10), [0.0, 0.0], rtol=1e-12, atol=1e-14, method="DOP853"
+    )
+    fast = (np.sin(w * 10) - w / 20 * np.sin(200.0)) / (400 - w * w)
+    x0 = scipy.linalg.expm(10 * A)[0, 0]
+    return np.array([[x0, 0.0, 1 - x0, 0.0, forced.y[0, -1]], [0.0, np.cos(200.0), 0.0, fast, 0.0]])
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("start", [0.0, 1e-9])
+def test_derivatives_at_rest_are_those_of_the_closed_form(mode, start):
+    """Also of a fast part beside a slow one, and by amplitudes of forces that are zero."""
+    for place in ([start, start], [1.0, start]):
+        found = jax.jit(mode(end))(jnp.array([*place, 0.0, 0.0, 0.0]))
+        np.testing.assert_allclose(found, right(), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_derivatives_at_rest_become_as_accurate_as_their_tolerance():
+    p = jnp.zeros(5)
+    np.testing.assert_allclose(jax.jacfwd(lambda p: end(p, tolerance=1e-10))(p), right(), atol=1e-7)
+
+
+@pytest.mark.slow
+def test_one_member_at_rest_beside_one_that_moves():
+    p = jnp.array([[0.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.5, 0.0, 0.2, 0.0]])
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.vmap(mode(end))(p), np.stack([right()] * 2), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_value_is_the_same_with_and_without_its_derivative():
+    p = jnp.array([0.3, 0.2, 0.1, 0.4, 0.5])
+    value = jax.jit(end)(p)
+    both = jax.jit(lambda p: jax.jvp(end, (p,), (p,)))(p)
+    np.testing.assert_allclose(both[0], value, rtol=1e-14)
+
+
+@pytest.mark.slow
+def test_an_adjoint_of_diffrax_differentiates_the_steps_of_the_motion():
+    p = jnp.array([0.3, 0.0, 0.0, 0.0, 0.0])
+    plain = jk.simulate(Oscillator(), jk.State(p[:2], jnp.zeros(2)), [0.0, 10.0], adjoint=diffrax.ForwardMode())
+    assert plain.adjoint == "ForwardMode"
+    found = jax.jacfwd(lambda p: end(p, adjoint=diffrax.ForwardMode()))(p)
+    assert abs(found[1, 1] - np.cos(200.0)) > 0.1  # the steps do not resolve the fast part, which rests
+
+
+@pytest.mark.slow
+def test_a_stiff_part_that_has_decayed_does_not_shorten_the_steps():
+    """u1' = -1e4 u1, as a first-order state beside a slow one."""
+
+    class Stiff(jk.System):
+        rate: jk.Scalar = jk.parameter(1e4)
+        coordinates, speeds, states = ("x",), ("v",), ("z",)
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="block")])
+
+        def loads(self, t, q, u, motion, inputs):
+            return jk.Force(-q["x"] * motion.N.x, motion["block"])
+
+        def state_rates(self, t, q, u, x, motion, now):
+            return {"z": -self.rate * (x[0] - q["x"])}
+
+    def last(x):
+        state = jk.State(jnp.stack([x]), jnp.zeros(1), jnp.zeros(1))
+        return jk.simulate(Stiff(), state, [0.0, 10.0], solver=diffrax.Kvaerno5())["z"][-1]
+
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(last))(1.0), np.cos(10.0), atol=1e-3)
+
+
+@pytest.mark.parametrize("begin", [3.0, 3.07, 7.13])
+def test_a_smooth_force_that_begins_after_a_rest_is_not_passed_over(begin):
+    """A force that acts on the slow block for about a tenth of a second."""
+    pulse = lambda t, state: 2.0 * jnp.exp(-(((t - begin) / 0.05) ** 2))  # noqa: E731
+    ride = jk.simulate(Oscillator(), jk.State(jnp.zeros(2), jnp.zeros(2)), np.linspace(0.0, 10.0, 501), {"push": pulse})
+    rates = lambda t, z: A @ z + [0.0, 2.0 * np.exp(-(((t - begin) / 0.05) ** 2))]  # noqa: E731
+    exact = scipy.integrate.solve_ivp(rates, (0.0, 10.0), [0.0, 0.0], rtol=1e-11, atol=1e-13, max_step=0.01).y[0, -1]
+    np.testing.assert_allclose(ride["x"][-1], exact, atol=1e-6)
