@@ -517,8 +517,6 @@ NOT_YET: dict[str, str] = {
     "critical_speeds-values": "accepted: empty",
     "critical_speeds-states": "AttributeError of Python: empty, unknown name",
     "critical_speeds-modes": "AttributeError of Python: all",
-    "periodic-inputs": "reaches a program: not finite of an entry, wrong shape of an entry, empty of an entry, "
-        "unknown name; message of Python: wrong type of an entry; AttributeError of Python: wrong type, sequence",
     "periodic-rtol": "reaches a program: not finite; message of Python: wrong type, wrong shape, empty",
     "periodic-atol": "reaches a program: not finite; message of Python: wrong type, wrong shape, empty",
     "periodic-max_steps": "reaches a program: all",

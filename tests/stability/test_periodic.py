@@ -151,6 +151,126 @@ def test_a_forced_linear_oscillator():
     assert np.isnan(orbit.trivial_multiplier)
 
 
+class Driven(Particle):
+    inputs = ("push",)
+
+    def loads(self, t, q, u, motion, inputs):
+        force = inputs["push"] - q["x"] - 0.1 * u["v"]
+        return (jk.Force(force * motion.N.x, motion["particle"]),)
+
+
+def push(amplitude, t, state):
+    return amplitude * jnp.cos(1.3 * t)
+
+
+def driven(amplitude=1.0, guess=REST, period=2 * np.pi / 1.3, t=0.0):
+    inputs = {"push": jax.tree_util.Partial(push, jnp.asarray(amplitude))}
+    return periodic(Driven(), guess, inputs, period=period, autonomous=False, t=t)
+
+
+def test_an_input_function_forces_an_orbit():
+    np.testing.assert_allclose(driven().states[0], forced(1.3)[:2], rtol=1e-10)
+
+
+def test_the_orbit_at_time_stamps_of_today_has_the_phase_of_the_force():
+    """In extended precision. A time near 1.7e9 s is rounded to 2e-7 s."""
+    orbit, t = driven(t=1.7e9), np.longdouble(1.7e9)
+    response = (forced(1.3)[0] - 1j * forced(1.3)[1] / 1.3) * np.exp(1j * np.longdouble(1.3) * t)
+    np.testing.assert_allclose(orbit.states[0], [response.real, (1.3j * response).real], rtol=1e-5)
+    np.testing.assert_allclose(orbit.t, 1.7e9, rtol=1e-15)
+
+
+def test_an_orbit_may_have_the_amplitude_zero():
+    for start in (1e-9, 0.1):
+        orbit = driven(0.0, jk.State([start], [0.0]))
+        np.testing.assert_allclose(orbit.states[0], 0.0, atol=1e-12)
+        assert orbit.residual < 1e-6
+
+
+def test_a_period_that_the_force_does_not_have_raises():
+    for part in (0.5, 1.001):
+        with pytest.raises(ValueError, match=r"the equations at t and t \+ period differ"):
+            driven(period=part * 2 * np.pi / 1.3)
+
+
+def test_input_functions_that_use_the_time_or_traced_numbers_raise():
+    with pytest.raises(ValueError, match="the equations depend on the time"):
+        periodic(Driven(), NEAR, {"push": lambda t, state: jnp.cos(t)}, period=6.3)
+    with pytest.raises(TypeError, match="uses a traced number from a closure"):
+        jax.eval_shape(lambda k: periodic(Driven(), NEAR, {"push": lambda t, state: k}, period=6.3).period, 1.0)
+
+
+@pytest.mark.slow
+def test_a_family_in_the_frequency_requires_the_period_as_a_function():
+    orbit = periodic(Oscillator(), REST, period=2 * np.pi / 1.3, autonomous=False)
+    with pytest.raises(ValueError, match="'frequency' changes the period of the force"):
+        family(Oscillator(), orbit, towards={"frequency": 1})
+
+
+class WithFilter(VanDerPol):
+    """An event that reads a first-order state."""
+
+    states = ("low",)
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return (q["x"] - x["low"],)
+
+    def events(self, t, q, u, x):
+        return {"mean": jk.falling(q["x"] - x["low"])}
+
+
+@pytest.mark.slow
+def test_a_section_may_read_first_order_states_at_any_time():
+    orbit = periodic(WithFilter(), jk.State([1.9], [-0.5], [1.9]), section="mean", period=6.66, t=1.7e9)
+    np.testing.assert_allclose(orbit.period, MU_1[1], rtol=1e-11)
+    np.testing.assert_allclose(orbit["x"], orbit["low"], rtol=1e-11)
+    np.testing.assert_allclose(orbit.multipliers, [np.exp(-MU_1[1]), MU_1[2]], rtol=1e-7)
+
+
+class VibratingTable(Particle):
+    """A ball of 1 kg on a table with the height A sin(w t).
+
+    An orbit with one impact in a period T = 2 pi / w has A w cos(w t) = g T (1 - e) / (2 (1 + e)) at the impact.
+    """
+
+    amplitude: Scalar = parameter(0.03)
+    frequency: Scalar = parameter(20.0)
+    restitution: Scalar = parameter(0.5)
+
+    def force(self, t, x, v):
+        return -9.81
+
+    def contacts(self, t, q, u, motion):
+        table = self.amplitude * jnp.sin(self.frequency * t)
+        return {"table": jk.Contact(gap=q["x"] - table, restitution=self.restitution)}
+
+
+def on_table(amplitude, share):
+    """Height and speed of the ball at this share of the period after the table's middle, by the formula above."""
+    T, g = 2 * np.pi / 20, 9.81
+    impact = np.arccos(g * T / 6 / (20 * amplitude)) / 20
+    flight = share * T - impact
+    flight += T * (flight < 0)
+    height = amplitude * np.sin(20 * impact) + 0.5 * g * flight * (T - flight)
+    return jk.State([height], [g * (0.5 * T - flight)])
+
+
+@pytest.mark.weekly
+def test_a_ball_on_a_vibrating_table_and_its_fold():
+    guess = on_table(0.0301, 0.5)
+    start = jk.simulate(VibratingTable(), guess, np.array([0.5, 0.500001]) * np.pi / 10).state(0)
+    assert start.contacts is not None
+    orbit = periodic(VibratingTable(), start, t=np.pi / 20, **FORCED)
+    np.testing.assert_allclose(orbit.states[0], [*on_table(0.03, 0.5).q, *on_table(0.03, 0.5).u], rtol=1e-9)
+    np.testing.assert_allclose(
+        orbit.multipliers, [-0.0862431836 + 0.4925059535j, -0.0862431836 - 0.4925059535j], rtol=1e-7
+    )
+    found = family(VibratingTable(), orbit, towards={"amplitude": -1}, steps=8)
+    (fold,) = found.bifurcations
+    assert fold.kind == "fold"
+    np.testing.assert_allclose(fold.value, 9.81 * np.pi / 1200, rtol=1e-8)
+
+
 @pytest.mark.weekly
 def test_derivatives_of_a_forced_orbit_include_those_of_its_period():
     def found(frequency):
@@ -313,7 +433,11 @@ def test_rimless_wheel():
     orbit = periodic(RimlessWheel(), jk.State([-0.32, 0.0], [1.2]), section="step")
     np.testing.assert_allclose([orbit["rate"], orbit.multipliers[0].real], wheel_by_formula(0.4, 0.08), rtol=1e-11)
     np.testing.assert_allclose([orbit["angle"], orbit.trivial_multiplier], [0.08 - 0.4, 1.0], rtol=1e-11)
-    np.testing.assert_allclose(orbit.ride["angle"][-1], 0.08 + 0.4, rtol=1e-8)
+    ride = orbit.ride
+    np.testing.assert_allclose(ride["angle"][-1], 0.08 + 0.4, rtol=1e-8)
+    assert int(ride.jumps.count) == 1
+    np.testing.assert_allclose(ride.jumps.t[0], orbit.period, rtol=1e-10)
+    np.testing.assert_allclose(ride.jumps.energy[0], 0.5 * (orbit["rate"] * np.tan(0.8)) ** 2, rtol=1e-9)
 
 
 @pytest.mark.weekly
@@ -373,7 +497,11 @@ def test_a_two_step_gait_beyond_the_period_doubling():
     np.testing.assert_allclose([*after.q[1, :2], *after.u[1]], [*start.q[:2], *start.u], rtol=1e-9)
     np.testing.assert_allclose(walk.jumps.t[1], orbit.period, rtol=1e-10)
     assert np.abs(after.q[0, :2] - start.q[:2]).min() > 0.01
-    assert int(orbit.ride.jumps.count) == 1  # the ride ends before the second jump
+    jumps = orbit.ride.jumps
+    assert np.max(np.abs(jk.audit(orbit.system, orbit.ride).energy_error)) < 1e-6
+    assert int(jumps.count) == 2  # the samples end before the second jump
+    np.testing.assert_allclose(jumps.energy[:2], walk.jumps.energy[:2], rtol=1e-9)
+    np.testing.assert_allclose(jumps.impulses[:2], walk.jumps.impulses[:2], rtol=1e-9)
     np.testing.assert_allclose(orbit.ride["swing"][-1], orbit["stance"], rtol=1e-7)  # 1e-9 of a period before it
     low, high = (gait_of_two_steps(slope + h).period for h in (-1e-4, 1e-4))
     slope_of_period = jax.jit(jax.grad(lambda slope: gait_of_two_steps(slope).period))(slope)
@@ -427,6 +555,11 @@ class Ratchet(Pushed):
 def test_a_coordinate_in_the_condition_of_an_event_must_be_periodic():
     with pytest.raises(ValueError, match="no periodic orbit was found"):
         periodic(Ratchet(), jk.State([0.3, 5.0], [0.0, 0.2]), period=6.3)
+
+
+def test_an_orbit_under_a_trace_has_the_multipliers_of_all_states_that_events_use():
+    found = jax.eval_shape(lambda T: periodic(Ratchet(), jk.State([0.3, 5.0], [0.0, 0.2]), period=T).multipliers, 6.3)
+    assert found.shape == (3,)
 
 
 # -- bad input

@@ -521,10 +521,10 @@ def _work_with_jumps(
     a mass centre, and no load does work on that.
     """
     jumps: Any = jax.tree.map(np.asarray, trajectory.jumps)
-    m = int(jumps.count)
     t = np.asarray(trajectory.t, float)[reached]
-    times, eps = np.asarray(jumps.t, float)[:m], float(np.finfo(jumps.t.dtype).eps)
-    near = 64 * eps * (t[-1] - t[0])
+    near = 64 * float(np.finfo(jumps.t.dtype).eps) * (t[-1] - t[0])
+    m = int(np.sum(np.asarray(jumps.t, float) <= t[-1] + near))  # the ride of an orbit ends before its last jump
+    times = np.asarray(jumps.t, float)[:m]
     # Jumps within a rounding error are one: no polynomial can pass between them.
     first = np.flatnonzero(np.append(True, np.diff(times) > near)[:m])
     last = np.append(first[1:], m)[: len(first)] - 1

@@ -79,9 +79,9 @@ class Probing(NamedTuple):
         """The direction of these arguments, in which a solver may have replaced samples by numbers."""
         if callable(args.signals):
             return self.args
-        every = self.args.signals.items()
         signals = {
-            name: d.values[0] if is_samples(d) and not is_samples(args.signals[name]) else d for name, d in every
+            name: d if not is_samples(d) or is_samples(args.signals[name]) else None if d.values is None else d.values[0]
+            for name, d in self.args.signals.items()
         }
         return dataclasses.replace(self.args, signals=signals)
 

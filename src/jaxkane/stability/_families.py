@@ -18,7 +18,7 @@ from .._scalarjit.cache_key import jit
 from .._system.parameters import parameters_in, with_parameters
 from .._system.system import System, packed
 from ._continuation import Family, SolutionCurve, steady_family
-from ._orbit_equations import OrbitArguments, OrbitEquations, packed_rates
+from ._orbit_equations import OrbitArguments, OrbitEquations, packed_rates, repeats
 from ._periodic import Orbit, as_orbit, normal_at, orbit_equations, scales_at
 from ._steady import SteadyMotion
 
@@ -162,6 +162,10 @@ def family(
     args = start.arguments._replace(system=system, center=packed(start.state))
     kept = [start.equations.hold.index(i) for i in equations.hold]
     args = args._replace(targets=args.targets[np.array(kept, int)])
+    if parameter and not equations.autonomous:
+        z, other = start.unknowns, _with_value(args, parameter, 1.01 * _value(args, parameter) + 1e-4)
+        if not repeats(*other[:3], other.start, equations.period(z, other), equations.skipped(z, other)):
+            raise ValueError(f"{label}: {name!r} changes the period of the force. Pass a function as its `period`.")
     curve = _OrbitCurve(equations, parameter, args, start.unknowns, dict(until or {}), label)
     y = curve.first
     if np.max(np.abs(curve.evaluate(y)[0])) > 1e-6:

@@ -1,4 +1,4 @@
-"""The equations of a periodic orbit by multiple shooting, and their derivatives."""
+"""The equations of a periodic orbit by multiple shooting, their derivatives, and the quantities that must repeat."""
 
 from __future__ import annotations
 
@@ -15,16 +15,22 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._integrate.contact_jumps import rates_from_motion
-from .._integrate.events import event_values, own_events_of
-from .._integrate.inputs import as_signals, inputs_at
+from .._integrate.events import event_values, events_of, own_events_of
+from .._integrate.inputs import Samples, as_signals, inputs_at, samples_of
 from .._integrate.jumps import stages_of, state_after
 from .._integrate.simulate import simulate
 from .._integrate.status import Status
 from .._integrate.trajectory import Trajectory
+from .._kane.arguments import is_concrete
 from .._kane.constraint_residuals import configuration_residual, coordinate_units, projected
-from .._kane.contact import has_contacts
-from .._kane.right_hand_side import vector_field
-from .._system.system import System, packed_motion, unpacked, with_class
+from .._kane.contact import has_contacts, layout_of, terms_at
+from .._kane.kanes_method import KaneEquations
+from .._kane.right_hand_side import reads_time, values_of, vector_field
+from .._scalarjit.cache_key import captures_any, jit
+from .._scalarjit.compat import concretely, depends_on
+from .._scalarjit.components import as_vector
+from .._system.system import System, call_with_states, packed_motion, unpacked, with_class
+from ._steady import cyclic_coordinates
 
 
 class OrbitArguments(NamedTuple):
@@ -32,7 +38,8 @@ class OrbitArguments(NamedTuple):
 
     Fields:
 
-    - `system`: the system. `inputs`: as for `simulate`. `t`: the time of the start [s].
+    - `system`: the system. `inputs`: as for `simulate`.
+    - `t`: the time of the start [s], without `skipped`: seconds of an autonomous system, or whole periods of a force.
     - `period` [s]: of a force, unless it is a function of the system. With a jump at the section: an estimate of the
       period.
     - `start` (n_y,): a packed state, from which the drifting coordinates are taken.
@@ -44,6 +51,7 @@ class OrbitArguments(NamedTuple):
     system: System
     inputs: Any
     t: Array
+    skipped: Array
     period: Array
     start: Array
     advance: Array
@@ -108,6 +116,10 @@ class OrbitEquations(eqx.Module):
         if self.autonomous:
             return z[-1]
         return args.period if self.period_of is None else jnp.asarray(self.period_of(args.system), z.dtype)
+
+    def skipped(self, z: Array, args: OrbitArguments) -> Array:
+        """The time [s] before the clock of the orbit. Time stamps near 1.7e9 s would blur the times of its steps."""
+        return args.skipped * (1.0 if self.autonomous else self.period(z, args))
 
     def rows(self, z: Array) -> Float[Array, "K n"]:
         """The closed entries at the start of each segment."""
@@ -284,7 +296,8 @@ class OrbitEquations(eqx.Module):
             )  # an entry that is zero along the orbit is compared with others
             own = amplitude[self.closed.index(i)]
             largest.append(jnp.ones_like(own) if i < n_q and units[i] == "rad" else jnp.maximum(own, least))
-        sizes = jnp.tile(jnp.stack(largest), self.segments)
+        # An orbit may have the amplitude zero. Errors of closing below `atol` are those of the simulation.
+        sizes = jnp.tile(jnp.maximum(jnp.stack(largest), self.atol / closing_tolerance(z.dtype)), self.segments)
         return jax.lax.stop_gradient(jnp.append(sizes, T) if self.autonomous else sizes)
 
     def return_matrix(self, segments: Array, z: Array, args: OrbitArguments) -> Float[Array, "m m"]:
@@ -337,6 +350,11 @@ class OrbitEquations(eqx.Module):
         return basis[:, len(vectors) :]
 
 
+def closing_tolerance(dtype: Any) -> float:
+    """An orbit closes if its residuals are below this part of the amplitude. Newton's method reaches 1e-12 or fails."""
+    return max(1e-6, float(jnp.finfo(dtype).eps) ** 0.5)
+
+
 def packed_rates(args: OrbitArguments, t: Array, y: Array) -> Array:
     """The rates of a packed state with the inputs of an orbit."""
     state = unpacked(args.system, y)
@@ -364,10 +382,104 @@ def with_section(system: System, section: str, jumps: bool) -> System:
 @functools.cache
 def _with_section(kind: Any, section: str, jumps: bool) -> Any:
     class WithSection(kind):
-        def events(self, t, q, u):
-            events = super().events(t, q, u)
+        def events(self, t, q, u, x):
+            events = call_with_states(super().events, t, q, u, x)
             ending = {section: dataclasses.replace(events[section], stages=())} if jumps else {}
             return {name: event for name, event in events.items() if name != section} | ending
 
     WithSection.__name__ = WithSection.__qualname__ = kind.__name__
     return WithSection
+
+
+def drifting_coordinates(system: System, inputs: Any, y: Array) -> set[str]:
+    """Names of the cyclic coordinates that need not be periodic: no event, no contact, no input function and no
+    periodic coordinate uses them. The trials have parameters near one, so that the result is the same under a trace."""
+    names, cyclic = system.coordinates, cyclic_coordinates(system)
+    if not cyclic:
+        return set()
+    rng, slopes = np.random.default_rng(0), [np.array(np.nan)] * 3
+
+    def trial(x: Any) -> Any:
+        return jnp.asarray(rng.uniform(0.5, 1.5, x.shape), x.dtype) if eqx.is_inexact_array(x) else x
+
+    with concretely():
+        for k in range(4):
+            args = jax.tree.map(trial, (system, inputs))
+            if k >= 2 and is_concrete(system, inputs):  # for quantities that are NaN for parameters near one
+                args = system, inputs
+            found = _slopes_of_used(*args, jnp.asarray(rng.uniform(-1.0, 1.0, y.shape), y.dtype))
+            slopes = [np.fmax(x, np.abs(np.asarray(more))) for x, more in zip(slopes, found, strict=True)]
+    exact, rounded, of_coordinates = slopes
+    # Contacts may depend on a rotation of everything by rounding errors.
+    limit = float(jnp.finfo(y.dtype).eps) ** 0.6 * (1.0 + rounded.max(axis=1, initial=0.0, keepdims=True))
+    periodic = np.array([name not in cyclic for name in names])
+    periodic |= np.any(~(exact <= 0), axis=0) | np.any(~(rounded <= limit), axis=0)
+    uses = np.any(~(of_coordinates <= 0), axis=0)  # (n_q, n_q)
+    for _ in names:
+        periodic |= uses[periodic].any(axis=0)
+    return {name for name, is_periodic in zip(names, periodic, strict=True) if not is_periodic}
+
+
+@jit
+def _slopes_of_used(system: System, inputs: Any, y: Array) -> tuple[Array, ...]:
+    n_q, t = len(system.coordinates), jnp.zeros((), y.dtype)
+    return jax.jacfwd(lambda q: _used_quantities(system, inputs, t, y.at[:n_q].set(q)))(y[:n_q])
+
+
+def _used_quantities(system: System, inputs: Any, t: Array, y: Array) -> tuple[Array, Array, Array]:
+    """What determines the motion in addition to the accelerations.
+
+    - (m,): inputs, event functions, their conditions, new speeds and states after their jumps.
+    - (k,): gaps, normal velocities, squares of the slips, and coefficients of contacts.
+    - (1 + j, n_q): the rates of the coordinates, and their new values after each jump.
+    """
+    n_q, state = len(system.coordinates), unpacked(system, y)
+    values, events = inputs_at(system, inputs, t, state), own_events_of(system, t, state)
+    found, of_contacts = [jnp.zeros(0, y.dtype), *(jnp.reshape(x, 1) for x in values.values())], [y[:0]]
+    of_coordinates = [as_vector(KaneEquations(system, t, state.q, state.u).q_dot, y)]
+    if events.names:
+        at = event_values(system, t, y, jnp.zeros_like(y))
+        found += [at.values, at.conditions]
+    for i in np.flatnonzero(events.stages):
+        after = state_after(system, t, y, jnp.asarray(i, y.dtype), stages_of(events))
+        found, of_coordinates = [*found, after[n_q:]], [*of_coordinates, after[:n_q]]
+    if has_contacts(system):
+        terms = terms_at(system, t, state.q, state.u, values_of(system, state.x, values))
+        of_contacts = [terms.gaps, terms.v[:, 0], jnp.sum(terms.v[:, 1:] ** 2, axis=1), *terms.laws]
+    return jnp.concatenate(found), jnp.concatenate(of_contacts), jnp.stack(of_coordinates)
+
+
+def uses_time(system: System, inputs: Any, y: Array) -> tuple[bool, bool]:
+    """Whether the rates and inputs use the time, and whether events, jumps and contacts do."""
+    t, state = jnp.zeros((), y.dtype), unpacked(system, y)
+    program = jax.make_jaxpr(lambda t: [*inputs_at(system, inputs, t, state).values()])(t)
+    events, which = events_of(system, t, state), stages_of(own_events_of(system, t, state))
+    jumps = state_after.program(system, t, y, t, which)[1] if any(which.stages) else None
+    of_jumps = jumps is not None and jumps.reads[len(jax.tree.leaves(system))]
+    return reads_time(system, y.dtype) or any(depends_on(program, [0])), events.read_time or of_jumps
+
+
+@jit
+def repeats(system: System, inputs: Any, t: Array, y: Array, period: Array, skipped: Array) -> Array:
+    """Whether the equations near a packed state are the same at random times, one `period` later, and `skipped` [s]
+    later. True with `Samples`, which need not continue after one period."""
+    of_rates, of_events = uses_time(system, inputs, y)
+    if not (of_rates or of_events) or samples_of((system, inputs)) or captures_any(Samples, system, inputs):
+        return jnp.array(True)
+    rng, eps = np.random.default_rng(0), float(jnp.finfo(y.dtype).eps)
+
+    def quantities(t: Array, y: Array) -> Array:
+        parts = [*map(jnp.ravel, _used_quantities(system, inputs, t, y))] if of_events else []
+        if of_rates:
+            with_memory = jnp.pad(y, (0, layout_of(system).memory_size))  # all contacts are open
+            parts.append(vector_field(system, t, with_memory, inputs_at(system, inputs, t, unpacked(system, y))))
+        return jnp.concatenate(parts)
+
+    shifts = jnp.stack([0.0 * t, period, skipped])[None, None]
+    times = t + period * jnp.asarray(rng.uniform(size=(1, 8, 1)), y.dtype) + shifts
+    away = jnp.asarray(rng.uniform(-0.1, 0.1, y.shape), y.dtype) * (1.0 + jnp.abs(y))
+    at = [x.reshape(48, -1) for x in jnp.broadcast_arrays(times[..., None], jnp.stack([y, y + away])[:, None, None])]
+    found = jax.lax.map(lambda at: quantities(at[0][0], at[1]), tuple(at)).reshape(2, 8, 3, -1)
+    blur = 100 * eps * jnp.abs(t + skipped) / period  # the type of the state must resolve the times
+    size = (closing_tolerance(y.dtype) + blur) * jnp.ptp(found[:, :, :1], axis=1, keepdims=True)
+    return (blur < 0.1) & ~jnp.any(jnp.abs(found - found[:, :, :1]) > size + 1e3 * eps * jnp.abs(found))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -15,33 +16,34 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from .._common.lookup import as_names, by_name, hint, refuse_unknown
 from .._integrate.events import event_values, own_events_of
-from .._integrate.inputs import as_signals, inputs_at
-from .._integrate.jumps import stages_of, state_after
+from .._integrate.inputs import as_signals, inputs_at, samples_of
 from .._integrate.simulate import checked_state, refuse_not_finite
 from .._integrate.trajectory import Trajectory, as_trajectory, reached_times
 from .._kane.arguments import check_time, is_concrete, is_one_number
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import check_state, has_configuration_constraints
-from .._kane.right_hand_side import reads_time
 from .._kane.scaling import least_norm, rank_tolerance
-from .._scalarjit.cache_key import jit
+from .._scalarjit.cache_key import captured_tracers, jit
 from .._scalarjit.nan import constant, nan_where
-from .._system.system import State, System, packed, unpacked
+from .._system.system import State, System, packed_motion, unpacked
 from ._matrix_eigenvalues import eigvals
 from ._orbit_equations import (
     Evaluation,
     OrbitArguments,
     OrbitEquations,
+    closing_tolerance,
+    drifting_coordinates,
     packed_rates,
+    repeats,
     section_value,
+    uses_time,
 )
-from ._steady import cyclic_coordinates, is_not_steady
+from ._steady import is_not_steady
 
 _MAX_STEPS = 100  # of Newton's method
 _SAMPLES = 513  # of the ride in which the first return is sought
 _DOUBLINGS = 40  # of its duration, at most
-_FOUND = 1e-6
-"""An orbit closes if its residuals are below this part of the amplitude. Newton's method reaches 1e-12 or fails."""
+_is_not_steady = jit(is_not_steady)
 
 
 class Orbit(eqx.Module):
@@ -87,7 +89,7 @@ class Orbit(eqx.Module):
 
     @property
     def ride(self) -> Trajectory:
-        """The motion over one period at 201 times. It is simulated when this attribute is read."""
+        """The motion over one period at 201 times, simulated when it is read. `jumps` contains a jump at its end."""
         return _ride(self.equations, self.unknowns, self.arguments)
 
     def __getitem__(self, name: str) -> Any:
@@ -135,7 +137,7 @@ def periodic(
         y(t + T) = y(t)
 
     Cyclic coordinates drift, such as the position and the wheel angles of a bicycle: they need not be periodic, unless
-    an event or an input function uses them.
+    an event, a contact or an input function uses them.
 
     **Arguments:**
 
@@ -146,7 +148,7 @@ def periodic(
         starts there. If the event changes the state, the guess and the orbit start after the jump. Without a section
         the orbit starts in the plane through the guess that is orthogonal to the flow.
     - `period`: a guess of the period [s]. By default, the time of the first return of the guess. If `autonomous` is
-        False, it is the period of the force itself: a number, or a function of the system such as
+        False, it is a period of the force itself, which is checked: a number, or a function of the system such as
         `lambda s: 2 * jnp.pi / s.frequency`.
     - `autonomous`: False for a system that is forced periodically in time.
     - `hold`: names of coordinates, independent speeds and first-order states that keep the value of the guess at the
@@ -185,6 +187,11 @@ def periodic(
             f"{name}: `returns` = {returns} with `segments` = {segments}: the jumps at the section {section!r} can be "
             "in any segment. Omit `segments`."
         )
+    if autonomous and any(uses_time(system, args.inputs, args.start)):
+        raise ValueError(
+            f"{name}: the equations depend on the time, so the phase of an orbit is not free. Pass the period of the "
+            "force: period=..., autonomous=False."
+        )
     y, entries = args.start, (*system.coordinates, *system.speeds, *system.states)
     if period is not None:
         T = period(system) if callable(period) else period
@@ -195,6 +202,10 @@ def periodic(
         y, T = _first_return(name, equations, args, y)
         args = args._replace(center=constant(y), normal=_normal(equations, args, y))
     T = jnp.asarray(T, y.dtype)
+    if not autonomous:
+        is_blurred = float(jnp.finfo(y.dtype).eps) * jnp.abs(args.t) > 0.1 * equations.rtol * T
+        skipped = jnp.where(is_blurred & (not samples_of(args.inputs)), constant(jnp.round(args.t / T)), 0.0)
+        args = args._replace(t=args.t - skipped * T, skipped=skipped)
     args = args._replace(period=constant(T) if autonomous else T)
     T = jax.lax.stop_gradient(T)
     orbit, found = _solve(equations, args, constant(y), T, states)
@@ -235,8 +246,13 @@ def orbit_equations(
     advances = dict(advance or {})
     refuse_unknown(advances, system.coordinates, f"{name}: `advance` must name coordinates; unknown:")
     change = jnp.stack([jnp.asarray(advances.get(key, 0.0), y.dtype) for key in entries])
-    inputs = {} if inputs is None else inputs
-    drifting = {key for key in _drifting(system, inputs, y) if key not in advances}
+    inputs = as_signals(inputs, system.inputs, t[None], name)
+    if captured_tracers(inputs):
+        raise TypeError(
+            f"{name}: an input function uses a traced number from a closure. Make it a parameter of the system, or "
+            "pass jax.tree_util.Partial(lambda number, t, state: ..., number)."
+        )
+    drifting = drifting_coordinates(system, inputs, y).difference(advances)
     default = 1e-12 if y.dtype == jnp.float64 else 1e-6
     equations = OrbitEquations(
         closed=tuple(i for i, key in enumerate(entries) if key not in drifting),
@@ -253,7 +269,9 @@ def orbit_equations(
         max_steps=max_steps,
         solver=diffrax.Dopri8() if solver is None else solver,
     )
-    return equations, OrbitArguments(system, inputs, t, jnp.ones((), y.dtype), y, change, targets, y, jnp.zeros_like(y))
+    times = (jnp.zeros_like(t), t) if autonomous else (t, jnp.zeros_like(t))
+    data = jnp.ones((), y.dtype), y, change, targets, y, jnp.zeros_like(y)
+    return equations, OrbitArguments(system, inputs, *times, *data)
 
 
 def _checked_guess(name: str, system: System, guess: Any, segments: int, t: Any) -> tuple[Array, Any, Any]:
@@ -264,7 +282,7 @@ def _checked_guess(name: str, system: System, guess: Any, segments: int, t: Any)
     guess = as_trajectory(guess)
     if isinstance(guess, Trajectory):
         reached_times("periodic", system, guess)
-        ys = packed(State(guess.q, guess.u, guess.x if system.states else None))
+        ys = packed_motion(State(guess.q, guess.u, guess.x if system.states else None))
         T, parts = guess.t[-1] - guess.t[0], jnp.arange(segments) / segments
         states = jax.vmap(lambda y: jnp.interp(guess.t[0] + parts * T, guess.t, y), 1, 1)(ys)
         state = unpacked(system, ys[0])
@@ -277,7 +295,7 @@ def _checked_guess(name: str, system: System, guess: Any, segments: int, t: Any)
     refuse_not_finite(system, state)
     check_state(system, jnp.asarray(t, state.q.dtype), state.q)
     check_system(system, jnp.asarray(t, state.q.dtype), state.q)
-    return packed(state), T, states
+    return packed_motion(state), T, states
 
 
 def _check_options(name: str, system: System, section, period, autonomous, y) -> None:
@@ -288,11 +306,6 @@ def _check_options(name: str, system: System, section, period, autonomous, y) ->
         raise TypeError(f"{name}: `period` must be one number [s], or a function of the system; got {period!r}.")
     if T is not None and is_concrete(T) and not (np.isfinite(float(T)) and float(T) > 0):
         raise ValueError(f"{name}: `period` must be positive and finite [s]; got {float(T):g}.")
-    if autonomous and reads_time(system, y.dtype):
-        raise ValueError(
-            f"{name}: the equations depend on the time, so the phase of an orbit is not free. Pass the period of the "
-            "force: period=..., autonomous=False."
-        )
     if autonomous:
         _check_section(name, system, section, y)
         return
@@ -321,60 +334,18 @@ def _changes_state(system: System, section: str | None, y: Array) -> bool:
     return section in events.names and events.stages[events.names.index(section)] > 0
 
 
-def _drifting(system: System, inputs: Any, y: Array) -> set[str]:
-    """Names of the coordinates that need not be periodic: cyclic ones that no event and no input function uses."""
-    drifting = set(cyclic_coordinates(system))
-    state = unpacked(system, y)
-    used: list[Any] = []
-    t = jnp.zeros((), y.dtype)
-    cyclic = np.array([key in drifting for key in system.coordinates] + [False] * (y.size - len(system.coordinates)))
-    events = own_events_of(system, t, state)
-    if events.names:
-
-        def event_functions(y):
-            found = event_values(system, t, y, jnp.zeros_like(y))
-            return jnp.concatenate([found.values, found.conditions])
-
-        used.append(event_functions)
-    for i, stages in enumerate(events.stages):
-        if stages:
-            # the new values of the other entries: a jump may change a drifting coordinate
-            used.append(lambda y, i=i: state_after(system, t, y, jnp.asarray(i, y.dtype), stages_of(events))[~cyclic])
-    if callable(inputs) or any(map(callable, inputs.values())):
-        signals = as_signals(inputs, system.inputs, jnp.stack([t, t + 1.0]), type(system).__name__)
-        used.append(
-            lambda y: jnp.stack([*map(jnp.asarray, inputs_at(system, signals, t, unpacked(system, y)).values())])
-        )
-    rng = np.random.default_rng(0)
-    for f in used:
-        for _ in range(2):
-            there = jnp.asarray(rng.uniform(-1.0, 1.0, y.shape), y.dtype)
-            slopes = jax.jacfwd(f)(there)
-            depends = ~(jnp.max(jnp.abs(slopes), axis=0) == 0)
-            if is_concrete(depends):
-                drifting -= {key for key, k in zip(system.coordinates, np.asarray(depends), strict=False) if k}
-    return drifting
-
-
 def _refuse_equilibrium(name: str, equations: OrbitEquations, args: OrbitArguments, y: Array) -> None:
-    if not equations.autonomous or not is_concrete(args.system, y) or callable(args.inputs):
-        return
-    if any(map(callable, args.inputs.values())):
-        return
     state = unpacked(args.system, y)
-    w = [jnp.asarray(args.inputs.get(key, 0.0), y.dtype) for key in args.system.inputs]
-    w = jnp.stack(w) if w else jnp.zeros(0, y.dtype)
+    w = inputs_at(args.system, args.inputs, args.t, state, all_of_them=True)
+    if not equations.autonomous or not is_concrete(args.system, y, w):
+        return
+    w = jnp.stack([w[key] for key in args.system.inputs]) if w else jnp.zeros(0, y.dtype)
     x = jnp.zeros(0, y.dtype) if state.x is None else state.x
-    if not bool(_is_not_steady(args.system, args.t, state.q, state.u, x, w)):
+    if not _is_not_steady(args.system, args.t, state.q, state.u, x, w, True):
         raise ValueError(
             f"{name}: the guess is an equilibrium or a steady motion. Pass a state on the orbit. For the small orbits "
             "at a Hopf point, use jaxkane.stability.limit_cycle."
         )
-
-
-@jit
-def _is_not_steady(system, t, q, u, x, w):
-    return is_not_steady(system, t, q, u, x, w, True)
 
 
 @jit
@@ -458,7 +429,7 @@ def _crossing(g, taus, ys, i: int) -> tuple[Any, Any]:
 def _sampled(equations: OrbitEquations, args: OrbitArguments, y: Array, duration: Array):
     """A ride, its packed states, and the quantity whose sign changes at the section."""
     ride = equations.simulate(args, y, args.t + jnp.linspace(0.0, 1.0, _SAMPLES, dtype=y.dtype) * duration)
-    ys = packed(State(ride.q, ride.u, ride.x if args.system.states else None))
+    ys = packed_motion(State(ride.q, ride.u, ride.x if args.system.states else None))
     if equations.section:
         g = jax.vmap(lambda y: section_value(args.system, equations.section, args.t, y))(ys)
     else:
@@ -479,6 +450,7 @@ class _Found(eqx.Module):
     - `change` (n_z,): the scaled change of the unknowns that changes the residuals least.
     - `speed`: the largest change of a closed entry in one period at the initial rate, relative to its size.
     - `crosses`: whether the orbit crosses the section in the direction of its event.
+    - `repeats`: whether the equations have the period of the orbit.
     """
 
     ok: Array
@@ -487,6 +459,7 @@ class _Found(eqx.Module):
     change: Array
     speed: Array
     crosses: Array
+    repeats: Array
 
 
 @jit
@@ -504,12 +477,19 @@ def _solve(equations: OrbitEquations, args: OrbitArguments, y: Array, T: Array, 
     speed = jnp.max(jnp.abs(equations.rates(z_known, known)[0] * period / sizes[: len(equations.closed)]))
     speed = speed if equations.autonomous else jnp.ones_like(speed)
     singular = s / s[0]
-    tolerance = max(_FOUND, float(jnp.finfo(y.dtype).eps) ** 0.5)
-    crosses = _crosses(equations, z_known, known)
-    ok = (residual <= tolerance) & (singular[-1] > rank_tolerance(y.dtype)) & (speed > 1e-6) & crosses
+    crosses, has_period = _crosses(equations, z_known, known), jnp.array(True)
+    if not equations.autonomous:
+        has_period = repeats(*known[:3], known.start, period, equations.skipped(z_known, known))
+    ok = (
+        (residual <= closing_tolerance(y.dtype))
+        & (singular[-1] > rank_tolerance(y.dtype))
+        & (speed > 1e-6)
+        & crosses
+        & has_period
+    )
     z, segments = nan_where(~ok, (z, at.segments), args)
     orbit = as_orbit(equations, z, args, segments, residual)
-    return orbit, jax.lax.stop_gradient(_Found(ok, residual, singular, Vt[-1], speed, crosses))
+    return orbit, jax.lax.stop_gradient(_Found(ok, residual, singular, Vt[-1], speed, crosses, has_period))
 
 
 def _crosses(equations: OrbitEquations, z: Array, args: OrbitArguments) -> Array:
@@ -536,9 +516,8 @@ def as_orbit(equations: OrbitEquations, z: Array, args: OrbitArguments, segments
     trivial = trivial if equations.autonomous else jnp.full_like(trivial, jnp.nan)
     states, period = equations.states(z, args), equations.period(z, args)
     state = unpacked(args.system, states[0])
-    return Orbit(
-        args.system, period, state, args.t, args.inputs, residual, trivial, states, z, args, segments, equations
-    )
+    t = args.t + equations.skipped(z, args)
+    return Orbit(args.system, period, state, t, args.inputs, residual, trivial, states, z, args, segments, equations)
 
 
 def _shots(equations: OrbitEquations, args: OrbitArguments, y: Array, T: Array) -> Array:
@@ -572,7 +551,8 @@ def _root(equations: OrbitEquations, guess: Array, args: OrbitArguments) -> tupl
     the largest part of the compilation.
     """
     sizes, eps = equations.sizes(guess, args), float(jnp.finfo(guess.dtype).eps)
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(equations.evaluate, guess, args))
+    shapes = eqx.filter_eval_shape(equations.evaluate, guess, args)
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     zero, one = jnp.zeros((), guess.dtype), jnp.ones((), guess.dtype)
 
     def step(carry):
@@ -690,20 +670,32 @@ def _return_matrix_jvp(primals, tangents):
 @jit
 def _ride(equations: OrbitEquations, z: Array, args: OrbitArguments) -> Trajectory:
     y, T = equations.states(z, args)[0], equations.period(z, args)
-    # A ride to a jump ends just before it: a sample at its time would be on either side.
-    last = 1.0 - 1e-9 if equations.jumps else 1.0
-    ts = args.t + jnp.linspace(0.0, last, 201, dtype=z.dtype) * T
-    return equations.simulate(args, y, ts, jumping=equations.jumps and equations.returns > 1)
+    # Samples end just before a jump at the section. One more time is after it, so that `jumps` contains it.
+    margin, skipped = max(1e-9, 10 * equations.rtol), equations.skipped(z, args)
+    parts = np.append(np.linspace(0.0, 1.0 - margin, 201), 1.0 + margin) if equations.jumps else np.linspace(0, 1, 201)
+    ts = args.t + jnp.asarray(parts, z.dtype) * T
+    ride = equations.simulate(args, y, ts, jumping=equations.jumps)
+    if equations.jumps:
+        names = ("t", "q", "u", "u_dep", "x", "inputs", "outputs", "contact_memory")
+        kept = {name: jax.tree.map(lambda x: x[:-1], getattr(ride, name)) for name in names}
+        ride = dataclasses.replace(ride, t_end=ride.t[-2], end=ride.state(-2), **kept)
+    jumps = None if ride.jumps is None else dataclasses.replace(ride.jumps, t=ride.jumps.t + skipped)
+    return dataclasses.replace(ride, t=ride.t + skipped, t_end=ride.t_end + skipped, jumps=jumps)
 
 
 def _no_orbit(name: str, equations: OrbitEquations, entries: tuple[str, ...], found: _Found) -> str:
     residual, speed = float(found.residual), float(found.speed)
+    if not found.repeats:
+        return (
+            f"{name}: the equations at t and t + period differ, or the type of the state cannot resolve these times. "
+            "Pass a period of the force with all its digits, e.g. as a function of the system."
+        )
     if not np.isfinite(residual):
         return (
             f"{name}: the simulation of the guess does not reach the end of its period. A value may grow without "
             "bound, or an event may end the simulation. Pass a guess that is nearer to the orbit, or its period."
         )
-    if not residual <= _FOUND:
+    if not residual <= closing_tolerance(found.residual.dtype):
         return (
             f"{name}: no periodic orbit was found near this guess (the largest error of closing is {residual:.3g} of "
             "the amplitude). Pass a nearer guess, more `segments` if the orbit is strongly unstable, or `hold` if the "
