@@ -213,6 +213,17 @@ def test_infinitely_many_bounces_end_at_a_differentiable_time():
     np.testing.assert_array_equal(ride.contacts["table"], np.repeat([OPEN, SLIDES, STICKS], [10, 4, 7]))
 
 
+@pytest.mark.parametrize("duration", [10.0, 100.0])
+def test_the_end_of_infinitely_many_bounces_does_not_depend_on_the_duration(duration):
+    # t = sqrt(2 h / g) (1 + e) / (1 - e),  d t / d e = 2 sqrt(2 h / g) / (1 - e)^2
+    rtol, slope_rtol = 1e-12, 1e-10
+    ride, slopes = ride_of(np.linspace(0, duration, 21), restitution=0.7, gravity=9.81, h=1.0)
+    n, falls = int(ride.jumps.count), np.sqrt(2 / 9.81)
+    np.testing.assert_allclose(ride.jumps.t[n - 1], falls * 1.7 / 0.3, rtol=rtol)
+    np.testing.assert_allclose(slopes["restitution"]["t"][n - 1], 2 * falls / 0.3**2, rtol=slope_rtol)
+    np.testing.assert_allclose(slopes["h"]["t"][n - 1], falls / 2 * 1.7 / 0.3, rtol=slope_rtol)
+
+
 def test_restitution_is_relative_to_a_moving_surface():
     # A ball falls on a table that rises: v+ - s' = -e (v- - s') and m (v+ - v-) = L at the time of the impact.
     rtol = 1e-10

@@ -236,6 +236,33 @@ def test_sequential_and_simultaneous_impacts_of_balls():
     np.testing.assert_allclose(jnp.sum(ride.end.u * 0.8 ** jnp.arange(5.0)), 1.0, rtol=1e-12)
 
 
+class BallOnABall(jk.System):
+    """Two balls of 1 kg without a size, above each other. The lower one does not bounce."""
+
+    coordinates, speeds = ("low", "high"), ("low_dot", "high_dot")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[i] * N.y, u[i] * N.y), name=f"ball {i}") for i in range(2)])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def contacts(self, t, q, u, motion):
+        balls = jk.Contact(gap=q["high"] - q["low"], restitution=0.5)
+        return {"balls": balls, "floor": jk.Contact(gap=q["low"])}
+
+
+@pytest.mark.slow
+def test_bounces_on_a_body_at_rest_end():
+    """Without contacts, both balls would fall alike. The acceleration toward the lower one is due to its contact."""
+    ride = jk.simulate(BallOnABall(), jk.State({"high": 1.0}, {}), jnp.linspace(0, 10, 21))
+    assert ride.ok
+    np.testing.assert_allclose(jumps_of(ride)[-1], 3 * np.sqrt(2 / 9.81), rtol=1e-11)
+    np.testing.assert_array_equal(ride.contacts["balls"][-10:], SLIDES)
+    np.testing.assert_allclose(end_of(ride), 0.0, atol=1e-12)
+
+
 # -- In space.
 class Particle(jk.System):
     """A particle over a plane through O, whose normal is N.z. Gravity has a component along N.x."""

@@ -134,8 +134,8 @@ def changed_contacts(
     closed = (memory.states >= SLIDES) & ~bearing
     v_N = before.v[:, 0]
     # The limit of the friction and the normal force may vanish together. Then the contact opens.
-    push = solve_forces(layout, before, memory).forces[:, 0]
-    vanishes = ~bearing & (push * before.mobility[:, 0] <= 1e-8 * before.a_size[:, 0])
+    forces = solve_forces(layout, before, memory).forces
+    vanishes = ~bearing & (forces[:, 0] * before.mobility[:, 0] <= 1e-8 * before.a_size[:, 0])
     opens, slips = event.opens | (event.slips & vanishes), event.slips & ~vanishes
     event = event._replace(opens=opens, slips=slips)
     # -- The impact, if contacts close.
@@ -145,9 +145,11 @@ def changed_contacts(
     closes = v_N < -_negligible(before)[:, 0]
     takes_part = (closed | event.touches | near) & ~bearing & ~(event.is_start & closes)
     strikes = takes_part & closes & ~(closed & event.is_own)
-    bounces = _rest_of_bounces(before, strikes)
+    # With all contacts open, a body would not approach the resting body on which it bounces.
+    approach = -(before.a[:, 0] + jnp.where(closed, 0.0, jnp.einsum("iks,ks->i", before.delassus[:, 0], forces)))
+    bounces = _rest_of_bounces(before, approach, strikes)
     # A bounce that is lower than the rounding error of the gap cannot be simulated.
-    is_low = 0.5 * (before.laws.restitution * v_N) ** 2 <= -before.a[:, 0] * (errors / 16)
+    is_low = 0.5 * (before.laws.restitution * v_N) ** 2 <= approach * (errors / 16)
     rests, is_impact = strikes & (bounces < jnp.inf) & ((bounces < rest) | is_low), jnp.any(strikes)
     e = jnp.where(strikes & ~rests, before.laws.restitution, 0.0)
     has_friction = [has and not b for has, b in zip(layout.has_friction, layout.is_bearing, strict=True)]
@@ -160,9 +162,10 @@ def changed_contacts(
     negligible = jnp.maximum(_negligible(before), _negligible(after))
     is_apart = after.v[:, 0] > negligible[:, 0] + jnp.where(is_impact, 1e-10 * jnp.abs(v_N), 0.0)
     is_apart &= is_impact | ~event.is_own | event.touches
-    # A block that rocks on its corners in turn: each corner opens for a shorter time than the one before.
-    fall, rise = -after.a[:, 0], after.v[:, 0]
-    is_apart &= ~((fall > 0) & ((2.0 * rise < rest * fall) | (0.5 * rise**2 <= fall * (errors / 16))))
+    # A block that rocks on its corners in turn: each corner opens for a shorter time than the one before. For a contact
+    # that bounces, this rule would omit the rest of the bounces, which is longer than one bounce.
+    fall, rise, goes_on = -after.a[:, 0], after.v[:, 0], strikes & ~rests & (bounces < jnp.inf)
+    is_apart &= goes_on | ~((fall > 0) & ((2.0 * rise < rest * fall) | (0.5 * rise**2 <= fall * (errors / 16))))
     candidates = takes_part & ~is_apart & ~event.opens & ~(is_impact & (hit.states == OPEN) & strikes & (e > 0))
     sticks = jnp.where(is_impact & ~bearing, hit.states == STICKS, jnp.zeros_like(closed))
     delays = jnp.where(rests, bounces, 0.0)
@@ -190,9 +193,12 @@ def _negligible(terms: ContactTerms) -> Array:
     return 1e3 * float(jnp.finfo(terms.v.dtype).eps) * jnp.broadcast_to(size, terms.size.shape)
 
 
-def _rest_of_bounces(terms: ContactTerms, strikes: Array) -> Array:
-    """The time (c,) that all bounces after this impact take, 2 v / (a (1 - e)); infinity if they do not end [s]."""
-    fall, e = -terms.a[:, 0], terms.laws.restitution
+def _rest_of_bounces(terms: ContactTerms, fall: Array, strikes: Array) -> Array:
+    """The time (c,) that all bounces after this impact take, 2 v / (a (1 - e)); infinity if they do not end [s].
+
+    `fall` (c,): the accelerations a toward the surfaces.
+    """
+    e = terms.laws.restitution
     ends = strikes & (fall > 0) & (e < 1)
     return jnp.where(ends, -2.0 * e * terms.v[:, 0] / jnp.where(ends, fall * (1.0 - e), 1.0), jnp.inf)
 
