@@ -186,6 +186,13 @@ BAD = {
         ValueError,
         "gap",
     ),
+    "a gap of speeds": (lambda m, q, u: {"a": jk.Contact(gap=q["y"] + u["vy"])}, ValueError, "do not depend on the sp"),
+    "a normal of speeds": (
+        lambda m, q, u: {"a": jk.Contact(m["rim"], m.N.y + u["vx"] * m.N.x, gap=1.0)},
+        ValueError,
+        "'a'",
+    ),
+    "a square slip": (lambda m, q, u: {"a": jk.DryFriction(u["vx"] ** 2, 1.0)}, ValueError, "affine in the speeds"),
     "penetration": (lambda m, q, u: {"a": jk.Contact(gap=q["y"] - 2.0)}, ValueError, "gap"),
 }
 
@@ -195,6 +202,64 @@ def test_misuse_is_explained(case):
     contacts, kind, message = BAD[case]
     with pytest.raises(kind, match=message):
         simulate_with(contacts)
+
+
+class Particle(jk.System):
+    """A point of 1 kg on a surface. With `turn` zero, each surface is described correctly."""
+
+    turn: jk.Scalar = jk.parameter(0.0)
+    coordinates, speeds = ("x", "y"), ("vx", "vy")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["x"] * N.x + q["y"] * N.y, u["vx"] * N.x + u["vy"] * N.y)
+        return jk.Motion([jk.Body(1.0, 0.0, P, name="particle")], points={"P": P, "O": O})
+
+
+class TurningPlane(Particle):
+    """Its normal turns, but the velocity of the surface is said to be zero."""
+
+    def contacts(self, t, q, u, motion):
+        N = motion.N
+        return {"plane": jk.Contact(motion["P"], N.y * jnp.cos(self.turn * t) - N.x * jnp.sin(self.turn * t))}
+
+
+class TurningPlaneWithSurface(Particle):
+    """The surface point below the particle has the velocity of the surface there."""
+
+    def contacts(self, t, q, u, motion):
+        N = motion.N
+        n, s = (N.y * jnp.cos(self.turn * t + a) - N.x * jnp.sin(self.turn * t + a) for a in (0.0, -0.5 * jnp.pi))
+        along = motion["P"].position.dot(s)
+        return {"plane": jk.Contact(motion["P"], n, surface=motion["O"].moving(along * s, self.turn * along * n))}
+
+
+class Bowl(Particle):
+    """y = x^2 / 2. The gap is a distance only where it is zero."""
+
+    def contacts(self, t, q, u, motion):
+        slope = q["x"]
+        gap = (q["y"] - 0.5 * q["x"] ** 2) / jnp.sqrt(1.0 + slope**2)
+        return {"bowl": jk.Contact(motion["P"], motion.N.y - (slope + self.turn * q["x"]) * motion.N.x, gap=gap)}
+
+
+@pytest.mark.parametrize("surface", [TurningPlane, Bowl])
+def test_a_gap_that_contradicts_the_velocity_elsewhere_is_refused(surface):
+    """At the start it agrees. It depends on the parameter, whether it agrees at other coordinates and times."""
+    rest, ts = jk.State({}, {}), jnp.linspace(0.0, 1.0, 3)
+    assert jk.assemble(surface(), {}).q.shape == (2,)
+    for refused in (
+        lambda: jk.simulate(surface(0.5), rest, ts),
+        lambda: jk.assemble(surface(0.5), {"x": 0.0, "y": 0.0}),
+        lambda: jk.sweep.sweep(surface(jnp.array([0.0, 0.5])), rest, ts),
+        lambda: jax.eval_shape(lambda turn: jk.simulate(surface(turn), rest, ts), jnp.array(0.5)),
+    ):
+        with pytest.raises(ValueError, match="but the velocity of its point along the normal"):
+            refused()
+
+
+def test_a_turning_plane_with_the_velocity_of_its_surface_is_accepted():
+    assert jk.assemble(TurningPlaneWithSurface(0.5), {}).u.shape == (2,)
 
 
 @pytest.mark.slow

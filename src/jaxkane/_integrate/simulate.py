@@ -17,7 +17,8 @@ from jaxtyping import Array
 from .._kane.arguments import by_names, check_is_system, is_concrete, refuse_incomplete
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import check_state
-from .._kane.contact import check_contacts, has_contacts, layout_of
+from .._kane.contact import layout_of
+from .._kane.contact_checks import check_contacts
 from .._kane.diagnosis import diagnosis
 from .._kane.right_hand_side import reads_time, values_of
 from .._scalarjit.cache_key import captured_tracers
@@ -104,8 +105,7 @@ def simulate(
     origin, taus = clock_of(ts, dtype)
     check_state(system, origin, state.q)
     check_system(system, origin, state.q)
-    if has_contacts(system) and state.contacts is None:
-        check_contacts(system, origin, state.q)
+    check_contacts(system, origin, state.q, may_penetrate=state.contacts is not None)
     settings = settings_for(
         dtype,
         rtol=rtol,

@@ -33,6 +33,7 @@ from .constraint_residuals import (
     violations,
 )
 from .contact import REDUNDANT, ContactRows, has_multipliers, layout_of, speeds_in_contact
+from .contact_checks import check_contacts
 from .description import at_random_point, structure_of
 from .kanes_method import KaneEquations
 from .scaling import SMALLEST_SIZE
@@ -394,6 +395,7 @@ def assemble(
         u0 = speeds_in_contact(system, jnp.asarray(t, q0.dtype), q0, u0, touching)
     if is_concrete(system, q0, u0, t):
         check_system(system, t, q0)
+        check_contacts(system, t, q0, may_penetrate=True)
         if u_dep:
             _check_dependent_speeds(system, u_dep, t, q0, u0)
     return State(q0, u0, x0)

@@ -30,7 +30,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._scalarjit.cache import Cache
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import (
     Component,
@@ -48,7 +47,7 @@ from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
 from .._system.system import System
 from .arguments import Row, is_concrete, is_one_number
-from .description import dtype_of, jvp, structure_of
+from .description import dtype_of, jvp
 from .impact import RowBasis, checked_restitution, inverse_root, least_norm
 from .kanes_method import KaneEquations, unit
 from .scaling import term_sizes
@@ -511,50 +510,6 @@ def speeds_in_contact(system: System, t: Component, q: Array, u: Array, touching
     states = jnp.asarray([SLIDES if name in touching else OPEN for name in layout.names], q.dtype)
     memory = memory._replace(states=states)
     return projected_speeds(layout, terms_at(system, t, q, u, {}), memory, u)
-
-
-@ScalarFunction
-def _gap_rates_and_velocities(system: System, t: Component, q: Array, u: Array) -> tuple[Array, Array]:
-    kane, layout = KaneEquations(system, t, q, u), layout_of(system)
-    rows = ContactRows(kane, layout)
-    rates = rows.gap_rates(kane.t, kane.q, kane.u_all)
-    return as_vector(rates, q), as_vector([row[0] for row in rows.velocities(kane.t, kane.q, kane.u_all)], q)
-
-
-_CHECKED = Cache()  # structures
-
-
-def check_contacts(system: System, t: Component, q: Array) -> None:
-    """Raise `ValueError` if the rate of a gap is not the normal velocity of its point, or if bodies penetrate.
-
-    The rates are compared once for each structure, at speeds of size 1.
-    """
-    layout = layout_of(system)
-    if not layout.names or not is_concrete(system, t, q):
-        return
-    t, u = np.asarray(t, q.dtype), np.random.default_rng(0).uniform(0.5, 1.5, len(system.speeds)).astype(q.dtype)
-    label = f"{type(system).__name__}.contacts"
-
-    def compare() -> bool:
-        rates, velocities = _gap_rates_and_velocities.numpy(system, t, np.asarray(q), u)
-        size = np.abs(rates) + np.abs(velocities) + np.finfo(q.dtype).tiny
-        for name, i in ((name, i) for i, name in enumerate(layout.names) if layout.has_point[i]):
-            if abs(rates[i] - velocities[i]) > 1e3 * float(np.finfo(q.dtype).eps) ** 0.75 * size[i]:
-                raise ValueError(
-                    f"{label}: the gap of {name!r} changes by {rates[i]:.6g}, but the velocity of its point along the "
-                    f"normal is {velocities[i]:.6g} (at speeds of size 1). Pass the point of the body that touches, "
-                    "with the velocity of its material, and the gap of this point."
-                )
-        return True
-
-    _CHECKED.get(structure_of(system), compare)
-    gaps, sizes = gap_sizes.numpy(system, t, np.asarray(q), np.zeros_like(u))
-    for name, gap, size in zip(layout.names, gaps, sizes, strict=True):
-        if gap < -(float(np.finfo(q.dtype).eps) ** 0.6) * size:
-            raise ValueError(
-                f"{label}: the gap of {name!r} is {gap:.6g} at the start. It must not be negative. Find touching "
-                f"coordinates with jaxkane.assemble(system, q, touching=({name!r},))."
-            )
 
 
 class ContactMemory(NamedTuple):

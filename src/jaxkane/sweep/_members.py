@@ -19,6 +19,7 @@ from .._integrate.simulate import as_state, checked_state, clock_of, first_of, r
 from .._kane.arguments import is_concrete
 from .._kane.checks import check_system
 from .._kane.consistent_state import assemble
+from .._kane.contact_checks import check_contacts
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, Inputs, Numbers
 from .._system.parameters import in_batches, parameters_in, with_parameters
@@ -350,16 +351,19 @@ def _check(members: PyTree, shared: PyTree, t: Component, table: Table | None) -
 
 
 def _check_description(members: PyTree, shared: PyTree, t: Component) -> None:
-    """Refuse a contradictory system, checked with the first member. An impossible body makes only its member
-    invalid."""
+    """Refuse a contradictory system, checked with the first member; contacts, where numbers decide, also with the last
+    one. An impossible body makes only its member invalid."""
     if any(x.shape[0] == 0 for x in jax.tree.leaves(members)):
         return
-    system, state, _, columns = eqx.combine(jax.tree.map(lambda x: x[0], members), shared)
-    system, _ = _system(system, Row(columns))
-    q = as_state(system, state).q if isinstance(state, State) else None
-    if q is not None and is_concrete(q) and not np.all(np.isfinite(q)):
-        q = None
-    check_system(system, t, q, bodies=False)
+    for i in (0, -1):
+        system, state, _, columns = eqx.combine(jax.tree.map(lambda x, i=i: x[i], members), shared)
+        system, _ = _system(system, Row(columns))
+        q = as_state(system, state).q if isinstance(state, State) else None
+        if q is not None and is_concrete(q) and not np.all(np.isfinite(q)):
+            q = None
+        if i == 0:
+            check_system(system, t, q, bodies=False)
+        check_contacts(system, t, q, may_penetrate=True)
 
 
 def _signals(inputs: Inputs, system: System, columns: dict[str, Any], ts: Numbers) -> Any:
