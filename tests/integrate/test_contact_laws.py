@@ -78,6 +78,7 @@ class RoundRod(jk.System):
     gravity: jk.Scalar = jk.parameter(unit="m/s^2")
     shake: jk.Scalar = jk.parameter(unit="m")  # at SHAKE rad/s
     belt: jk.Scalar = jk.parameter(unit="m/s")
+    change: jk.Scalar = jk.parameter(unit="1/s")  # the restitution grows, the friction decreases
     coordinates, speeds, inputs = ("x", "h", "angle"), ("vx", "vy", "w"), ("push",)
 
     def motion(self, t, q, u):
@@ -98,15 +99,17 @@ class RoundRod(jk.System):
         return jk.weight(motion, -self.gravity * N.y), jk.Force(resistance + inputs["push"] * N.x, motion["rod"])
 
     def contacts(self, t, q, u, motion):
-        law = {"restitution": self.restitution, "friction": self.friction, "static": self.static}
+        more, less = 1.0 + self.change * t, 1.0 - self.change * t
+        law = {"restitution": self.restitution * more, "friction": self.friction * less, "static": self.static * less}
         return {"table": jk.Contact(motion["end"], motion.N.y, surface=motion["table"], **law)}
 
 
 SHAKE = 20.0
 NAMES = ("restitution", "friction", "static", "drag", "radius", "length", "mass", "inertia", "gravity", "shake", "belt")
+NAMES += ("change",)
 NAMES += ("x", "h", "angle", "vx", "vy", "w")
 ROD = {"mass": 1.0, "inertia": 1.0, "gravity": 10.0}
-rod = simulate_with_slopes(lambda p: RoundRod(*p[:11]), lambda p: jk.State(p[11:14], p[14:]))
+rod = simulate_with_slopes(lambda p: RoundRod(*p[:12]), lambda p: jk.State(p[12:15], p[15:]))
 ON_AND_OFF = jnp.arange(4.0)
 
 
@@ -352,6 +355,28 @@ def test_painleve_paradox_of_a_sliding_rod(direction):
     assert int(smooth.status) == jk.Status.COMPLETED
 
 
+def test_a_friction_that_becomes_negative_ends_the_simulation():
+    """mu = 0.2 (1 - t): v = 5 - 2 (t - t^2 / 2), until 1 s. It may be negative while the contact is open."""
+    ride, slopes = ride_of(np.linspace(0, 2, 21), friction=0.2, vx=5.0, change=1.0)
+    assert int(ride.status) == jk.Status.INVALID_COEFFICIENT
+    assert ride.reason == "invalid coefficient"
+    np.testing.assert_allclose(ride.t_end, 1.0, rtol=1e-11)
+    np.testing.assert_allclose(end_of(ride)[[0, 3]], [5.0 - 1.0 + 1.0 / 3.0, 4.0], rtol=1e-9)
+    assert np.isnan(slopes["vx"]["end"]).all()
+    open_contact, _ = ride_of(np.linspace(0, 2, 21), friction=0.2, restitution=0.8, h=60.0, change=1.0)
+    assert open_contact.ok
+
+
+def test_a_restitution_above_one_ends_the_simulation_at_the_impact():
+    """0.8 (1 + t) at sqrt(0.2) s. Otherwise the impact would increase the energy by 3.4 J."""
+    ride, slopes = ride_of(np.linspace(0, 2, 21), restitution=0.8, h=1.0, change=1.0)
+    assert int(ride.status) == jk.Status.INVALID_COEFFICIENT
+    np.testing.assert_allclose(ride.t_end, np.sqrt(0.2), rtol=1e-11)
+    np.testing.assert_allclose(end_of(ride)[4], -10.0 * np.sqrt(0.2), rtol=1e-11)
+    np.testing.assert_allclose(ride.jumps.energy[:1], 0.0, atol=1e-12)
+    assert np.isnan(slopes["h"]["end"]).all()
+
+
 def test_two_zero_crossings_of_a_gap_in_one_step():
     """A particle leaves the table with 1e-7 m/s and lands after 2e-8 s."""
     ride, _ = ride_of(np.linspace(0, 2, 21), restitution=0.5, friction=0.1, vy=1e-7)
@@ -530,7 +555,7 @@ def test_the_derivative_of_the_time_of_coming_to_rest():
 
 def plain(p, ts, push, **options):
     samples = jk.Samples(ON_AND_OFF, push, zero_order_hold=True)
-    return jk.simulate(RoundRod(*p[:11]), jk.State(p[11:14], p[14:]), ts, {"push": samples}, **TIGHT, **options)
+    return jk.simulate(RoundRod(*p[:12]), jk.State(p[12:15], p[15:]), ts, {"push": samples}, **TIGHT, **options)
 
 
 # They land and rest on a belt, lift off a shaking table, never touch it.
@@ -590,6 +615,34 @@ def test_a_block_on_a_belt_sticks_and_slips():
     np.testing.assert_allclose(slopes["end"][1, :4], [0.0, 1.0, 0.0, 0.0], atol=slope_atol)
     # The multiplier of the orbit is exactly zero: the first sticking forgets all of the initial state but its phase.
     np.testing.assert_array_equal(slopes["end"][1, 4:], 0.0)
+
+
+class Brake(jk.System):
+    """A block of 1 kg, whose dry friction decreases with the time."""
+
+    kinetic: jk.Scalar = jk.parameter(2.0, unit="N")
+    decrease: jk.Scalar = jk.parameter(0.0, unit="N/s")
+    coordinates, speeds = ("x",), ("v",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="block")])
+
+    def contacts(self, t, q, u, motion):
+        return {"brake": jk.DryFriction(u["v"], self.kinetic - self.decrease * t, static=2.5)}
+
+
+@pytest.mark.weekly
+def test_members_of_a_sweep_whose_dry_friction_becomes_impossible():
+    """v = 5 - 2 t + d t^2 / 2. It becomes negative, larger than the static friction, or neither."""
+    decreases, invalid = jnp.array([4.0, -1.0, 0.0]), jk.Status.INVALID_COEFFICIENT
+    rides = jk.sweep.sweep(Brake(decrease=decreases), jk.State({}, {"v": 5.0}), jnp.linspace(0.0, 1.0, 21), **TIGHT)
+    np.testing.assert_array_equal(rides.status, [invalid, invalid, jk.Status.COMPLETED])
+    np.testing.assert_allclose(rides.t_end, [0.5, 0.5, 1.0], rtol=1e-11)
+    t = rides.t[:, :10]
+    np.testing.assert_allclose(rides["v"][:, :10], 5.0 - 2.0 * t + 0.5 * decreases[:, None] * t**2, rtol=1e-11)
+    assert np.isnan(rides["v"][:2, 11:]).all()
+    np.testing.assert_allclose(rides["v"][2, -1], 3.0, rtol=1e-11)
 
 
 @pytest.mark.weekly

@@ -253,7 +253,7 @@ class BallOnABall(jk.System):
         return {"balls": balls, "floor": jk.Contact(gap=q["low"])}
 
 
-@pytest.mark.slow
+@pytest.mark.weekly
 def test_bounces_on_a_body_at_rest_end():
     """Without contacts, both balls would fall alike. The acceleration toward the lower one is due to its contact."""
     ride = jk.simulate(BallOnABall(), jk.State({"high": 1.0}, {}), jnp.linspace(0, 10, 21))

@@ -91,6 +91,7 @@ class Change(NamedTuple):
     - `y`: the packed state afterwards.
     - `delay` [s]: the rest of the bounces of a contact that rests now.
     - `impulses` (c, r): of the impact, zero without one [N s].
+    - `is_lawful`: whether the coefficients of the contacts are in their ranges.
     - `is_determined`: whether the contact laws have a solution.
     - `is_smooth`: whether derivatives afterwards are correct.
     """
@@ -98,6 +99,7 @@ class Change(NamedTuple):
     y: Array
     delay: Array
     impulses: Array
+    is_lawful: Array
     is_determined: Array
     is_smooth: Array
 
@@ -155,7 +157,8 @@ def changed_contacts(
     has_friction = [has and not b for has, b in zip(layout.has_friction, layout.is_bearing, strict=True)]
     friction = jnp.where(bearing, 0.0, before.laws.friction)
     hit = contact_impact(before.delassus, before.v, e, friction, takes_part, has_friction)
-    impulses = jnp.where(is_impact & hit.determined, hit.impulses, 0.0)
+    is_lawful = before.laws.are_valid(strikes, takes_part | bearing)
+    impulses = jnp.where(is_impact & hit.determined & is_lawful, hit.impulses, 0.0)
     u = u + before.X @ (before.B.T @ impulses.reshape(-1))
     # -- The contact states that the accelerations allow.
     after: ContactTerms = terms_at(system, t, state.q, u, values)
@@ -184,7 +187,8 @@ def changed_contacts(
         # those of a particle were 21 instead of 3.
         begins = (new.slow[:, 0] > 0) & (memory.states != SLIDES)
         is_smooth = ~jnp.any(begins & (after.laws.static <= after.laws.friction))
-    return Change(y, delay, impulses, is_determined & (~is_impact | hit.determined), is_smooth)
+    is_lawful &= after.laws.are_valid(False, new.states >= SLIDES)
+    return Change(y, delay, impulses, is_lawful, is_determined & (~is_impact | hit.determined), is_smooth)
 
 
 def _negligible(terms: ContactTerms) -> Array:
@@ -300,7 +304,10 @@ def _unit_rows(x: Array) -> Array:
 
 @ScalarFunction
 def contact_event_values(system: System, t: Array, y: Array, inputs: dict[str, Array]) -> tuple[Array, Array]:
-    """The event functions of all contacts (2 c,), normal and tangential ones, and their rounding errors."""
+    """The event functions of all contacts (2 c,), normal and tangential ones, and their rounding errors.
+
+    The rounding errors are NaN if the friction of a closed contact is impossible, so that the step is rejected.
+    """
     layout, state = layout_of(system), unpacked(system, y)
     values = values_of(system, state.x, inputs)
     assert state.contacts is not None
@@ -315,4 +322,5 @@ def contact_event_values(system: System, t: Array, y: Array, inputs: dict[str, A
     margins = jnp.where(rests, normal, 0.0), jnp.where(memory.states == STICKS, tangential, 0.0)
     functions = [f + (64 * eps * margin + 1e3 * tiny) for f, margin in zip(functions, margins, strict=True)]
     noise = 2 * eps * jnp.stack([normal, tangential], axis=1).reshape(-1)
-    return jnp.stack(functions, axis=1).reshape(-1), noise
+    is_lawful = terms.laws.are_valid(False, memory.states >= SLIDES)
+    return jnp.stack(functions, axis=1).reshape(-1), jnp.where(is_lawful, noise, jnp.nan)

@@ -298,7 +298,7 @@ class EventValues(NamedTuple):
       dependent speeds.
     - `conditions` (m,): the quantities `when` of the events that have one.
     - `noise` (n,): rounding errors of the functions of contacts, zero for events of the system; None without contacts.
-      At the start of a step it is None.
+      At the start of a step it is None. NaN if a coefficient of friction is impossible.
     """
 
     values: Array

@@ -32,7 +32,10 @@ class Status(enum.IntEnum):
     """The state after a jump is not finite, or it violates a configuration constraint."""
     UNDETERMINED_CONTACT = 10
     """The laws of contact and friction have no solution, e.g. for the rod of Painleve."""
-    EVENT = 11
+    INVALID_COEFFICIENT = 11
+    """The restitution of a contact left the range from 0 to 1, or a friction became negative or larger than the static
+    friction."""
+    EVENT = 12
 
 
 def reason(code: int, events: tuple[str, ...]) -> str:
@@ -49,6 +52,8 @@ _ADVICE: dict[int, str] = {
     Status.MAX_JUMPS: "Increase max_jumps. If jumps accumulate at one time, end the simulation there by another event.",
     Status.IMPOSSIBLE_JUMP: "Check `then` of the event at `t_end`. New coordinates must satisfy the constraints.",
     Status.UNDETERMINED_CONTACT: "Rigid contacts with this friction have no solution. Reduce the friction.",
+    Status.INVALID_COEFFICIENT: "Limit the coefficients of contacts and dry friction: 0 <= restitution <= 1 and "
+    "0 <= kinetic <= static friction.",
     Status.REPEATED_JUMP: "Let `then` move the event function away from zero, or change the direction of its rate.",
     Status.MAX_STEPS: "Increase max_steps (an input sample needs a step), or check for stiff or discontinuous loads.",
 }

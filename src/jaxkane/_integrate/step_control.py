@@ -373,7 +373,8 @@ def _at_events(
     step is rejected and repeated to just after the crossing, until a step ends there. That step is the last.
 
     If an event function is NaN at the end of a step, the step is halved. If the step is as short as the resolution, the
-    simulation ends before it, because it is unknown whether the function crossed zero.
+    simulation ends before it, because it is unknown whether the function crossed zero. An impossible coefficient of
+    friction has the same effect.
 
     A step over the bound is halved. If the step is as short as a thousandth of the duration, the simulation ends before
     it. If the shorter steps do not cross the bound, the simulation ends before the end of the first step over it.
@@ -385,7 +386,8 @@ def _at_events(
     h, kept, duration = t1 - t0, step.keep, jax.lax.stop_gradient(control.duration)
     resolution = _resolution(t1, h, duration)
     values = [*end.values, *end.conditions]
-    unknown = kept & functools.reduce(operator.or_, [x != x for x in values], jnp.array(False))
+    is_lawful = jnp.array(True) if end.noise is None else jnp.all(end.noise == end.noise)
+    unknown = kept & functools.reduce(operator.or_, [x != x for x in values], ~is_lawful)
     fails = unknown & (h <= resolution)
     kept &= ~unknown
     event, x = first_event(events, _shortest(t1, duration), start, end, h, t1 < before.rejected_end)
@@ -413,6 +415,7 @@ def _at_events(
     rejected = repeat | at_start | at_bound | fails
     status = jnp.where(at_bound, float(Status.SINGULAR_SPEEDS), before.status)
     status = jnp.where(fails, float(Status.STEP_TOO_SMALL), status)
+    status = jnp.where(fails & ~is_lawful, float(Status.INVALID_COEFFICIENT), status)
     happens, jumps = at_end | at_start, jnp.zeros_like(kept)
     for i, stages in enumerate(events.stages):
         jumps |= happens & (event == i) & (stages > 0)
