@@ -36,13 +36,8 @@ def check_contacts(system: System, t: Component, q: Numbers, *, may_penetrate: b
     """Raise `ValueError` if the description of a contact contradicts itself, or if bodies penetrate.
 
     A contact is checked at the coordinates `q`, and at coordinates and a time nearby at which it touches. The result
-    depends on the values of the parameters. Traced numbers are replaced as by `check_system`.
-
-    **Arguments:**
-
-    - `t`: time [s].
-    - `q`: coordinates (n_q,), or None for random coordinates.
-    - `may_penetrate`: whether the gaps at `q` may be negative.
+    depends on the values of the parameters. Traced numbers, and coordinates that are None, are replaced as by
+    `check_system`. With `may_penetrate`, the gaps at `q` may be negative.
     """
     if not has_contacts(system) or in_batches(system):
         return
