@@ -646,3 +646,18 @@ def test_derivatives_of_an_event_after_an_input_jump(adjoint, derivative):
     np.testing.assert_allclose(found[0], [0.81, 0.045, 0.3], atol=1e-9)
     np.testing.assert_allclose(slope[0], [1.0, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(slope[1], -1.0, atol=1e-9)  # at 0.6 s
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"step": 0.05}], ids=["adaptive", "fixed"])
+def test_a_function_that_touches_zero_without_crossing_it_is_not_an_event(options):
+    class Passing(Particle):
+        at: jk.Scalar = jk.parameter(0.5)
+
+        def events(self, t, q, u):
+            return {"square": (t - self.at) ** 2, "wave": jk.falling(1.0 - jnp.cos(3.0 * (t - self.at)))}
+
+    start, ts = jk.State(jnp.array([1.0]), jnp.array([0.0])), jnp.linspace(0.0, 2.0, 21)
+    times = jnp.concatenate([jnp.linspace(0.1, 1.9, 37), jnp.linspace(0.1234, 1.8, 100)])
+    status = jax.jit(jax.vmap(lambda at: jk.simulate(Passing(at=at), start, ts, **options).status))(times)
+    np.testing.assert_array_equal(status, 0)

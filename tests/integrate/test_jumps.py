@@ -343,13 +343,10 @@ def test_two_zero_crossings_of_a_gap_in_one_step():
 
 
 def test_a_repeated_jump_has_a_status():
-    ride = moving(lambda t, q, u, x: {"wall": jk.rising(q["x"] - 1.0, then={"v": 0.5 * u["v"]})})
-    assert ride.reason == "repeated jump"
-    assert "then" in repr(ride)
-    np.testing.assert_allclose(ride.t_end, 1.0, atol=1e-12)
-    assert int(ride.jumps.count) == 1
     rests = drop(P.at[3].set(0.0))
     assert rests.reason == "repeated jump"
+    assert "then" in repr(rests)
+    assert int(rests.jumps.count) == 1
     np.testing.assert_allclose(rests.t_end, TIMES[0], atol=1e-10)
 
 
@@ -500,6 +497,37 @@ def test_an_event_unchanged_by_its_jump_occurs_once_per_crossing():
     crossings = [(2 * np.pi * k - 1.0) / (6 * np.pi) for k in range(1, 7)]
     np.testing.assert_allclose(ride.jumps.t[:7], sorted([*crossings, 0.5]), atol=1e-9)
     assert float(ride["mode"][-1]) == 7.0
+
+
+def test_each_of_several_events_at_one_time_occurs_once_in_alphabetical_order():
+    """Events of the time and of the state, also at the end of the simulation; and a kick that does not reverse."""
+
+    def events(t, q, u, x):
+        def count(place):
+            return {"mode": x["mode"] + place}
+
+        return {
+            "a": jk.rising(3.0 * t - 2.1, then=count(1.0)),
+            "b": jk.falling(0.7 - t, then=count(10.0)),
+            "kick": jk.rising(q["x"] - 0.7, then={"v": 2.0 * u["v"]}),
+            "last": jk.rising(t - 2.0, then=count(100.0)),
+            "later": jk.rising(4.0 * t - 8.0, then=count(1000.0)),
+        }
+
+    ride = moving(events)
+    assert ride.ok
+    names = [ride.jumps.name(i) for i in range(int(ride.jumps.count))]
+    assert names == ["a", "b", "kick", "last", "later"]
+    np.testing.assert_allclose(ride.jumps.t[:5], [0.7, 0.7, 0.7, 2.0, 2.0], atol=1e-12)
+    assert float(ride["mode"][-1]) == 1111.0
+    np.testing.assert_allclose(ride["x"][-1], 0.7 + 2.0 * 1.3, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_an_event_that_ends_the_simulation_is_not_hidden_by_a_jump_at_the_same_time():
+    ride = moving(lambda t, q, u, x: {"a": jk.rising(t - 1.0, then={"mode": 1.0}), "stop": q["x"] - 1.0})
+    assert ride.reason == "stop"
+    np.testing.assert_allclose(ride.t_end, 1.0, atol=1e-12)
 
 
 class OverMovingFloor(Ball):

@@ -6,6 +6,7 @@ An event ends the simulation, or changes the state (`jumps.py`).
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -87,8 +88,10 @@ def first_crossing(
     g1: Float[Array, " n"],
     slope1: Float[Array, " n"],
     direction: Float[Array, " n"],
+    resolution: Array | float = 0.0,
 ) -> Float[Array, " n"]:
-    """Where in [0, 1] cubics through two ends first cross zero; infinity if they do not.
+    """Where in [0, 1] cubics through two ends first cross zero; infinity if they do not. A cubic that touches zero and
+    turns back does not cross it.
 
     **Arguments:**
 
@@ -96,13 +99,14 @@ def first_crossing(
     - `slope0`, `slope1` (n,): slopes at 0 and 1.
     - `direction` (n,): 1 upwards, -1 downwards, 0 both. A function that is zero at 0 crosses there if it then changes
         in its direction; with the direction 0 it does not.
+    - `resolution`: a crossing so near to 1 must be visible in the value at 1.
     """
     ends = zip(g0, slope0, g1, slope1, direction, strict=True)
-    places = [_first_crossing(*(jnp.asarray(x, g0.dtype) for x in end)) for end in ends]
+    places = [_first_crossing(*(jnp.asarray(x, g0.dtype) for x in (*end, resolution))) for end in ends]
     return jnp.stack(places) if places else jnp.zeros_like(g0)
 
 
-def _first_crossing(g0: Array, slope0: Array, g1: Array, slope1: Array, direction: Array) -> Array:
+def _first_crossing(g0: Array, slope0: Array, g1: Array, slope1: Array, direction: Array, resolution: Array) -> Array:
     """The first crossing of one cubic. Arguments are scalars, so that everything is one function."""
     a, b, c = 2 * (g0 - g1) + slope0 + slope1, 3 * (g1 - g0) - 2 * slope0 - slope1, slope0
 
@@ -115,27 +119,34 @@ def _first_crossing(g0: Array, slope0: Array, g1: Array, slope1: Array, directio
     # Between its extrema a cubic crosses zero at most once.
     low, high = _extrema(a, b, c)
     places = (jnp.zeros_like(a), low, high, jnp.ones_like(a))
-    values = (g0, p(low), p(high), g1)
+    # The values at the extrema have rounding errors of this size: (x - 1)^2 has a minimum of -1e-17.
+    noise = 8 * jnp.finfo(a.dtype).eps * (jnp.abs(g0) + jnp.abs(g1) + jnp.abs(slope0) + jnp.abs(slope1))
+    values = (g0, *(jnp.where((jnp.abs(p(x)) <= noise) & (x > 0), 0.0, p(x)) for x in (low, high)), g1)
     # The sign of the slope at a crossing. With direction 0 the function must leave the side on which it is.
     side = jnp.where(g0 != 0, g0, jnp.where(values[1] != 0, values[1], jnp.where(values[2] != 0, values[2], g1)))
     way = jnp.where(direction == 0, -jnp.sign(side), direction)
     left, right, before, any_passes = places[0], places[1], values[0], jnp.zeros((), bool)
-    for i in reversed(range(3)):
-        passes = (way * values[i] <= 0) & (way * values[i + 1] >= 0) & (values[i] != values[i + 1])
+    last, is_after = jnp.where(g0 == 0, -way, g0), way * g1 > 0
+    for i in range(3):
+        passes = ~any_passes & (way * last < 0) & (is_after if i == 2 else way * values[i + 1] > 0)
         left, right = jnp.where(passes, places[i], left), jnp.where(passes, places[i + 1], right)
         before, any_passes = jnp.where(passes, values[i], before), any_passes | passes
+        last = jnp.where(values[i + 1] == 0, last, values[i + 1])
 
     # Newton's method, on the root's side of the inflection. It starts where the cubic bends away from zero, so it
     # cannot pass a root. A few digits are enough, because the repeated step is evaluated again.
     inflection = jnp.clip(_ratio(-b, 3 * a), left, right)
     is_behind = way * p(inflection) < 0
     left, right = jnp.where(is_behind, inflection, left), jnp.where(is_behind, right, inflection)
-    x = jnp.where((before == 0) | (way * (3 * a * (left + right) + 2 * b) < 0), left, right)
+    x = jnp.where(
+        (jnp.abs(before) <= jnp.finfo(a.dtype).tiny) | (way * (3 * a * (left + right) + 2 * b) < 0), left, right
+    )
     for _ in range(6):
         slope = p_dot(x)
         stays = (p(x) == 0) | (slope == 0)
         x = jnp.where(stays, x, x * x * (2 * a * x + b) - g0) / jnp.where(stays, 1.0, slope)
         x = jnp.clip(x, 0.0, 1.0)  # near a double root, rounding errors can move x anywhere
+    any_passes &= is_after | (jnp.clip(x, left, right) < 1 - resolution)
     # Infinity by a division: XLA fuses the last operations into each kernel and would compute them several times.
     return jnp.where(any_passes, jnp.clip(x, left, right), 1.0) / jnp.where(any_passes, 1.0, 0.0)
 
@@ -316,17 +327,41 @@ class EventValues(NamedTuple):
         return cls(numbers[1 : n + 1], numbers[n + 1 : 2 * n + 1], numbers[0], numbers[2 * n + 1 :])
 
     def at_start(
-        self, events: Events, rounding: Array, before: Array | None = None, closing: Array | None = None
+        self,
+        events: Events,
+        rounding: Array,
+        before: EventValues | None = None,
+        event: Array | None = None,
+        closing: Array | None = None,
     ) -> EventValues:
-        """The same where steps begin.
+        """The same where steps begin: at the start, or after the jump of an `event`.
 
         A function is set to zero if it would reach zero within a rounding error [s]. If its condition is not met, its
-        crossing is passed over: it is set to the side on which it will be. `before` (n,): its rates before a jump.
+        crossing is passed over: it is set to the side on which it will be.
+
+        `before`: at the jump. Functions that cross zero together with the event have the sign from before they cross
+        (see `with_sides`), and are due if the jump does not change them. A function that is zero before and after the
+        jump stays on its side, so an event that has occurred does not occur again. The function of the `event` itself
+        changes to its other side if it then crosses zero in its direction.
+
         `closing` (n,): whether it is the gap of a contact that touches and closes at the start of the simulation.
         """
-        rates = jnp.abs(self.rates) if before is None else jnp.maximum(jnp.abs(self.rates), jnp.abs(before))
-        vanishes = jnp.abs(self.values) <= rates * rounding
-        values = jnp.where(vanishes, jnp.zeros_like(self.values), self.values)
+        limit, side = jnp.abs(self.rates) * rounding, jnp.zeros_like(self.values)
+        is_due, tiny = jnp.zeros(side.shape, bool), jnp.finfo(side.dtype).tiny
+        if before is not None:
+            # A ball that stays on the floor has no rate after the impact, only before it.
+            limit = jnp.maximum(jnp.abs(self.rates), jnp.abs(before.rates)) * rounding
+            side, change = jnp.sign(before.values), jnp.abs(self.values) - jnp.abs(before.values)
+            way, places = (jnp.asarray(x, side.dtype) for x in (events.directions, range(len(events.directions))))
+            # A rate of 1e-17 m/s after an impact without restitution is a rounding error.
+            rests = jnp.abs(self.rates) <= float(jnp.finfo(side.dtype).eps) ** 0.5 * jnp.abs(before.rates)
+            self = self._replace(rates=jnp.where((event == places) & rests, 0.0, self.rates))
+            side = jnp.where((event == places) & (way * self.rates > 0), way, side)
+            is_due = (event != places) & (side * self.values < 0) & (jnp.abs(change) <= 4 * limit)
+            side = jnp.where(is_due | (jnp.abs(before.values) <= 2 * limit), side, 0.0)
+        vanishes = jnp.abs(self.values) <= jnp.where(is_due, 4.0, 1.0) * limit
+        values = jnp.where(is_due, side * jnp.abs(self.values), self.values)
+        values = jnp.where(vanishes, side * tiny, values)
         if any(contact is not None for contact in events.contacts):
             # The states of the contacts were just found, so none of their functions vanishes here.
             of_contacts = jnp.asarray([contact is not None for contact in events.contacts])
@@ -334,9 +369,21 @@ class EventValues(NamedTuple):
                 values = jnp.where(closing, 0.0, values)
                 of_contacts &= ~closing
             own = jnp.where(of_contacts & vanishes, jnp.maximum(self.rates, 0.0), self.rates)
-            values = jnp.where(of_contacts, jnp.maximum(values, jnp.finfo(values.dtype).tiny), values)
+            values = jnp.where(of_contacts, jnp.maximum(values, tiny), values)
             return self._replace(values=values, rates=own).passed(events, vanishes)
         return self._replace(values=values).passed(events, vanishes)
+
+    def with_sides(self, events: Events, start: EventValues, jumps: Array, resolution: Array) -> EventValues:
+        """The same at the end of a step. A function that is zero keeps its side at the `start`. If the step `jumps` at
+        its end, each function that then crosses zero in its direction has its sign from the start."""
+        side, direction = jnp.sign(start.values), jnp.asarray(events.directions, self.values.dtype)
+        way = jnp.where(direction == 0, -side, direction)
+        # A crossing whose condition was not met may be earlier in the step.
+        near, all_met = jnp.abs(self.values) <= 4 * jnp.abs(self.rates) * resolution, jnp.ones((), bool)
+        met = [all_met if i is None else self.conditions[i] > 0 for i in events.conditions]
+        crosses = jumps & (way * side <= 0) & (way * self.values >= 0) & (near | jnp.stack(met)) if met else near
+        values = jnp.where(self.values == 0, side * jnp.finfo(side.dtype).tiny, self.values)
+        return self._replace(values=jnp.where(crosses, side * jnp.abs(values), values))
 
     def passed(self, events: Events, near: Any) -> EventValues:
         """The same, with the functions that are `near` zero (n,) set to their side after the crossing, where their
@@ -349,21 +396,6 @@ class EventValues(NamedTuple):
                 crosses = near[i] & (self.conditions[place] <= 0) & (way * self.rates[i] > 0)
                 values[i] = jnp.where(crosses, way * jnp.finfo(self.values.dtype).tiny, values[i])
         return self._replace(values=jnp.stack(values)) if any(x is not None for x in events.conditions) else self
-
-    def occurred_once(self, events: Events, event: Array, before: Array | None) -> EventValues:
-        """The same after the jump of an event that did not change the rate of its own function.
-
-        A function of the time, for example, continues through zero. It is set to its side after the crossing.
-        """
-        values = list(self.values)
-        for i, direction in enumerate(events.directions):
-            if events.stages[i] and before is not None:
-                rate, tolerance = self.rates[i], jnp.finfo(self.values.dtype).eps ** 0.5
-                way = jnp.asarray(direction, rate.dtype) if direction else jnp.sign(rate)
-                is_same = jnp.abs(rate - before[i]) <= tolerance * jnp.abs(before[i])
-                passes = (event == i) & (values[i] == 0) & is_same & (way * rate > 0)
-                values[i] = jnp.where(passes, way * jnp.finfo(rate.dtype).tiny, values[i])
-        return self._replace(values=jnp.stack(values)) if values else self
 
     def growth(self, end: EventValues, h: Array, share: float) -> Array:
         """The largest ratio of the next step to this step, such that no event function oscillates within the next step.
@@ -412,16 +444,27 @@ def event_values(system: System, t: Component, y: Array, y_dot: Array | None) ->
 
 
 def first_event(
-    events: Events, rounding: Array, start: EventValues, end: EventValues, h: Array, is_ahead: Array
+    events: Events,
+    rounding: Array,
+    resolution: Array,
+    start: EventValues,
+    end: EventValues,
+    h: Array,
+    is_ahead: Array,
+    is_last: Array,
 ) -> tuple[Array, Array]:
     """Which event function first crosses zero in a step, as a float, and where in [0, 1]; infinity if none does.
 
+    Of events at the same time, this is the first in alphabetical order.
+
     **Arguments:**
 
-    - `events`: their directions. An event whose condition is not met at both ends of the step is passed over.
-    - `rounding`: a function that would reach zero within this time after the step is zero at its end [s].
+    - `events`: their directions. An event whose condition is not met at the crossing is passed over.
+    - `rounding`: events within this time are simultaneous [s].
+    - `resolution`: the longest time from an event to the end of its step [s].
     - `start`, `end`: the event functions at both ends of the step. `h`: its length [s].
     - `is_ahead`: whether a longer step from a time before has crossed zero.
+    - `is_last`: whether the simulation ends at the end of the step.
     """
     # A gap opens like t^3. The cubic through both ends of a step may then be negative by a rounding error.
     shift = 0.0 if end.noise is None else end.noise
@@ -429,21 +472,38 @@ def first_event(
     # If a rate is not finite, e.g. of a norm at zero, the slope of the chord is used instead.
     chord = end.values - start.values
     slopes = [jnp.where(jnp.abs(rates) < jnp.inf, h * rates, chord) for rates in (start.rates, end.rates)]
-    x = first_crossing(start.values + shift, slopes[0], end.values + shift, slopes[1], direction)
-    coming = (jnp.sign(end.values) * jnp.sign(end.rates) < 0) & (direction * end.rates >= 0)
+    x = first_crossing(start.values + shift, slopes[0], end.values + shift, slopes[1], direction, resolution / h)
+    # A function that is zero at the end, or would be within a rounding error, usually crosses in the next step. There
+    # may be none, or another function crosses at the same time. The slope of one that touches zero vanishes.
+    way = jnp.where(direction == 0, -jnp.sign(start.values), direction)
+    coming = (way * end.values <= 0) & (way * slopes[1] > jnp.finfo(h.dtype).eps ** 0.5 * jnp.abs(chord))
     coming &= jnp.abs(end.values) <= jnp.abs(end.rates) * rounding
+    coming &= is_last | (jnp.min(x, initial=jnp.inf) <= 1)
     if end.noise is not None:
         # A gap of two large coordinates does not change in steps that are too short for their digits.
         coming |= is_ahead & (jnp.abs(end.values) <= end.noise) & (direction * end.rates > 0)
     x = jnp.where(coming, jnp.minimum(x, 1.0), x)
-    event, place = jnp.full_like(h, -1.0), jnp.full_like(h, jnp.inf)
-    for i in reversed(range(len(events.directions))):
-        nearer = x[i] <= place
-        condition = events.conditions[i]
+    places, event, place = [], jnp.full_like(h, -1.0), jnp.full_like(h, jnp.inf)
+    for i, (each, condition) in enumerate(zip(x, events.conditions, strict=True)):
+        if not events.contacts or events.contacts[i] is None:
+            # The cubic of t^4 crosses zero at the start of a step. A short step decides.
+            later = jnp.maximum(each, 2 * jnp.finfo(h.dtype).eps ** 2)
+            each = jnp.where(way[i] * end.values[i] > 0, each, later)
         if condition is not None:
-            nearer &= (start.conditions[condition] > 0) | (end.conditions[condition] > 0)
-        event, place = jnp.where(nearer, float(i), event), jnp.where(nearer, x[i], place)
-    return event, place
+            now, later = start.conditions[condition] > 0, end.conditions[condition] > 0
+            is_met = jnp.where(is_at_start(each), now, later | (now & ((1 - each) * h > resolution)))
+            each = jnp.where(is_met, each, jnp.inf)
+        places.append(each)
+    first = functools.reduce(jnp.minimum, places, place)
+    first += rounding / h
+    for i in reversed(range(len(places))):
+        event, place = (jnp.where(places[i] <= first, new, old) for new, old in ((float(i), event), (places[i], place)))
+    return event, jnp.where(event < 0, jnp.inf, place)
+
+
+def is_at_start(place: Array) -> Array:
+    """Whether a crossing is at the start of the step. A function that is zero there may be marked by a tiny number."""
+    return place <= jnp.finfo(place.dtype).eps ** 2
 
 
 class EventPoint(NamedTuple):

@@ -21,7 +21,7 @@ from .probe import Probe, Probing, read_errors
 from .settings import with_scan_kind
 from .solvers import rates_at_ends
 from .status import Status
-from .step_control import ControllerState, StepSizeController, almost
+from .step_control import ControllerState, StepSizeController
 
 # How the loop of equinox is differentiated, by adjoint.
 _KINDS: dict[type, str] = {
@@ -248,13 +248,10 @@ def fast_loop(
                 status = jnp.where(is_possible, after.status, jump.status)
                 status = jnp.where(fits, status, float(Status.MAX_JUMPS))
                 changed = (changed[0].at[0].set(status), changed[1])
-                # The step may have ended at the duration, within the resolution after the jump.
-                is_last = jump.t >= almost(controller.duration)
-                goes_on = (status == float(Status.COMPLETED)) & ~is_last
-                begin = jnp.where(is_last, controller.duration, jump.t)
+                goes_on = status == float(Status.COMPLETED)
                 record = a.jumps.with_(jump.t, now.jump, jump.before, jump.after, jump.smooth, jump.impulses)
                 rates_after = None if a.rates is None else jnp.zeros_like(a.rates)
-                return AtJump(jnp.zeros_like(a.is_due), begin, end, y, rates_after, restarted, changed, goes_on, record)
+                return AtJump(jnp.zeros_like(a.is_due), jump.t, end, y, rates_after, restarted, changed, goes_on, record)
 
             after = loop(lambda a: a.is_due, jumped_at, base, 1, 1, lambda a: a.jumps.buffers)
             t0, cut = jnp.where(base.is_due, after.t, t0), constant(after.t)

@@ -23,7 +23,7 @@ from .._scalarjit.jaxpr import LARGEST_SUM
 from .._scalarjit.nan import constant
 from .._scalarjit.scalar_function import ScalarFunction
 from .discontinuities import Discontinuities, rounding
-from .events import Events, EventValues, first_event
+from .events import Events, EventValues, first_event, is_at_start
 from .status import Status
 
 
@@ -41,6 +41,7 @@ class ControllerState(NamedTuple):
     - `length`: the length of the step that an event rejected first [s]. After a jump, steps continue with it.
     - `jump`: the event whose jump is due where this step ends, or where it begins if it was rejected; -1 if none is.
     - `last_jump`: the event of the jump at which this step begins; -1 if it begins at no jump.
+    - `begin`: the start of the last accepted step [s].
     - `start`: the event functions at the start of the step; None if the system has none.
     """
 
@@ -51,6 +52,7 @@ class ControllerState(NamedTuple):
     length: Array
     jump: Array
     last_jump: Array
+    begin: Array
     start: EventValues | None
 
     def packed(self) -> Array:
@@ -161,7 +163,8 @@ class StepSizeController(diffrax.AbstractAdaptiveStepSizeController[Array, None]
     def after_jump(self, state: Any, t: Array, y: Array, args: Any) -> tuple[Array, Any]:
         """The end of the step that begins after a jump to (t, y), and the state of the controller."""
         t, state = constant((t, state[0]))
-        values = self._values(t, t, y, args)
+        # If an input is discontinuous here, its event is still due: the value is that at the end of the last step.
+        values = self._values(ControllerState.unpacked(state, len(self.events.names)).begin, t, y, args)
         end, state = _after_jump(self._numbers(), state, t, values, self._stop_after(t))
         return end, (state, None)
 
@@ -236,7 +239,7 @@ def _first(
     if values is not None:
         closing = None if y0 is None else control.events.closing_at_start(y0, values, rounding)
         start = values._replace(noise=None).at_start(control.events, rounding, closing=closing)
-    state = ControllerState(status, past, never, zero, end, zero - 1, zero - 1, start)
+    state = ControllerState(status, past, never, zero, end, zero - 1, zero - 1, zero, start)
     return jnp.minimum(end, control.duration), state.packed()
 
 
@@ -248,15 +251,15 @@ def _after_jump(
     state, duration = ControllerState.unpacked(packed, len(control.events.names)), control.duration
     end = t + (_to_next(control.step, t) if control.step is not None else jnp.minimum(state.length, control.longest))
     end = end if stop is None else _clipped(t, end, stop)
-    end = jnp.where(end > almost(duration), duration, end)
+    # At the end of the simulation, a last short step finds the events at the same time.
+    end = jnp.where(end > almost(duration), jnp.maximum(duration, t + _shortest(t, duration)), end)
     resolution = _resolution(t, state.length, duration)
-    # A ball that stays on the floor has no rate after the impact, only before it.
-    before, values = None if state.start is None else state.start.rates, values._replace(noise=None)
+    values = values._replace(noise=None)
     state = state._replace(
         rejected_end=jnp.full_like(t, -jnp.inf),
         jump=jnp.full_like(t, -1.0),
         last_jump=state.jump,
-        start=values.at_start(control.events, resolution, before).occurred_once(control.events, state.jump, before),
+        start=values.at_start(control.events, resolution, state.start, state.jump),
     )
     return end, state.packed()
 
@@ -318,7 +321,8 @@ def _decide(
         decision, state = _at_events(control, before, end, t0, t1, step)
     # The end of the simulation. The last step must not consist of rounding errors. A rejected last step is halved.
     near = decision.t1 > almost(duration)
-    last = jnp.where(decision.keep, duration, decision.t0 + 0.5 * (duration - decision.t0))
+    halfway = jnp.where(decision.t0 > almost(duration), decision.t1, decision.t0 + 0.5 * (duration - decision.t0))
+    last = jnp.where(decision.keep, duration, halfway)
     repeats = decision.keep != keep
     fails = too_short & ~repeats
     status = jnp.where(fails, float(Status.STEP_TOO_SMALL), state.status)
@@ -390,27 +394,21 @@ def _at_events(
     unknown = kept & functools.reduce(operator.or_, [x != x for x in values], ~is_lawful)
     fails = unknown & (h <= resolution)
     kept &= ~unknown
-    event, x = first_event(events, _shortest(t1, duration), start, end, h, t1 < before.rejected_end)
+    is_ahead, is_last = t1 < before.rejected_end, t1 > almost(duration)
+    event, x = first_event(events, _shortest(t1, duration), resolution, start, end, h, is_ahead, is_last)
     crossed = kept & (x <= 1)
     # Signs, since a product of two small determinants underflows in float32.
     over = kept & (jnp.sign(start.bound) * jnp.sign(end.bound) < 0)
     at_bound = (over & (h <= duration / 1000)) | (kept & ~over & (t1 >= before.over_bound))
-    at_start = crossed & (x == 0) & ~over & ~at_bound
+    at_start = crossed & is_at_start(x) & ~over & ~at_bound
     is_near = (1 - x) * h <= resolution
     if end.noise is not None:
         sizes = zip(end.values, end.noise, strict=True)
         for i, (value, noise) in enumerate(sizes):
             is_near |= (event == i) & (jnp.abs(value) <= noise)
         end = end._replace(noise=None)
-    at_end = crossed & is_near & ~over & (x != 0) & ~at_bound
-    is_passed = jnp.zeros_like(kept)
-    for i, place in enumerate(events.conditions):
-        if place is not None:
-            is_passed |= at_end & (event == i) & (end.conditions[place] <= 0)
-            near = [is_passed if j == i else jnp.zeros_like(kept) for j in range(len(events.names))]
-            end = end.passed(events, near)
-    at_end &= ~is_passed
-    repeat = ((crossed | over) & ~at_end & ~at_start & ~at_bound & ~is_passed) | (unknown & ~fails)
+    at_end = crossed & is_near & ~over & ~at_start & ~at_bound
+    repeat = ((crossed | over) & ~at_end & ~at_start & ~at_bound) | (unknown & ~fails)
     beyond = jnp.where(over | unknown, 0.5 * h, jnp.minimum(x, 1.0) * h + 0.5 * resolution)
     rejected = repeat | at_start | at_bound | fails
     status = jnp.where(at_bound, float(Status.SINGULAR_SPEEDS), before.status)
@@ -421,6 +419,7 @@ def _at_events(
         jumps |= happens & (event == i) & (stages > 0)
     repeats = jumps & at_start & (event == before.last_jump)
     status = jnp.where(repeats, float(Status.REPEATED_JUMP), status)
+    end = end.with_sides(events, start, jumps, resolution)
     is_first = repeat & (t1 > before.rejected_end)
     untouched = jumps & (t1 > before.rejected_end)
     state = ControllerState(
@@ -431,6 +430,7 @@ def _at_events(
         length=jnp.where(is_first | untouched, h, before.length),
         jump=jnp.where(jumps & ~repeats, event, -1.0),
         last_jump=jnp.where(kept & ~rejected, -1.0, before.last_jump),
+        begin=jnp.where(kept & ~rejected, t0, before.begin),
         start=jax.tree.map(lambda new, old: jnp.where(kept & ~rejected, new, old), end, start),
     )
     next_t0, next_t1 = jnp.where(rejected, begin, step.t0), jnp.where(repeat, t0 + beyond, step.t1)
