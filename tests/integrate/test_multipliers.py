@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -141,8 +142,53 @@ def test_a_redundant_third_rocker_does_not_change_the_motion(excess):
     np.testing.assert_allclose(ride["a"][-1], pendulum.y[0, -1], atol=1e-6 if excess else 1e-8)
 
 
+class Struck(Links):
+    """Four links, of which the first is struck or slowed when it passes an angle."""
+
+    kind: str = eqx.field(static=True, default="impact")
+
+    def events(self, t, q, u):
+        new = {"impact": jk.Impact(u["u0"] - 2.0 * u["u1"], restitution=0.5), "slower": {"u0": 0.5 * u["u0"]}}
+        return {"strike": jk.falling(q["q0"] - 0.85, then=new[self.kind])}
+
+
+def moving_links():
+    """The system, and its state with and without multipliers."""
+    state = jk.assemble(Struck(), at_rest(), {"u0": -0.5, "u1": 0.3})
+    u_dep = jk.dependent_speeds(Struck(), 0.0, state.q, state.u)
+    return state, jk.State(state.q, jnp.concatenate([state.u, u_dep]))
+
+
+def test_an_impact_satisfies_the_constraints_of_a_system_with_multipliers():
+    own, state = moving_links()
+
+    def strike(t, q, u, motion):
+        return u["u0"] - 2.0 * u["u1"]
+
+    wanted = jk.impact(Struck(), 0.0, own.q, own.u, strike, 0.5)
+    found = jk.impact(jk.with_multipliers(Struck()), 0.0, state.q, state.u, strike, 0.5)
+    u_dep = jk.dependent_speeds(Struck(), 0.0, own.q, wanted.u)
+    np.testing.assert_allclose(found.u, [*wanted.u, *u_dep], rtol=1e-10)
+    np.testing.assert_allclose(found.impulses, wanted.impulses, rtol=1e-10)
+    np.testing.assert_allclose(found.energy_lost, wanted.energy_lost, rtol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["impact", "slower"])
+def test_jumps_with_multipliers_agree_with_those_of_dependent_speeds(kind):
+    own, state = moving_links()
+    ts = jnp.linspace(0.0, 0.2, 3)
+    wanted = jk.simulate(Struck(kind=kind), own, ts, rtol=1e-10, atol=1e-10)
+    found = jk.simulate(jk.with_multipliers(Struck(kind=kind)), state, ts, rtol=1e-10, atol=1e-10)
+    assert int(wanted.jumps.count) == int(found.jumps.count) > 0
+    np.testing.assert_allclose(found.q, wanted.q, atol=1e-8)
+    np.testing.assert_allclose(found.jumps.energy[0], wanted.jumps.energy[0], rtol=1e-7)
+
+
 def test_with_multipliers_rejects_unsupported_uses():
     system = jk.with_multipliers(Links())
+    with pytest.raises(ValueError, match="`release` is not supported for a system with multipliers"):
+        jk.impact(system, 0.0, at_rest(), np.zeros(4), lambda t, q, u, motion: u["u0"], release=("end",))
     assert jk.with_multipliers(system) is system
     with pytest.raises(TypeError, match="must be an instance of a System"):
         jk.with_multipliers(Links)

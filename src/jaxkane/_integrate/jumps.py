@@ -24,10 +24,10 @@ from jaxtyping import Array, Float, Int
 
 from .._common.lookup import refuse_unknown
 from .._kane.contact import has_contacts
-from .._kane.impact import Impact, after_impact
+from .._kane.impact import REDUNDANT, Impact, Permanent, after_impact, inverse_root
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import Tracer
-from .._scalarjit.components import Component, as_vector, component
+from .._scalarjit.components import Component, as_vector, component, stack
 from .._scalarjit.nan import nan_if_not_zero
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.prints import wrapped
@@ -196,7 +196,33 @@ def _after_stage(system: System, t: Component, y: Array, name: str, stage: int) 
             new.append(component(then[key]) if key in then else y[i])
         except TypeError as error:
             raise TypeError(f"{label}: the new value of {key!r} must be one number, got {then[key]!r}.") from error
-    return jnp.concatenate([as_vector(new, y), y[len(names) :]]), ()
+    after = jnp.concatenate([as_vector(new, y), y[len(names) :]])
+    return _onto_constraints(system, t, after, [key for key in system.speeds if key not in then]), ()
+
+
+def _onto_constraints(system: System, t: Component, y: Array, names: Sequence[str]) -> Array:
+    """For a system with multipliers, the state with speeds that satisfy its constraints; NaN if there are none.
+
+    Of the speeds `names`, the dependent speeds of the system without multipliers change, or all if it has none. The
+    change has the smallest kinetic energy.
+    """
+    state, n_q = unpacked(system, y), len(system.coordinates)
+    kane = KaneEquations(system, t, state.q, state.u)
+    permanent = Permanent.of(kane)
+    if permanent is None:
+        return y
+    dependent = system.inner.dependent_speeds or system.speeds  # pyright: ignore[reportAttributeAccessIssue]
+    free = [i for i, name in enumerate(system.speeds) if name in names and name in dependent]
+    change, C, n = jnp.zeros_like(state.u), permanent.C, len(system.speeds)
+    if free:
+        M = kane.mass_matrix(kane.partial_velocities())
+        X = stack(inverse_root([[M[i][j] for j in free] for i in free])).astype(y.dtype)
+        A, b = permanent._replace(C=jnp.stack([C[:, i] for i in free], axis=1)).rows(X)
+        values = X @ (b @ A)
+        change = as_vector([values[free.index(i)] if i in free else 0.0 for i in range(n)], y)
+    rest, size = permanent.residuals + C @ change, jnp.abs(C) @ (jnp.abs(state.u) + jnp.abs(change))
+    change = jnp.where(jnp.all(jnp.abs(rest) <= REDUNDANT * size), change, jnp.nan)
+    return jnp.concatenate([y[:n_q], state.u + change, y[n_q + n :]])
 
 
 @jax.custom_jvp

@@ -48,7 +48,7 @@ from .._system.motion import Motion
 from .._system.system import System
 from .arguments import Row, is_concrete, is_one_number
 from .description import dtype_of, jvp
-from .impact import RowBasis, checked_restitution, inverse_root, least_norm
+from .impact import REDUNDANT, RowBasis, checked_restitution, inverse_root, least_norm
 from .kanes_method import KaneEquations, unit
 from .scaling import term_sizes
 from .unilateral import MOST_CONTACTS, OPEN, SLIDES, STICKS, force_scales, with_friction
@@ -199,10 +199,6 @@ class ContactLayout(NamedTuple):
     def memory_size(self) -> int:
         return len(self.names) * self.memory_width
 
-
-REDUNDANT = 1e-6
-"""A velocity residual with a multiplier is redundant if its part that does not depend on the others is relatively
-smaller. Lengths in files are often rounded to six digits."""
 
 NO_CONTACTS = ContactLayout((), (), (), False, (), ())
 

@@ -279,6 +279,7 @@ class Quantities(NamedTuple):
     - `deviation` (m,): the part of each residual that is not affine in the speeds.
     - `size` (m,): the size of the terms of each residual.
     - `released`: None if nothing is released.
+    - `permanent`: the residuals of permanent constraints with multipliers, None without them.
     """
 
     u: Array
@@ -288,6 +289,37 @@ class Quantities(NamedTuple):
     deviation: Array
     size: Array
     released: Released | None
+    permanent: Permanent | None = None
+
+
+REDUNDANT = 1e-6
+"""A velocity residual with a multiplier is redundant if its part that does not depend on the others is relatively
+smaller. Lengths in files are often rounded to six digits."""
+
+
+class Permanent(NamedTuple):
+    """Velocity residuals with multipliers: derivatives `C` (k, n) by the speeds, and `residuals` (k,)."""
+
+    C: Array
+    residuals: Array
+
+    @classmethod
+    def of(cls, kane: KaneEquations) -> Permanent | None:
+        system: Any = kane.system
+        if not hasattr(system, "multiplier_residuals"):
+            return None
+
+        def residuals(u: Row) -> Row:
+            return system.multiplier_residuals(kane.t, kane.q, u)
+
+        columns = [kane.along_speeds(residuals, unit(kane.n, r)) for r in range(kane.n)]
+        values = stack([residuals(kane.u_all)])[0]
+        return cls(stack(columns).astype(kane.dtype).T, values.astype(kane.dtype))
+
+    def rows(self, X: Array) -> tuple[Array, Array]:
+        """A (k, n) with orthonormal rows and b (k,), for which A w = b is the change X w onto the constraints."""
+        basis = RowBasis.of(self.C @ X, REDUNDANT)
+        return basis.Q, basis.solve(-self.residuals)[0]
 
 
 class BeforeImpact:
@@ -318,9 +350,14 @@ class BeforeImpact:
         r, r0, slope = impact.residuals, self.residuals(self.rest), self.along(kane.u_all)
         deviation = [sub(sub(x, y), z) for x, y, z in zip(r, r0, slope, strict=True)]
         size = [total(map(abs, terms)) for terms in zip(r, r0, slope, strict=True)]
+        if impact.release and hasattr(kane.system, "multiplier_residuals"):
+            raise ValueError(
+                f"{kane.name}: an impact with `release` is not supported for a system with multipliers. Use the system "
+                "with dependent speeds (its attribute `inner`)."
+            )
         released = self._released(momenta) if impact.release else None
         rows: Any = (kane.u, h, r, impact.restitution, deviation, size)
-        return Quantities(*map(self._array, rows), released=released)
+        return Quantities(*map(self._array, rows), released=released, permanent=Permanent.of(kane))
 
     def _array(self, row: Sequence[Component]) -> Array:
         return stack([row])[0].astype(self.kane.dtype)
@@ -422,7 +459,12 @@ def _solved(M: Array, C: Array, before: Quantities) -> ImpactSolution:
     X, C, n = coordinates.X, coordinates.C, len(M)
     # C (u+ - u-) = c(u+) - c(u-) = -(1 + e) c(u-)
     b = -(1.0 + before.restitution) * before.residuals
-    w, y, T, is_new, missing = least_norm(C @ X, b)
+    A, k = C @ X, 0
+    if before.permanent is not None:
+        rows, values = before.permanent.rows(X)
+        A, b, k = jnp.concatenate([rows, A]), jnp.concatenate([values, b]), len(rows)
+    w, y, T, is_new, missing = least_norm(A, b)
+    b, y, T, is_new, missing = b[k:], y[k:], T[k:, k:], is_new[k:], missing[k:]
     p = least_norm(T.T[::-1], y[::-1])[0]  # T^T p = y
     size = before.size + jnp.abs(b) + jnp.abs(T) @ jnp.abs(y)
     tolerance = float(jnp.finfo(M.dtype).eps) ** 0.5
