@@ -254,12 +254,11 @@ def _after_jump(
     # At the end of the simulation, a last short step finds the events at the same time.
     end = jnp.where(end > almost(duration), jnp.maximum(duration, t + _shortest(t, duration)), end)
     resolution = _resolution(t, state.length, duration)
-    values = values._replace(noise=None)
     state = state._replace(
         rejected_end=jnp.full_like(t, -jnp.inf),
         jump=jnp.full_like(t, -1.0),
         last_jump=state.jump,
-        start=values.at_start(control.events, resolution, state.start, state.jump),
+        start=values._replace(noise=None).at_start(control.events, resolution, state.start, state.jump),
     )
     return end, state.packed()
 
