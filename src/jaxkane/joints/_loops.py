@@ -50,6 +50,13 @@ def with_dependent(
         is_concrete = not any(isinstance(x, Tracer) or np.ndim(x) for x in values.values())
         q, rows, redundant = _independent_residuals(trial, choices.pose, is_concrete)
         speeds, coordinates = _dependent_names(trial, q, rows, choices, norms)
+    if len(rows) == len(trial.speeds):
+        warnings.warn(
+            f"{structure.name}: no independent speed: {len(rows)} speeds, and {len(rows)} independent residuals of the "
+            "loops. If the mechanism can move, pass a `pose` at which its loops are closed. Otherwise, remove a loop.",
+            UserWarning,
+            stacklevel=3,
+        )
     first, loops = 0, []
     for loop in structure.loops:
         own = range(first, first + loop.size)
@@ -88,23 +95,35 @@ def _independent_residuals(
     """Coordinates at which the loops are closed, the residuals that are independent there, and those that nearly depend
     on them, which are omitted.
     """
+    rng = np.random.default_rng(1)
     q = trial.start(pose)
-    size, order = _pivots(trial.velocity_slopes(q))
-    rows = [i for i, pivot in zip(order, size, strict=False) if pivot > max(1e-9 * size[0], 1e-13)]
-    good = [i for i, pivot in zip(order, size, strict=False) if i in rows and trial.is_regular(i, pivot / size[0])]
-    closed = trial.closed(q, sorted(good))
-    if closed is not None:
-        size, order = _pivots(trial.velocity_slopes(closed)[rows])
-        pivots = zip(order, size, strict=False)
-        regular = [rows[i] for i, pivot in pivots if trial.is_regular(rows[i], pivot / size[0])]
-        if len(regular) > len(good):  # q is close to a singular configuration
-            good, closed = regular, trial.closed(q, sorted(regular))
+    # Not at the reference: residuals that are independent elsewhere may be dependent there, if links are in line.
+    beside = trial.beside(q, rng)
+    q = q if pose is not None else beside
+    rows, good = (trial.independent(q, smallest) for smallest in (0.0, NEARLY_REDUNDANT))
+    n_open, closed = len(trial.independent(beside, NEARLY_REDUNDANT)), trial.closed(q, sorted(good))
     redundant = sorted(set(rows) - set(good))
+    regular = [] if closed is None else trial.independent(closed, NEARLY_REDUNDANT)
+    is_regular = n_open <= min(len(good), len(regular)) < len(trial.speeds)
+    if is_concrete and not (closed is not None and is_regular and trial.gaps(closed, good, redundant).max() <= 1.0):
+        every = list(range(len(trial.residual_units)))
+        for attempt in range(_ATTEMPTS):
+            other = trial.closed(trial.beside(q, rng, 0.2 * 2**attempt) if attempt else q, every)
+            regular = every if other is None else trial.independent(other, NEARLY_REDUNDANT)
+            if other is None or len(regular) == len(trial.speeds):
+                continue
+            # A residual that depends on others at every closed pose is redundant, although it is independent where the
+            # loops are open. At a singular pose, it is independent again beside this pose.
+            if len(regular) >= n_open or trial.are_implied(other, regular, rng):
+                return other, sorted(regular), []
     if closed is None:
         return q, sorted(good), redundant
     if is_concrete:
         trial.check_implied(closed, good, redundant)
     return closed, sorted(good), redundant
+
+
+_ATTEMPTS = 6
 
 
 def _dependent_names(
@@ -281,11 +300,27 @@ class _Trial:
     def _of(self, q: np.ndarray, name: str | None) -> float:
         return float(q[self.coordinates.index(name)]) if name else 0.0
 
-    def is_regular(self, row: int, share: float) -> bool:
-        """Whether an independent residual is used. `share`: its part that does not depend on the others. The
+    def independent(self, q: np.ndarray, smallest: float) -> list[int]:
+        """Residuals whose gradients have a part that does not depend on the others, of at least this relative size. The
         coefficients of couplings are exact, so only residuals of loops may be redundant because of rounding."""
-        is_of_loop = row < sum(closure.size for closure in self.closures)
-        return share > NEARLY_REDUNDANT or not is_of_loop
+        R, order = _qr(self.velocity_slopes(q).T)
+        n, pivots = sum(closure.size for closure in self.closures), np.abs(np.diag(R))
+        exact = max(1e-9 * pivots[0], 1e-13)
+        return [int(i) for i, x in zip(order, pivots) if x > (max(exact, smallest * pivots[0]) if i < n else exact)]
+
+    def beside(self, q: np.ndarray, rng: np.random.Generator, size: float = 0.2) -> np.ndarray:
+        return self.normalized(q + rng.uniform(-size, size, q.shape))
+
+    def are_implied(self, q: np.ndarray, rows: list[int], rng: np.random.Generator) -> bool:
+        """Whether all residuals vanish wherever these do, also at a distance from the closed coordinates q."""
+        G = np.concatenate([self.slopes(q)[rows], self.norm_slopes(q)])
+        free = scipy.linalg.null_space(G, rcond=NEARLY_REDUNDANT)  # (n_q,d)
+        for _ in range(2 if free.size else 0):
+            way = free @ rng.normal(size=free.shape[1])
+            moved = self.closed(self.normalized(q + 0.2 * way / np.linalg.norm(way)), rows)
+            if moved is None or np.abs(self.residuals(moved)).max() > 1e-6:
+                return False
+        return True
 
     def velocity_slopes(self, q: np.ndarray) -> np.ndarray:
         """Derivatives of the velocity residuals with respect to the speeds (residuals, n)."""
@@ -344,25 +379,31 @@ class _Trial:
                 q[self.coordinates.index(joint.name)] = joint.reference
         for name, value in (pose or {}).items():
             q[self.coordinates.index(name)] = value
-        q /= self.coordinate_units
-        # Not at the reference: residuals that are independent elsewhere may be dependent there, if links are in line.
-        return self.normalized(q if pose is not None else q + np.random.default_rng(1).uniform(-0.2, 0.2, q.shape))
+        return self.normalized(q / self.coordinate_units)
 
     def closed(self, q: np.ndarray, rows: list[int]) -> np.ndarray | None:
         """Coordinates near q at which these residuals are zero; None if Newton's method does not converge."""
         weights = np.ones(len(q))  # prefer to change the coordinates that will be dependent
         for i, group in enumerate(_by_joints(self.structure, self.coordinates, lambda joint: joint.coordinates)):
             weights[group] = max(0.1**i, 1e-3)
-        for _ in range(50):
+        sizes = []
+        for i in range(50):
             h = self.residuals(q)[rows]
-            if np.abs(h).max(initial=0.0) < 1e-9:
-                return q
+            sizes.append(np.abs(h).max(initial=0.0))
+            if sizes[-1] < 1e-12 or (i > 10 and sizes[-1] > 0.5 * sizes[-10]):
+                break
             norms = 0.5 * self.norm_slopes(q)
             J = np.concatenate([self.slopes(q)[rows], norms])
             step = weights * np.linalg.lstsq(J * weights, -np.concatenate([h, np.zeros(len(norms))]), rcond=None)[0]
             # At most 0.5 (largest lengths or rad) in one step, so that a loop closes near q and not in another branch.
             q = self.normalized(q + step / max(1.0, 2.0 * np.linalg.norm(step)))
-        return None  # not closed from there: `assemble` reports it
+        return q if sizes[-1] < 1e-9 else None  # not closed from there: `assemble` reports it
+
+    def gaps(self, q: np.ndarray, rows: list[int], redundant: list[int]) -> np.ndarray:
+        """The residuals other than `rows`, relative to the largest permitted ones."""
+        h = np.abs(self.residuals(q))
+        h[rows] = 0.0
+        return h / np.array([1e-2 if i in redundant else 1e-6 for i in range(len(h))])
 
     def check_implied(self, q: np.ndarray, rows: list[int], redundant: list[int]) -> None:
         """Check that residuals that depend on the independent ones are zero where those are. Those that nearly depend
@@ -370,18 +411,16 @@ class _Trial:
 
         **Raises:** `ValueError` for one that is not zero, e.g. if the sites of a planar loop are not in one plane.
         """
-        h = np.abs(self.residuals(q))
-        h[rows] = 0.0
+        h, gaps = np.abs(self.residuals(q)), self.gaps(q, rows, redundant)
         origins = [f"Loop({x.first!r}, {x.second!r})" for x in self.structure.loops for _ in range(x.size)]
         origins += [f"Coupling({x.first!r}, {x.second!r})" for x in self.structure.couplings]
-        allowed = np.array([1e-2 if i in redundant else 1e-6 for i in range(len(h))])
-        worst = int(np.argmax(h / allowed))
-        if h[worst] > allowed[worst]:
+        worst = int(np.argmax(gaps))
+        if gaps[worst] > 1.0:
             off = h[worst] * self.residual_units[worst]
             raise ValueError(
-                f"{self.structure.name}: {origins[worst]} cannot be satisfied: its residual is {off:.3g} for all "
-                "positions of the joints that satisfy the other loops. In a plane loop, place all sites in one plane. "
-                "Two constraints on one joint must agree."
+                f"{self.structure.name}: {origins[worst]} is not satisfied: its residual is {off:.3g} where the others "
+                "are zero. In a plane loop, place all sites in one plane. Two constraints on one joint must agree. If "
+                "the loop can be closed, pass a `pose` at which it is."
             )
         if redundant:
             listed = ", ".join(f"{origins[i]} ({h[i] * self.residual_units[i]:.2g})" for i in redundant)
@@ -391,12 +430,6 @@ class _Trial:
                 UserWarning,
                 stacklevel=5,
             )
-
-
-def _pivots(C: np.ndarray) -> tuple[np.ndarray, list[int]]:
-    """The sizes of the rows of C, each without its part along those before it, in the returned order."""
-    R, order = _qr(C.T)
-    return np.abs(np.diag(R)), [int(i) for i in order]
 
 
 def _by_joints(
