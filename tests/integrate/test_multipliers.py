@@ -185,6 +185,66 @@ def test_jumps_with_multipliers_agree_with_those_of_dependent_speeds(kind):
     np.testing.assert_allclose(found.jumps.energy[0], wanted.jumps.energy[0], rtol=1e-7)
 
 
+def test_assemble_keeps_named_speeds_of_systems_with_multipliers():
+    system, q = jk.with_multipliers(Links()), at_rest()
+    C = np.stack([np.sin(q), np.cos(q)])
+    u = np.asarray(jk.assemble(system, q, {"u1": 0.5}).u)
+    assert u[1] == pytest.approx(0.5, rel=1e-14)
+    np.testing.assert_allclose(C @ u, 0.0, atol=1e-14)
+    u = jk.assemble(system, q, {"u0": 2.0, "u1": 0.5}).u
+    np.testing.assert_allclose(u[2:], -np.linalg.solve(C[:, 2:], C[:, :2] @ [2.0, 0.5]), rtol=1e-12)
+    with pytest.raises(ValueError, match=r"no speeds satisfy .* with u0 = 2, u1 = 0\.5, u2 = 9\. Omit the speeds"):
+        jk.assemble(system, q, {"u0": 2.0, "u1": 0.5, "u2": 9.0})
+    with pytest.raises(ValueError, match="u omits u1, u2, u3, which the others determine"):
+        jk.simulate(system, jk.State(q, {"u0": 2.0}), [0.0, 1.0])
+
+
+class WithMasslessPointer(jk.System):
+    """A block moves a massless pointer, which a constraint turns by the same number."""
+
+    coordinates, dependent_coordinates = ("x", "angle"), ("angle",)
+    speeds, dependent_speeds = ("x_dot",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        block = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+        pointer = N.rotate(3, q["angle"], u["rate"])
+        return jk.Motion([jk.Body(2.0, (0.1, 0.1, 0.1), block, N), jk.Body(0.0, (0.0, 0.0, 0.0), block, pointer)])
+
+    def configuration_constraints(self, t, q):
+        return [q["angle"] - q["x"]]
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, 3.0 * motion.N.x)
+
+
+@pytest.mark.slow
+def test_massless_bodies_may_be_moved_by_constraints_with_multipliers():
+    system = jk.with_multipliers(WithMasslessPointer())
+    state = jk.assemble(system, {"x": 0.3}, {"x_dot": 2.0})
+    np.testing.assert_allclose(state.u, [2.0, 2.0], rtol=1e-14)
+    ride = jk.simulate(system, state, [0.0, 1.0])
+    np.testing.assert_allclose(ride.q[-1], 0.3 + 2.0 + 0.5 * 3.0, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_assembled_configurations_with_multipliers_depend_on_named_coordinates():
+    system = jk.with_multipliers(Parallelogram())
+    q, slopes = jax.jvp(lambda a: jk.assemble(system, {"a": a}).q, (0.5,), (1.0,))
+    np.testing.assert_allclose(q, [0.5, 0.5, 0.5, 0.0], atol=1e-12)
+    np.testing.assert_allclose(slopes, [1.0, 1.0, 1.0, 0.0], atol=1e-10)
+    with pytest.raises(ValueError, match="no coordinate may be changed"):
+        jk.assemble(system, {"a": 0.5, "b": 0.4, "c": 0.5, "bar": 0.0})
+
+
+def test_assemble_tries_other_guesses():
+    """From q2 = q3 = 0.3, Newton's method diverges."""
+    for system in (Links(), jk.with_multipliers(Links())):
+        q = np.asarray(jk.assemble(system, [0.9, 0.3, 0.3, 0.3]).q)
+        assert q[:2].tolist() == [0.9, 0.3]
+        np.testing.assert_allclose([np.cos(q).sum(), np.sin(q).sum()], [2.8, 0.0], atol=1e-9)
+
+
 def test_with_multipliers_rejects_unsupported_uses():
     system = jk.with_multipliers(Links())
     with pytest.raises(ValueError, match="`release` is not supported for a system with multipliers"):

@@ -69,7 +69,7 @@ def test_named_values_that_violate_the_constraints_are_rejected(balls):
         ValueError, match=r"Plane: x = 1, y = 3, angle = 0 does not satisfy .*is 1\).*no coordinate may be changed"
     ):
         jk.assemble(Plane(), {"x": 1.0, "y": 3.0, "angle": 0.0})
-    with pytest.raises(ValueError, match=r"no a2, a3 satisfies .*a1 = 2"):
+    with pytest.raises(ValueError, match=r"no a2, a3 that satisfies .*a1 = 2"):
         jk.assemble(balls, {"a1": 2.0, "a4": 0.0}, free=("a2", "a3"))
     moved = jk.assemble(balls, {"b1": 0.1, "b4": 0.9}, free=("b4",)).q
     np.testing.assert_allclose(moved[7:], [0.1, 0.0, 0.0, 0.99**0.5], atol=1e-15)

@@ -251,7 +251,9 @@ def fast_loop(
                 goes_on = status == float(Status.COMPLETED)
                 record = a.jumps.with_(jump.t, now.jump, jump.before, jump.after, jump.smooth, jump.impulses)
                 rates_after = None if a.rates is None else jnp.zeros_like(a.rates)
-                return AtJump(jnp.zeros_like(a.is_due), jump.t, end, y, rates_after, restarted, changed, goes_on, record)
+                return AtJump(
+                    jnp.zeros_like(a.is_due), jump.t, end, y, rates_after, restarted, changed, goes_on, record
+                )
 
             after = loop(lambda a: a.is_due, jumped_at, base, 1, 1, lambda a: a.jumps.buffers)
             t0, cut = jnp.where(base.is_due, after.t, t0), constant(after.t)

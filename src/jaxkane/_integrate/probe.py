@@ -80,7 +80,11 @@ class Probing(NamedTuple):
         if callable(args.signals):
             return self.args
         signals = {
-            name: d if not is_samples(d) or is_samples(args.signals[name]) else None if d.values is None else d.values[0]
+            name: d
+            if not is_samples(d) or is_samples(args.signals[name])
+            else None
+            if d.values is None
+            else d.values[0]
             for name, d in self.args.signals.items()
         }
         return dataclasses.replace(self.args, signals=signals)

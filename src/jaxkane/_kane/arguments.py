@@ -127,7 +127,8 @@ def by_names(values: Mapping[str, Any], names: Sequence[str], label: str) -> Arr
 def refuse_incomplete(system: System, q: Numbers, u: Numbers) -> None:
     """Raise an exception if a dict omits a dependent coordinate or contains a dependent speed.
 
-    Only `assemble` solves for omitted dependent coordinates. Elsewhere, zero would be a wrong value for them.
+    Only `assemble` solves for omitted dependent coordinates, and for omitted speeds of a system with multipliers.
+    Elsewhere, zero would be a wrong value for them.
     """
     name = type(system).__name__
     speeds = (*system.speeds, *system.dependent_speeds)
@@ -135,10 +136,13 @@ def refuse_incomplete(system: System, q: Numbers, u: Numbers) -> None:
         if isinstance(values, Mapping):
             refuse_unknown(values, names, f"{name}: {label} has no", "it has")
     missing = [c for c in system.dependent_coordinates if c not in q] if isinstance(q, Mapping) else []
-    if missing:
+    label, determined = "q", missing
+    if not missing and isinstance(u, Mapping) and u and hasattr(system, "multiplier_residuals"):
+        label, determined = "u", [s for s in system.speeds if s not in u]
+    if determined:
         raise ValueError(
-            f"{name}: q omits {', '.join(missing)}, which the other coordinates determine. Find the state with "
-            "jaxkane.assemble(system, q, u) and pass its state.q, or pass the value in q."
+            f"{name}: {label} omits {', '.join(determined)}, which the others determine. Find the state with "
+            f"jaxkane.assemble(system, q, u) and pass its state.{label}, or pass the value in {label}."
         )
     dependent = [s for s in system.dependent_speeds if s in u] if isinstance(u, Mapping) else []
     if dependent:

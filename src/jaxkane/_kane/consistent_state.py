@@ -35,6 +35,7 @@ from .constraint_residuals import (
 from .contact import REDUNDANT, ContactRows, has_multipliers, layout_of, speeds_in_contact
 from .contact_checks import check_contacts
 from .description import at_random_point, structure_of
+from .diagnosis import diagnosis
 from .kanes_method import KaneEquations
 from .scaling import SMALLEST_SIZE
 
@@ -248,6 +249,20 @@ def newton_compiled(system: System, q0, t, where: tuple[int, ...], lenient: bool
     return result._replace(q=nan_where(~result.converged, result.q, (system, q0, t)))
 
 
+def _residuals_along(xp: ModuleType, system: System, t: Component, along: np.ndarray) -> tuple[Any, Any]:
+    """The residuals (h,) as a function of q, and their derivatives (h, d) along directions (n_q, d)."""
+    if xp is np:
+        return (
+            lambda q: configuration_residual.numpy(system, t, q),
+            lambda q: configuration_residual.numpy_jvp((system, t, q), (None, None, along)),
+        )
+    rest = jnp.zeros(along.shape[1], along.dtype)
+    return (
+        lambda q: configuration_residual(system, t, q),
+        lambda q: jax.jacfwd(lambda dq: configuration_residual(system, t, q + along @ dq))(rest),
+    )
+
+
 def _newton(xp: ModuleType, system: System, q0, t, where: tuple[int, ...], lenient: bool) -> NewtonResult:
     places, dtype = np.array(where, int), q0.dtype
     # Values that are not finite must not reach the linear solver. It would raise an exception for the whole batch.
@@ -256,14 +271,7 @@ def _newton(xp: ModuleType, system: System, q0, t, where: tuple[int, ...], lenie
     along = np.eye(len(q0), dtype=dtype)[:, places]  # (n_q,moved)
     root = _root_in_numbers if xp is np else _root_under_trace
 
-    def residuals(q: Numbers) -> Numbers:
-        return configuration_residual.numpy(system, t, q) if xp is np else configuration_residual(system, t, q)
-
-    def slopes(q: Numbers) -> Numbers:
-        if xp is np:
-            return configuration_residual.numpy_jvp((system, t, q), (None, None, along))
-        return jax.jacfwd(lambda dq: residuals(q + along @ dq))(jnp.zeros(len(places), dtype))
-
+    residuals, slopes = _residuals_along(xp, system, t, along)
     moved, sizes = scales_along(system, t, q0, along.T), residual_sizes(system, t, q0)[0]
     sizes = xp.where(sizes > 0, sizes, 1.0)
 
@@ -350,7 +358,9 @@ def assemble(
         last of four Euler parameters starts at one, which is the orientation without rotation. Values of coordinates
         that are solved for, such as dependent coordinates in an array, are initial guesses.
     - `u`: independent speeds (n_u,), or a dict by name. Omitted speeds are zero. A dict may also contain dependent
-        speeds, which are compared with the solution of the velocity residuals.
+        speeds, which are compared with the solution of the velocity residuals. With `touching`, and for a system of
+        `with_multipliers`, values in a dict are fixed and omitted speeds follow from them; all speeds of an array are
+        changed. The changes are the smallest in the metric of the mass matrix.
     - `x`: first-order states (n_x,), or a dict by name. Omitted states are zero.
     - `t`: time [s], one finite number.
     - `free`: names of the coordinates that are solved for. The default is `system.dependent_coordinates`. If a dict
@@ -360,14 +370,14 @@ def assemble(
         unknowns than constraints, the solution is the nearest to the initial guess along the gradients of the
         constraints.
     - `touching`: names of contacts whose gaps vanish. The coordinates that are solved for are then the dependent
-        coordinates and all omitted ones, or all coordinates of an array. The speeds are changed as little as possible
-        (in the metric of the mass matrix), so that these contacts neither approach nor separate.
+        coordinates and all omitted ones, or all coordinates of an array. With the returned speeds, these contacts
+        neither approach nor separate.
 
     **Returns:** a `State`. It can be differentiated (twice, in both modes) with respect to all numbers, by the implicit
     function theorem.
 
-    **Raises:** `ValueError` if no such configuration is found, or if given dependent speeds contradict the velocity
-    residuals. If arguments are traced, the coordinates and all their derivatives become NaN instead.
+    **Raises:** `ValueError` if no such configuration is found, or if given speeds contradict the velocity residuals.
+    If arguments are traced, the coordinates or speeds and all their derivatives become NaN instead.
     """
     check_is_system(system)
     name = type(system).__name__
@@ -392,7 +402,17 @@ def assemble(
             raise ValueError(f"{name}: {', '.join(bad)} is not finite.")
     q0 = _solve_configuration(with_touching(system, touching) if touching else system, q0, t, problem)
     if touching or has_multipliers(system):
-        u0 = speeds_in_contact(system, jnp.asarray(t, q0.dtype), q0, u0, touching)
+        named = tuple(u) if isinstance(u, Mapping) else ()
+        u0, contradict = speeds_in_contact(system, jnp.asarray(t, q0.dtype), q0, u0, touching, named)
+        if is_concrete(contradict) and contradict:
+            raise ValueError(
+                f"{name}: no speeds satisfy the velocity constraints{' of closed contacts' * bool(touching)} with "
+                f"{', '.join(f'{speed} = {float(u[speed]):.6g}' for speed in named)}. Omit the speeds that follow from "
+                "the others."
+            )
+        if is_concrete(u0) and not np.all(np.isfinite(u0)):
+            raise ValueError(diagnosis(system, t, q0, jnp.zeros_like(u0)) or f"{name}: the speeds are not finite.")
+        u0 = nan_where(contradict, u0, (system, q0, u0, t))
     if is_concrete(system, q0, u0, t):
         check_system(system, t, q0)
         check_contacts(system, t, q0, may_penetrate=True)
@@ -401,43 +421,63 @@ def assemble(
     return State(q0, u0, x0)
 
 
+_OTHER_GUESSES = 8
+
+
 def _solve_configuration(system: System, q0, t, problem: AssemblyProblem):
     t = jnp.asarray(t if isinstance(t, jax.Array) else np.asarray(t, q0.dtype), dtype=q0.dtype)
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
     if n_h == 0:
         return q0
-    if has_multipliers(system):
-        return _nearest_configuration(system, q0, t, problem.moved)
     if len(problem.moved) < n_h:  # e.g. a plane loop that is closed by a Vector, whose third component is always zero
         problem = problem._replace(lenient=True)
     places = tuple(system.coordinates.index(c) for c in problem.moved)
-    result = newton(system, q0, t, places, problem.lenient)
-    if is_concrete(system, q0, t) and not bool(result.converged):
-        raise NoConfiguration(_why_not(system, q0, problem, result))
-    return result.q
+    solve = _nearest_configuration if has_multipliers(system) else newton
+    result = solve(system, q0, t, places, problem.lenient)
+    if not is_concrete(system, q0, t) or bool(result.converged):
+        return result.q
+    if places and not (result.is_met and not result.is_determined):
+        along = np.eye(len(q0), dtype=q0.dtype)[list(places)]
+        scales, rng = np.asarray(scales_along(system, t, q0, along)), np.random.default_rng(0)
+        found = []
+        for i in range(_OTHER_GUESSES):
+            offset = 0.25 * (1 + i // 2) * rng.uniform(-1.0, 1.0, len(places)) * scales
+            other = solve(system, q0 + (offset @ along).astype(q0.dtype), t, places, problem.lenient)
+            found += [other.q] if bool(other.converged) else []
+        if found:
+            return min(found, key=lambda q: float(np.linalg.norm((along @ np.asarray(q - q0)) / scales)))
+    raise NoConfiguration(_why_not(system, q0, problem, result))
 
 
-def _nearest_configuration(system: System, q0, t, moved: Sequence[str]):
-    """A configuration of a system whose constraints may be redundant, by the Gauss-Newton method.
-
-    **Raises:** `NoConfiguration` if the constraints are not met. If arguments are traced, the result is NaN.
-    """
-    places = jnp.array([system.coordinates.index(c) for c in moved or system.coordinates])
+def _nearest_configuration(system: System, q0, t, where: tuple[int, ...], _: bool) -> NewtonResult:
+    """As `newton`, for constraints that may be redundant, by the Gauss-Newton method."""
+    xp: Any = np if is_concrete(system, q0, t) else jnp
+    if xp is np:
+        system, q0, t = jax.device_get((system, q0, t))
+    places = np.array(where, int)
+    along = np.eye(len(q0), dtype=q0.dtype)[:, places]
+    residuals, slopes = _residuals_along(xp, system, t, along)
+    weights, sizes = scales_by_unit(system, t, q0)[places], residual_sizes(system, t, q0)[0]
+    sizes = xp.where(sizes > 0, sizes, 1.0)
 
     def step(_: Any, q: Numbers) -> Numbers:
-        J = jax.jacfwd(lambda q: configuration_residual(system, t, q))(q)[:, places]
-        change = jnp.linalg.lstsq(jax.lax.stop_gradient(J), configuration_residual(system, t, q), rcond=REDUNDANT)[0]
-        return q.at[places].add(-change)
+        J = jax.lax.stop_gradient(slopes(q) * weights[None] / sizes[:, None])
+        J = xp.where(xp.isfinite(J), J, 0.0)
+        return q - along @ (weights * xp.linalg.lstsq(J, residuals(q) / sizes, rcond=REDUNDANT)[0])
 
-    # The last two steps have the derivatives of the implicit function theorem up to the second order.
-    q = step(1, step(0, jax.lax.stop_gradient(jax.lax.fori_loop(0, _MAX_STEPS, step, jax.lax.stop_gradient(q0)))))
-    is_met = jnp.all(violations(system, t, q)[0] <= configuration_tolerance(q.dtype))
-    if is_concrete(system, q0, t) and not bool(is_met):
-        raise NoConfiguration(
-            f"{type(system).__name__}: no {', '.join(moved or system.coordinates)} satisfies the configuration "
-            "constraints from this initial guess. Start from another guess."
-        )
-    return jnp.where(is_met, q, jnp.nan)
+    if xp is np:
+        with np.errstate(all="ignore"):
+            q = functools.reduce(lambda q, _: step(_, q), range(_MAX_STEPS), q0) if where else q0
+    else:  # the last two steps have the derivatives of the implicit function theorem up to the second order
+        q = jax.lax.fori_loop(0, _MAX_STEPS, step, jax.lax.stop_gradient(q0))
+        q = step(1, step(0, q0 + jax.lax.stop_gradient(q - q0)))  # fixed coordinates have derivatives, too
+    own, implied = violations(system, t, q)
+    limit = configuration_tolerance(q0.dtype)
+    is_met, implied_is_met = xp.all(own <= limit), xp.all(implied <= limit)
+    converged = is_met & implied_is_met
+    remainder, implied = (xp.max(xp.abs(x), initial=0.0) for x in (residuals(q), implied_residual(system, t, q)))
+    q = jax.device_put(q) if xp is np else nan_where(~converged, q, (system, q0, t))
+    return NewtonResult(q, converged, is_met, np.array(True), remainder, implied, _MAX_STEPS)
 
 
 def _why_not(system: System, q0, problem: AssemblyProblem, result: NewtonResult) -> str:
@@ -464,11 +504,14 @@ def _why_not(system: System, q0, problem: AssemblyProblem, result: NewtonResult)
     if result.is_met:
         return (
             f"{name}: the configuration constraints do not determine {moved} with {fixed}: they do not depend on it "
-            f"(a singular configuration, or redundant constraints). Change the fixed values.{hint}"
+            f"(a singular configuration, or redundant constraints). Change the fixed values, or assemble "
+            f"jaxkane.with_multipliers(system) if constraints are redundant.{hint}"
         )
+    guess = ", ".join(f"{c} = {float(q0[system.coordinates.index(c)]):.4g}" for c in problem.moved)
     return (
-        f"{name}: no {moved} satisfies the configuration constraints with {fixed}: after {int(result.steps)} Newton "
-        f"steps the residual is {float(result.remainder):.3g}. Start from another guess, or fix other values.{hint}"
+        f"{name}: Newton's method found no {moved} that satisfies the configuration constraints with {fixed}. "
+        f"From the guess {guess}, the residual is {float(result.remainder):.3g} after {int(result.steps)} steps, and "
+        f"{_OTHER_GUESSES} other guesses failed, too. Start from another guess, or fix other values.{hint}"
     )
 
 

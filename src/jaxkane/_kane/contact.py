@@ -47,11 +47,12 @@ from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
 from .._system.system import System
 from .arguments import Row, is_concrete, is_one_number
+from .constraint_residuals import configuration_tolerance
 from .description import dtype_of, jvp
 from .impact import REDUNDANT, RowBasis, checked_restitution, inverse_root, least_norm
 from .kanes_method import KaneEquations, unit
 from .scaling import term_sizes
-from .unilateral import MOST_CONTACTS, OPEN, SLIDES, STICKS, force_scales, with_friction
+from .unilateral import MOST_CONTACTS, SLIDES, STICKS, force_scales, with_friction
 
 
 @dataclasses.dataclass(frozen=True, init=False)
@@ -458,13 +459,21 @@ def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True)
     columns = [kane.along_speeds(velocities, kane.with_dependent(unit(kane.n, i))) for i in range(kane.n)]
     C = stack(columns).astype(kane.dtype).T if c else jnp.zeros((0, kane.n), kane.dtype)
     partials = kane.partial_velocities()
-    X = stack(inverse_root(kane.mass_matrix(partials))).astype(kane.dtype)
+    mass = kane.mass_matrix(partials)
+    if layout.n_residuals:
+        rates = [kane.along_speeds(lambda u: rows.residuals(t, q, u), unit(kane.n, i)) for i in range(kane.n)]
+        A, M = stack(rates).astype(kane.dtype).T, stack(mass).astype(kane.dtype)
+        # A massless link: M is regular for the permitted speeds only. On these, M + A^T W A is the same as M.
+        m = jnp.stack([M[i, i] for i in range(kane.n)])[None]
+        sizes = jax.lax.stop_gradient(jnp.max(jnp.where(m > 0, A**2 / jnp.where(m > 0, m, 1.0), 0.0), axis=1))
+        M = M + A.T @ (A / jnp.where(sizes > 0, sizes, 1.0)[:, None])
+        mass = [[M[i, j] for j in range(kane.n)] for i in range(kane.n)]
+    X = stack(inverse_root(mass)).astype(kane.dtype)  # X^T M X = 1
     a0 = shift = jnp.zeros(kane.n, kane.dtype)
     moving = (1.0, *kane.q_dot, *(0.0,) * kane.n, *kane.bias())
     n_q = len(q)
     if layout.n_residuals:
-        rates = [kane.along_speeds(lambda u: rows.residuals(t, q, u), unit(kane.n, i)) for i in range(kane.n)]
-        basis = RowBasis.of(stack(rates).astype(kane.dtype).T @ X, REDUNDANT)
+        basis = RowBasis.of(A @ X, REDUNDANT)
         residuals = as_vector(rows.residuals(t, q, u), like)
         drift = jvp(lambda t, *z: rows.residuals(t, z[:n_q], z[n_q:]), (t, *q, *u), moving)[1]
         a0 = X @ (basis.solve(-as_vector(drift, like))[0] @ basis.Q)
@@ -505,13 +514,24 @@ def _laws(contact: Any) -> tuple[Component, Component, Component]:
     return component(contact.restitution), component(contact.friction), component(contact.static)
 
 
-def speeds_in_contact(system: System, t: Component, q: Array, u: Array, touching: Sequence[str]) -> Array:
-    """The nearest speeds (n,), in the metric of M, for which the `touching` contacts neither approach nor separate."""
-    layout = layout_of(system)
-    memory = ContactMemory.unpacked(layout, jnp.zeros(layout.memory_size, q.dtype))
-    states = jnp.asarray([SLIDES if name in touching else OPEN for name in layout.names], q.dtype)
-    memory = memory._replace(states=states)
-    return projected_speeds(layout, terms_at(system, t, q, u, {}), memory, u)
+def speeds_in_contact(
+    system: System, t: Component, q: Array, u: Array, touching: Sequence[str], named: Sequence[str]
+) -> tuple[Array, Array]:
+    """The nearest speeds (n,), in the metric of M, for which the `touching` contacts neither approach nor separate.
+
+    The `named` speeds keep their values. **Returns:** the speeds, and whether no such speeds exist.
+    """
+    layout, terms = layout_of(system), terms_at(system, t, q, u, {})
+    kept = np.array([name in named for name in system.speeds])
+    closed = np.array([name in touching for name in layout.names], bool)
+    C = terms.C.reshape(*terms.v.shape, len(u))[:, 0]
+    rows = jnp.concatenate([np.eye(len(u), dtype=u.dtype)[kept], C[closed]])
+    needed = jnp.concatenate([np.zeros(sum(kept), u.dtype), -terms.v[closed, 0]])
+    change = terms.shift
+    if len(rows):
+        change = change + terms.X @ least_norm(rows @ terms.X, needed - rows @ terms.shift)[0]
+    sizes = jnp.abs(rows) @ (jnp.abs(u) + jnp.abs(terms.shift) + jnp.abs(change))
+    return u + change, jnp.any(jnp.abs(rows @ change - needed) > configuration_tolerance(u.dtype) * sizes)
 
 
 class ContactMemory(NamedTuple):
