@@ -73,7 +73,7 @@ class Ring(jk.System):
         P = O.moving(q[0] * N.x + q[1] * N.y, -q[1] * u[0] * N.x + q[0] * u[0] * N.y)
         return jk.Motion([jk.Body(1.0, 0.0, P)])
 refused("violate the configuration constraints", jk.simulate, Ring(), jk.State(np.array([0.3, 0.3]), np.zeros(1)), ts)
-refused("no y satisfies", jk.assemble, Ring(), {"x": 1.5}, {})
+refused("no y that satisfies", jk.assemble, Ring(), {"x": 1.5}, {})
 class Light(jk.System):
     mass: jk.Scalar = jk.parameter(0.0)
     coordinates = ("x",)
@@ -173,6 +173,20 @@ def test_configure_warns_if_called_too_late_and_rejects_zero_devices(python):
     assert "too late for devices=2: JAX has started with 1" in devices
     assert where == "<string>"
     assert "`devices` must be a number of CPU devices" in run.stderr
+
+
+@pytest.mark.parametrize(("first", "n"), [("", 1), ("jk.configure(float64=False, cache=False, verbose=False)", 0)])
+def test_simulations_in_float32_warn_once_unless_float32_was_chosen(python, first, n):
+    code = (
+        f"import warnings\n{first}\nP = jk.catalog.DoublePendulum(mass=1.0, length=1.0)\n"
+        "with warnings.catch_warnings(record=True) as told:\n"
+        "    warnings.simplefilter('always')\n"
+        "    for _ in range(2):\n"
+        "        try: jk.simulate(P, None, [0.0, 1.0])\n"
+        "        except TypeError: pass\n"
+        "print(sum('This simulation is in float32' in str(w.message) for w in told))"
+    )
+    assert python(code).stdout == f"{n}\n"
 
 
 def test_without_llvm_xla_is_used_and_reported(python):

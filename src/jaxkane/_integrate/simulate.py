@@ -24,6 +24,7 @@ from .._kane.right_hand_side import reads_time, values_of
 from .._scalarjit.cache_key import captured_tracers
 from .._scalarjit.compat import Tracer, on_device
 from .._scalarjit.components import Inputs
+from .._scalarjit.configure import warn_of_float32
 from .._system.system import State, System
 from .events import events_of
 from .inputs import as_signals, inputs_at, is_coarse, is_samples, share_times, since, time_array, times_since
@@ -96,6 +97,7 @@ def simulate(
     - `TypeError`: a derivative of a derivative, unless both are in forward mode.
     """
     refuse_captured(system)
+    warn_of_float32()
     state = checked_state(system, state)
     refuse_not_finite(system, state)
     dtype = state.q.dtype
