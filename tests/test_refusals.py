@@ -635,15 +635,8 @@ NOT_YET: dict[str, str] = {
     "sensors.camera-image_center": "message of Python: all",
     "sensors.marker-origin": "AttributeError of Python: wrong type, text",
     "weight-gravity": "message without the name: wrong type; message of Python: text",
-    "falling-quantity": "message without the name: wrong type",
-    "falling-when": "message without the name: wrong type",
-    "rising-quantity": "message without the name: wrong type",
-    "rising-when": "message without the name: wrong type",
     "hinge-name": "message of Python: wrong shape",
     "hinge-reference": "message of Python: wrong shape, empty",
-    "mechanism-independent": "message of Python: not finite, wrong type",
-    "mechanism-pose": "accepted: not finite of an entry, wrong type of an entry, wrong shape of an entry, empty of "
-        "an entry; message of Python: wrong type",
 }  # fmt: skip
 """Findings: wrong values without an error, or with an error that does not name the argument."""
 

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import scipy.linalg
 
-from .._common.lookup import as_names, not_there
+from .._common.lookup import as_names, not_there, real_number
 from .._scalarjit.compat import Tracer
 from ._joints import JointType
 from ._mechanism import Field, LinkStructure, LoopStructure, Structure, class_of, loop_residuals, polynomial
@@ -73,6 +73,8 @@ def with_dependent(
 
 def _checked_choices(structure: Structure, choices: LoopChoices) -> LoopChoices:
     """**Raises:** `ValueError` for unknown names."""
+    if choices.pose is not None and not isinstance(choices.pose, Mapping):
+        raise TypeError(f"`pose` must be a dict of coordinates by name, got {choices.pose!r}.")
     coordinates = [name for joint in structure.joints for name in joint.names(joint.coordinates)]
     joints = [joint.name for joint in structure.joints]
     for what, names, known, kind in (
@@ -82,6 +84,9 @@ def _checked_choices(structure: Structure, choices: LoopChoices) -> LoopChoices:
         wrong = [name for name in names if name not in known]
         if wrong:
             raise ValueError(f"`{what}`: " + str(not_there(wrong[0], known, kind).args[0]))
+    for name, value in (choices.pose or {}).items():
+        if not np.isfinite(real_number(value, f"`pose`: {name!r}")):
+            raise ValueError(f"`pose`: {name!r} = {value!r} is not finite.")
     dependent = None if choices.dependent is None else as_names(choices.dependent, "dependent")
     both = [name for name in dependent or () if name in choices.independent]
     if both:
