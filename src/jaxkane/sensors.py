@@ -120,7 +120,7 @@ def camera(
     - `frame`: the frame of the camera: z along the optical axis away from the camera, x to the right and y downwards in
         the image.
     - `focal_length`: in pixels.
-    - `principal_point`: (u0, v0) in pixels.
+    - `image_center`: the principal point (u0, v0) in pixels.
     """
     check_numbers("camera", focal_length=focal_length)
     x, y, z = point_of(point).position_from(center).components_in(frame)

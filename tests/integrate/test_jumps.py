@@ -551,3 +551,21 @@ def test_times_of_jumps_in_float32_with_posix_times():
     system = jax.tree.map(lambda x: x.astype(jnp.float32), Ball(0.8, 0.1))
     ride = jk.simulate(system, start, 1.7e9 + np.asarray(TS, np.float64))
     np.testing.assert_allclose(ride.jumps.t[:3] - 1.7e9, TIMES, atol=2e-4)
+
+
+@pytest.mark.weekly
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_an_impact_of_a_system_with_many_speeds_does_not_warn():
+    class Blocks(jk.System):
+        coordinates, speeds = (tuple(f"{x}{i}" for i in range(13)) for x in "xv")
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            points = [O.moving(q[i] * N.x, u[i] * N.x) for i in range(13)]
+            return jk.Motion([jk.Body(1.0, 0.0, P, name=f"block {i}") for i, P in enumerate(points)])
+
+        def events(self, t, q, u):
+            return {"wall": jk.falling(q["x0"], then=jk.Impact(u["v0"], restitution=0.5))}
+
+    ride = jk.simulate(Blocks(), jk.State(np.ones(13), -np.ones(13)), np.array([0.0, 2.0]))
+    np.testing.assert_allclose(ride.u[-1], [0.5, *[-1.0] * 12], rtol=1e-12)

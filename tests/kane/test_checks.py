@@ -422,6 +422,33 @@ def test_wrong_shapes_and_names_raise():
         jk.accelerations(bike, 0.0, {"lean": 0.1}, u)
 
 
+class Box(jk.System):
+    coordinates, speeds = ("x",), ("x_dot",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, (0.1, 0.1, 0.1), O.moving(q["x"] * N.x, u["x_dot"] * N.x), N, name="box")])
+
+
+def test_missing_names_in_a_class_are_reported():
+    for what, names in (("coordinates", {"coordinates": ()}), ("speeds", {"speeds": ()})):
+        kind = type("Nameless", (Box,), names)
+        with pytest.raises(ValueError, match=rf"Nameless has no {what}\. Name them in its class: {what} = "):
+            jk.accelerations(kind(), 0.0, {}, {})
+    with pytest.raises(ValueError, match=r"Box: no constraint force has a name\. Name the points of joints"):
+        jk.constraint_forces(Box(), 0.0, [0.0], [0.0])
+
+
+def test_messages_name_the_function_and_the_argument():
+    N, O = jk.inertial()
+    with pytest.raises(ValueError, match=r"^Contact: the coefficient of restitution is 1\.2"):
+        jk.Contact(gap=1.0, restitution=1.2)
+    with pytest.raises(TypeError, match=r"`point` must be a Point, got Body.* Pass one of its points"):
+        jk.Contact(jk.Body(1.0, (0.1, 0.1, 0.1), O, N), N.y)
+    with pytest.raises(TypeError, match=r"falling: `quantity` must be a number, such as q\[.*got 'angle'"):
+        jk.falling("angle")
+
+
 @pytest.mark.slow
 def test_assemble_reports_why_it_fails():
     bike = WhippleBicycle.benchmark()

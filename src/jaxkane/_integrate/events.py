@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from .._kane.arguments import is_numeric
 from .._kane.contact import NO_CONTACTS, ContactLayout, layout_of
 from .._kane.kanes_method import KaneEquations
 from .._kane.unilateral import OPEN
@@ -40,6 +41,12 @@ class Crossing:
     direction: int
     stages: tuple[Any, ...] = ()
     when: Any = None
+
+    def __post_init__(self):
+        for name, x in (("quantity", self.value), ("when", 1.0 if self.when is None else self.when)):
+            is_boolean = getattr(x, "dtype", type(x).__name__) == "bool"  # rejected later
+            if not (is_numeric(x) or is_boolean):
+                raise TypeError(f'rising, falling: `{name}` must be a number, such as q["angle"]; got {x!r}.')
 
 
 def rising(quantity: Component, *, then: Any = None, when: Component | None = None) -> Crossing:

@@ -171,10 +171,16 @@ def constraint_forces(
 
     **Returns:** a dict: components in N, (3,) at one time and (n_t, 3) along a trajectory.
 
-    **Raises:** `ValueError` as `accelerations`, and for a trajectory of another system; `TypeError` for a trajectory
-    together with `q`, `u` or `inputs`.
+    **Raises:** `ValueError` as `accelerations`, for a trajectory of another system, and without names of forces;
+    `TypeError` for a trajectory together with `q`, `u` or `inputs`.
     """
-    return along(forces_now, system, t, q, u, inputs)
+    forces = along(forces_now, system, t, q, u, inputs)
+    if not forces:
+        raise ValueError(
+            f"{type(system).__name__}: no constraint force has a name. Name the points of joints and contacts, or "
+            "frames: Motion(bodies, points={...}, frames={...})."
+        )
+    return forces
 
 
 def constraint_multipliers(

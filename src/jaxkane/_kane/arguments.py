@@ -80,10 +80,14 @@ def is_numeric(value: Any) -> bool:
 
 
 def check_is_system(system: Any) -> None:
-    """**Raises:** `TypeError` if the argument is not an instance of `System`."""
+    """**Raises:** `TypeError` if the argument is not an instance of `System`. `ValueError` without coordinates or
+    speeds."""
     if not isinstance(system, System):
         hint = f" Create one with {system.__name__}(...)." if isinstance(system, type) else ""
         raise TypeError(f"The first argument must be an instance of a System, got {system!r}.{hint}")
+    for what, names in (("coordinates", system.coordinates), ("speeds", (*system.speeds, *system.dependent_speeds))):
+        if not names:
+            raise ValueError(f"{type(system).__name__} has no {what}. Name them in its class: {what} = (...).")
 
 
 def refuse_multipliers(system: Any) -> None:

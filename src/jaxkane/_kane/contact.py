@@ -44,7 +44,7 @@ from .._scalarjit.components import (
 )
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point, Vector
-from .._system.motion import Motion
+from .._system.motion import Body, Motion
 from .._system.system import System
 from .arguments import Row, is_concrete, is_one_number
 from .constraint_residuals import configuration_tolerance
@@ -101,14 +101,15 @@ class Contact:
     ):
         for name, value, kind in (("point", point, Point), ("normal", normal, Vector), ("surface", surface, Point)):
             if value is not None and not isinstance(value, kind):
-                raise TypeError(f"Contact: `{name}` must be a {kind.__name__}, got {value!r}.")
+                hint = ' Pass one of its points, such as motion["heel"] or body.center.' * isinstance(value, Body)
+                raise TypeError(f"Contact: `{name}` must be a {kind.__name__}, got {value!r}.{hint}")
         if (point is None) != (normal is None) or (point is None and gap is None):
             raise ValueError("Contact: pass a point and a normal, or a gap, or all three.")
         if point is None and surface is not None:
             raise ValueError("Contact: `surface` needs a point and a normal.")
         if not is_one_number(restitution):
             raise TypeError(f"Contact: the restitution must be one number, got {restitution!r}.")
-        checked_restitution(restitution)
+        checked_restitution(restitution, "Contact")
         for name, value in (("gap", gap), ("friction", friction), ("static", static)):
             if value is not None and not is_one_number(value):
                 raise TypeError(f"Contact: `{name}` must be one number, got {value!r}.")

@@ -106,16 +106,16 @@ class Impact(eqx.Module):
         self.release = checked_release(release)
 
 
-def checked_restitution(value: Any) -> Any:
+def checked_restitution(value: Any, label: str = "Impact") -> Any:
     """One coefficient of restitution, or a tuple of these."""
     if not is_one_number(value) and not isinstance(value, (tuple, list)) and getattr(value, "ndim", 0) != 1:
-        raise TypeError(f"Impact: the restitution is one number, or one for each residual, got {value!r}.")
+        raise TypeError(f"{label}: the restitution is one number, or one for each residual, got {value!r}.")
     coefficients: tuple[Any, ...] = (value,) if is_one_number(value) else tuple(value)
     for e in coefficients:
         if not is_one_number(e):
-            raise TypeError(f"Impact: a coefficient of restitution is one number, got {e!r}.")
+            raise TypeError(f"{label}: a coefficient of restitution is one number, got {e!r}.")
         if is_concrete(e) and not 0 <= float(e) <= 1:
-            raise ValueError(f"Impact: the coefficient of restitution is {float(e)}. It must be between 0 and 1.")
+            raise ValueError(f"{label}: the coefficient of restitution is {float(e)}. It must be between 0 and 1.")
     return value if is_one_number(value) else coefficients
 
 
@@ -487,6 +487,11 @@ def _own_root(M: Array) -> Array:
     """X (n, n) with X^T M X = 1, upper triangular. NaN if M is singular within rounding."""
     if is_written_out(len(M)):
         return stack(inverse_root(_rows(M))).astype(M.dtype)
+    return _root_by_lapack(M)
+
+
+@jax.jit
+def _root_by_lapack(M: Array) -> Array:
     K = jnp.linalg.cholesky(M)
     K = jnp.where(jnp.all(jnp.diag(K) ** 2 > rounding_of_pivots(M.dtype) * jnp.diag(M)), K, jnp.nan)
     return jsl.solve_triangular(K, jnp.eye(len(M), dtype=M.dtype), lower=True).T

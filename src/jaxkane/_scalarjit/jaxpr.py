@@ -184,7 +184,8 @@ def unsupported_primitives(program: Jaxpr, is_ours: bool = False) -> Iterator[tu
         elif name == "dot_general" and is_small(equation):
             continue  # see `cse`
         elif name not in _PLAIN:
-            yield name, not is_ours
+            called = getattr(equation.params.get("call_jaxpr"), "jaxpr", None)  # hypot, not custom_jvp_call
+            yield getattr(getattr(called, "debug_info", None), "func_name", name).strip("_"), not is_ours
         elif name.startswith("reduce_") and getattr(equation.invars[0].aval, "size", 0) > LARGEST_SUM:
             yield f"{name} of more than {LARGEST_SUM}", not is_ours
 
