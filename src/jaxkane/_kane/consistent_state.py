@@ -149,6 +149,7 @@ def _reads_any(system: System, names: Sequence[str]) -> bool:
 
 
 _MAX_STEPS = 64
+_OTHER_GUESSES = 8
 
 
 def _iterated(xp: ModuleType, equations: Any, slopes: Any, start: Numbers, solve: Any, loop: Any) -> tuple[Any, Any]:
@@ -402,13 +403,13 @@ def assemble(
             raise ValueError(f"{name}: {', '.join(bad)} is not finite.")
     q0 = _solve_configuration(with_touching(system, touching) if touching else system, q0, t, problem)
     if touching or has_multipliers(system):
-        named = tuple(u) if isinstance(u, Mapping) else ()
-        u0, contradict = speeds_in_contact(system, jnp.asarray(t, q0.dtype), q0, u0, touching, named)
+        named = dict(u) if isinstance(u, Mapping) else {}
+        u0, contradict = speeds_in_contact(system, jnp.asarray(t, q0.dtype), q0, u0, touching, tuple(named))
         if is_concrete(contradict) and contradict:
+            values = ", ".join(f"{speed} = {float(x):.6g}" for speed, x in named.items())
             raise ValueError(
                 f"{name}: no speeds satisfy the velocity constraints{' of closed contacts' * bool(touching)} with "
-                f"{', '.join(f'{speed} = {float(u[speed]):.6g}' for speed in named)}. Omit the speeds that follow from "
-                "the others."
+                f"{values}. Omit the speeds that follow from the others."
             )
         if is_concrete(u0) and not np.all(np.isfinite(u0)):
             raise ValueError(diagnosis(system, t, q0, jnp.zeros_like(u0)) or f"{name}: the speeds are not finite.")
@@ -419,9 +420,6 @@ def assemble(
         if u_dep:
             _check_dependent_speeds(system, u_dep, t, q0, u0)
     return State(q0, u0, x0)
-
-
-_OTHER_GUESSES = 8
 
 
 def _solve_configuration(system: System, q0, t, problem: AssemblyProblem):
@@ -471,9 +469,8 @@ def _nearest_configuration(system: System, q0, t, where: tuple[int, ...], _: boo
     else:  # the last two steps have the derivatives of the implicit function theorem up to the second order
         q = jax.lax.fori_loop(0, _MAX_STEPS, step, jax.lax.stop_gradient(q0))
         q = step(1, step(0, q0 + jax.lax.stop_gradient(q - q0)))  # fixed coordinates have derivatives, too
-    own, implied = violations(system, t, q)
     limit = configuration_tolerance(q0.dtype)
-    is_met, implied_is_met = xp.all(own <= limit), xp.all(implied <= limit)
+    is_met, implied_is_met = (xp.all(x <= limit) for x in violations(system, t, q))
     converged = is_met & implied_is_met
     remainder, implied = (xp.max(xp.abs(x), initial=0.0) for x in (residuals(q), implied_residual(system, t, q)))
     q = jax.device_put(q) if xp is np else nan_where(~converged, q, (system, q0, t))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import warnings
 from pathlib import Path
@@ -33,7 +34,6 @@ class Configuration:
 
 
 _last: Configuration | None = None
-_is_warned = False
 
 
 def configure(
@@ -107,12 +107,11 @@ def configure(
     return done
 
 
+@functools.cache
 def warn_of_float32() -> None:
     """Warn once if float64 is not enabled, and neither `configure` nor the environment has chosen this."""
-    global _is_warned
-    if _is_warned or _last or jax.config.jax_enable_x64 or "JAX_ENABLE_X64" in os.environ:  # pyright: ignore[reportAttributeAccessIssue]
+    if _last or jax.config.jax_enable_x64 or "JAX_ENABLE_X64" in os.environ:  # pyright: ignore[reportAttributeAccessIssue]
         return
-    _is_warned = True
     warnings.warn(
         "This simulation is in float32, because float64 is not enabled. Call jaxkane.configure() right after the "
         "imports, or jaxkane.configure(float64=False) to use float32 without this warning.",

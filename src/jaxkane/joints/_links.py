@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from .. import rotations
-from .._common.lookup import as_names, not_there
+from .._common.lookup import not_there
 from .._kane.unilateral import MOST_CONTACTS
 from .._scalarjit.compat import Tracer
 from ..rotations import Matrix
@@ -211,8 +211,7 @@ def mechanism(
         couplings=tuple(x for x in closures if isinstance(x, CouplingStructure)),
     )
     fields = tuple(_field(name, joints) for name in values)
-    choices = LoopChoices(dependent, as_names(independent, "independent"), pose)
-    structure = with_dependent(structure, fields, values, choices)
+    structure = with_dependent(structure, fields, values, LoopChoices(dependent, independent, pose))
     return class_of(structure._replace(poses=_poses(structure, poses or {})), fields)(**values)
 
 

@@ -19,6 +19,8 @@ NEARLY_REDUNDANT = 1e-4
 """Files have coordinates of five digits. The axes of a plane loop are then parallel up to 1e-5, and the residual normal
 to its plane is not exactly redundant. As a constraint, it would lock the loop."""
 
+_ATTEMPTS = 6
+
 
 class LoopChoices(NamedTuple):
     """How loops are solved.
@@ -73,6 +75,7 @@ def with_dependent(
 
 def _checked_choices(structure: Structure, choices: LoopChoices) -> LoopChoices:
     """**Raises:** `ValueError` for unknown names."""
+    choices = choices._replace(independent=as_names(choices.independent, "independent"))
     if choices.pose is not None and not isinstance(choices.pose, Mapping):
         raise TypeError(f"`pose` must be a dict of coordinates by name, got {choices.pose!r}.")
     coordinates = [name for joint in structure.joints for name in joint.names(joint.coordinates)]
@@ -126,9 +129,6 @@ def _independent_residuals(
     if is_concrete:
         trial.check_implied(closed, good, redundant)
     return closed, sorted(good), redundant
-
-
-_ATTEMPTS = 6
 
 
 def _dependent_names(
