@@ -7,7 +7,21 @@ import pytest
 from scipy import optimize, stats
 from systems import Track
 
-from jaxkane.fit import Free, Gain, LeastSquares, Offset, Problem, Simulation, Trial, fit, load, validate
+from jaxkane.fit import (
+    Free,
+    Gain,
+    LeastSquares,
+    Offset,
+    Problem,
+    Simulation,
+    Trial,
+    cross_validate,
+    fit,
+    load,
+    minimize,
+    multi_start,
+    validate,
+)
 from jaxkane.fit.solve.mixed_effects import degrees_of_freedom
 
 TIGHT = 1e-6
@@ -78,6 +92,25 @@ def test_a_distribution_over_groups_maximizes_the_restricted_likelihood(mixed):
     assert [found.standard_errors[n] for n in ("mean of gain", "drift")] == pytest.approx(errors, rel=TIGHT)
     assert found.variance**0.5 * 0.025 == pytest.approx(noise, rel=TIGHT)
     assert found.ok, found.message
+
+
+def test_every_driver_estimates_the_deviation_of_groups(mixed):
+    trials, found = mixed
+    problem = Problem.of(
+        Track(), trials, (Free("gain", each="rider", prior="normal"), "drift"), simulation=Simulation(step=0.1)
+    )
+    for other in (minimize(problem, LeastSquares(), start=found.point), multi_start(problem, 1, spread=0.0).best):
+        assert other.deviations["gain"] == pytest.approx(found.deviations["gain"], rel=1e-3)
+        assert other.estimates == pytest.approx(found.estimates, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_the_distribution_predicts_a_group_that_is_left_out(mixed):
+    left_out = cross_validate(mixed[1], [[0, 5], [1, 2, 3, 4, 6, 7, 8, 9]])
+    assert not left_out.failures
+    assert np.all(np.isfinite(left_out.held_out))
+    anna, mean = (left_out.estimates[name][0] for name in ("gain [anna]", "mean of gain"))
+    assert anna == pytest.approx(mean, rel=1e-6)
 
 
 @pytest.mark.weekly

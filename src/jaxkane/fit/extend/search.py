@@ -20,7 +20,7 @@ from ..result.diagnostics import AT_A_MINIMUM
 from ..result.fit_result import Fit
 from ..result.linearized import LinearizedProblem, Score, linearized_problem, score_test
 from ..result.statistics import serial_correlation
-from ..solve.fit import minimize, uninterrupted
+from ..solve.fit import search, uninterrupted
 from ..solve.local_unknowns import usable
 from ..solve.optimizers import LeastSquares
 from .candidates import (
@@ -459,7 +459,7 @@ class Search:
         )
         start = eqx.tree_at(lambda p: p.parameters, group.point, group.point.parameters[parameters.places])
         try:
-            fit = uninterrupted(minimize(problem, LeastSquares(), start=start))
+            fit = uninterrupted(search(problem, LeastSquares(), start=start))
             if fit.status not in AT_A_MINIMUM:
                 return dataclasses.replace(extension, reason=f"its fit has not converged ({fit.status})"), None
             after = Model.of(fit, terms, self.folds)

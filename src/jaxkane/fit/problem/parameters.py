@@ -102,6 +102,16 @@ class Parameters(eqx.Module):
         return np.isfinite(np.asarray(self.prior_deviation)) | (joint[:n] | joint[n:])[np.asarray(self.places)]
 
     @property
+    def has_distribution(self) -> np.ndarray:
+        """Whether each parameter (p,) is the value of a group that has a distribution over groups."""
+        own = np.array([entry.group is not None for entry in self.all_entries])
+        rows = np.zeros(len(self.joint_target), bool)
+        for _, first, last in self.distributions:
+            rows[first:last] = True
+        used = np.any(np.asarray(self.joint_matrix)[rows] != 0, axis=0).reshape(2, -1).any(axis=0)
+        return (own & used)[np.asarray(self.places)]
+
+    @property
     def has_groups(self) -> bool:
         """Whether some parameters differ between trials."""
         return any(entry.group is not None for entry in self.all_entries)

@@ -454,9 +454,13 @@ class Problem:
         return parts
 
     def with_specification(self, spec: ProblemSpec) -> Problem:
-        """Another specification with the same trials, the same active trials and the same integration steps."""
+        """Another specification with the same trials, active trials, integration steps and standard deviations of
+        distributions."""
         counted = np.unique(np.asarray(self.windows.trial)[self.active_windows])
         problem = Problem.of_specification(spec, self.trials).with_steps(self.windows.step)
+        known = {name: d for (name, *_), d in zip(self.parameters.distributions, self.parameters.deviations)}
+        own = zip(problem.parameters.distributions, problem.parameters.deviations, strict=True)
+        problem = problem.with_deviations(np.array([known.get(name, d) for (name, *_), d in own]))
         return problem.as_fine_as(self).only(counted.tolist())
 
     def without_defects(self) -> Problem:

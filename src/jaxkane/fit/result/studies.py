@@ -19,7 +19,7 @@ from ..problem.model import Unknowns
 from ..problem.problem import Problem
 from ..problem.specification import refuse_other
 from ..problem.windows import Windows
-from ..solve.fit import minimize, uninterrupted
+from ..solve.fit import minimize, search, uninterrupted
 from ..solve.local_unknowns import solve_nuisance
 from ..solve.optimizers import LeastSquares, Optimizer
 from .diagnostics import AT_A_MINIMUM, poorly_fitted_channels
@@ -229,7 +229,7 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
             pinned = fit.problem.with_priors({name: (float(value), 1e-4 * error)})
             try:
                 start = pinned.at({name: float(value)}, point)
-                result = uninterrupted(minimize(pinned, LeastSquares(), start=start))
+                result = uninterrupted(search(pinned, LeastSquares(), start=start))
             except ValueError:  # outside its bounds, or it cannot be simulated
                 break
             if result.status not in AT_A_MINIMUM:
@@ -388,7 +388,7 @@ def _if_better(fit: Fit, windows: Windows, ends: Sequence[Unknowns], what: str) 
     try:
         costs = [solve_nuisance(problem, point, steps=4)[1].cost for point in ends]
         if min(costs) > 0.5 * fit.cost:
-            costs = [uninterrupted(minimize(problem, LeastSquares(rtol=1e-2), steps=4, start=ends[-1])).cost]
+            costs = [uninterrupted(search(problem, LeastSquares(rtol=1e-2), steps=4, start=ends[-1])).cost]
     except ValueError:
         return []
     if min(costs) < 0.5 * fit.cost:

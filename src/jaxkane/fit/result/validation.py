@@ -22,7 +22,7 @@ from ..problem.problem import Problem
 from ..problem.specification import ProblemSpec, refuse_other, with_options
 from ..problem.trial import Trial, as_trials
 from ..solve.blocks import Blocks
-from ..solve.fit import minimize, uninterrupted
+from ..solve.fit import search, uninterrupted, with_distributions
 from ..solve.linearization import Linearization
 from ..solve.local_unknowns import Unsimulated, solve_nuisance
 from ..solve.optimizers import LeastSquares
@@ -314,12 +314,14 @@ def cross_validate(fit: Fit, folds: int | str | Sequence[Sequence[int]] | None =
     with_all = fit.identifiability.given_sigma_errors
     for group in groups:
         training = fit.problem.only(set(range(T)) - set(group))
-        trained = uninterrupted(minimize(training, LeastSquares(), start=fit.point))
+        trained = with_distributions(search(training, LeastSquares(), start=fit.point), LeastSquares(), {})
+        trained = uninterrupted(trained)
         values, without = np.array([*trained.estimates.values()]), ", ".join(fit.trial_names[k] for k in group)
         # A parameter that the other trials do not determine stays at the estimate from all trials. The fold predicts
         # nothing about it and would look precise.
         with np.errstate(invalid="ignore"):
             alone = 1 - (with_all / trained.identifiability.given_sigma_errors) ** 2 > LARGEST_LEVERAGE
+        alone &= ~fit.parameters.has_distribution  # which predicts a group that is left out
         if trained.status not in AT_A_MINIMUM:
             failures.append(f"Without {without} the fit has not converged ({STATUS[trained.status]}).")
             values[:] = np.nan

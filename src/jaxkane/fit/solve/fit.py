@@ -120,8 +120,7 @@ def solve(
     checkpoint: str | os.PathLike[str] | None = None,
     **run: Any,
 ) -> Fit:
-    """Run `minimize` without the trials that cannot be simulated. Repeat it from the result while the integration
-    steps are too coarse there."""
+    """Run `minimize` without the trials that cannot be simulated."""
     method: Any = LeastSquares() if optimizer is None else optimizer
     if start is not None:
         _refuse_start_of_another(problem, start)
@@ -142,23 +141,16 @@ def solve(
             failed |= {names[k]: why for k, why in error.reasons.items()}
             start = None if start is None else problem.point_of(start, kept)
             problem, names = problem.with_trials([problem.trials[k] for k in kept]), tuple(names[k] for k in kept)
-    # Only the first run has a checkpoint: the following runs start near its result.
-    if method.horizons != ():
-        method = dataclasses.replace(method, horizons=())  # the following runs start near the minimum
-    result = _with_fine_steps(result, method, run)
-    result = _with_distributions(result, method, run)
-    for _, place in result.parameters.inequalities:
-        result = _resting(result, place, method, run)
     return dataclasses.replace(result, failed=failed)
 
 
-def _with_distributions(result: Fit, method: Any, run: dict[str, Any]) -> Fit:
+def with_distributions(result: Fit, method: Any, run: dict[str, Any]) -> Fit:
     """Estimate the standard deviations of the distributions over groups and all other unknowns alternately."""
     for _ in range(20 if result.problem.parameters.distributions else 0):
         if result.status not in AT_A_MINIMUM:
             break
         before, after = result.problem.parameters.deviations, estimated_deviations(result.problem, result.point)
-        again = minimize(result.problem.with_deviations(after), method, start=result.point, **run)
+        again = search(result.problem.with_deviations(after), method, start=result.point, **run)
         result = dataclasses.replace(again, history=(*result.history, *again.history[1:]))
         if np.all(np.abs(np.log(after / before)) < 1e-5):
             break
@@ -181,7 +173,7 @@ def _with_fine_steps(result: Fit, method: Any, run: dict[str, Any]) -> Fit:
             problem = finer(before, result.point, deviation)
             if problem.has_steps and np.array_equal(problem.windows.step, before.windows.step):
                 break
-            again = minimize(problem, method, start=result.point, **run)
+            again = search(problem, method, start=result.point, **run)
         except (KeyboardInterrupt, Unsimulated):
             return dataclasses.replace(result, status="unchecked")
         if again.status not in AT_A_MINIMUM:
@@ -203,6 +195,9 @@ def minimize(
     """Solve a `Problem`. `fit` specifies the problem and solves it.
 
         minimize(Problem.of(system, trials, free), LeastSquares(rtol=1e-9), steps=200)
+
+    As in `fit`, the search is repeated with finer integration steps where these change the result, the standard
+    deviations of distributions over groups are estimated, and a sum near its bound is fixed there.
 
     **Arguments:**
 
@@ -229,6 +224,28 @@ def minimize(
     steps = optimizer.steps if steps is None else steps
     if not isinstance(steps, int) or steps < 0:
         raise ValueError(f"`steps` must be an integer that is not negative, got {steps!r}.")
+    run: dict[str, Any] = {"steps": steps, "callback": callback, "progress": progress}
+    result = search(problem, optimizer, start=start, checkpoint=checkpoint, **run)
+    # Only the first search has a checkpoint, and only it may restart: the others start near the minimum.
+    method: Any = optimizer if optimizer.horizons == () else dataclasses.replace(optimizer, horizons=())  # type: ignore
+    result = with_distributions(_with_fine_steps(result, method, run), method, run)
+    for _, place in result.parameters.inequalities:
+        result = _resting(result, place, method, run)
+    return result
+
+
+def search(
+    problem: Problem,
+    optimizer: Optimizer,
+    *,
+    steps: int | None = None,
+    start: Unknowns | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    callback: Callable[[Unknowns, float], None] | None = None,
+    progress: bool = False,
+) -> Fit:
+    """One search of `minimize`, with the integration steps and the distributions over groups of the problem."""
+    steps = optimizer.steps if steps is None else steps
     start = problem.start if start is None else start
     key = {} if checkpoint is None else {"method": optimizer.name, **optimizer.checkpoint_key(problem)}
     file = Checkpoint(checkpoint, problem, **key)
@@ -263,13 +280,13 @@ def _resting(result: Fit, place: int, method: Any, run: dict[str, Any]) -> Fit:
     variables do not influence the cost.
     """
     parameters, point = result.parameters, result.point
-    if not parameters.is_near_bound(place, point.parameters):
+    if place not in np.asarray(parameters.places) or not parameters.is_near_bound(place, point.parameters):
         return result
     fixed, x = parameters.resting(place, point.parameters)
     problem = dataclasses.replace(result.problem, model=dataclasses.replace(result.problem.model, parameters=fixed))
     start = dataclasses.replace(point, parameters=on_device(x))
     try:
-        again = minimize(problem, method, start=start, **run)
+        again = search(problem, method, start=start, **run)
     except Unsimulated:
         return result
     history = (*result.history, *again.history[1:])
