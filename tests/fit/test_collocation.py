@@ -116,14 +116,31 @@ def test_gains_offsets_priors_and_several_trials():
     assert held.estimates["mass"] == pytest.approx(1.5, abs=1e-3)
 
 
-@pytest.mark.weekly
-def test_delay_of_an_input():
-    """0.1 s, within four standard errors."""
+@pytest.mark.slow
+@pytest.mark.weekly_cases("0.0")
+@pytest.mark.parametrize("before", [None, 0.0])
+def test_delay_of_an_input(before):
+    """0.1 s, within four standard errors. Without the input's value before the first sample, the first 0.3 s are
+    excluded."""
     trial = record(5)
     late = Trial(T, trial.measured, {"push": known_push(T + 0.1)}, sigma=trial.sigma)
-    found = by_collocation(late, (*NAMES, Delay("push", bounds=(0.0, 0.3), before=0.0)))
+    found = by_collocation(late, ("mass", Delay("push", start=0.15, bounds=(0.0, 0.3), before=before)), TRUTH)
     assert found.ok
+    assert found.mean_square < 1.5
     assert abs(found.estimates["delay of push"] - 0.1) < 4 * found.standard_errors["delay of push"]
+    assert np.isnan(found.residuals["trial"]["x"]).sum() == (6 if before is None else 0)
+
+
+def test_a_factor_of_the_first_state_and_jumps_are_refused():
+    class Stopped(Cart):
+        def events(self, t, q, u):
+            return {"wall": jk.falling(q["x"] + 1.0, then={"x_dot": 0.0})}
+
+    for item in (Gain("x", of="start"), Offset("x", of="start")):
+        with pytest.raises(ValueError, match=r"does not support the .* of start x"):
+            by_collocation(record(1), (*NAMES, item), unknown=("x_dot",))
+    with pytest.raises(ValueError, match="Collocation: events or contacts of Stopped change its state: wall"):
+        by_collocation(record(1), guess=Stopped())
 
 
 @pytest.mark.slow

@@ -78,6 +78,8 @@ class EvaluatedBlock:
 
     def __init__(self, block: Block, dtype: Any = jnp.float64):
         self.block, (self.B, n) = block, block.columns.shape
+        # `padded` would hide another number of places: 27 samples were compared with those of 20 others.
+        assert all(len(x) == self.B for x in jax.tree.leaves(block.data)), "The data have another number of places."
         self.data = jax.tree.map(lambda x: jnp.asarray(padded(x)), block.data)
         self.columns = padded(block.columns)
         one = jax.tree.map(lambda x: jnp.asarray(x[0]), block.data), jnp.zeros(n, dtype)
@@ -174,6 +176,9 @@ class NonlinearProgram:
         self.x_bounds, self.g_bounds = x_bounds, g_bounds
         self._blocks = list(blocks)
         sizes = [b.B * b.block.size for b in self._blocks]
+        for k, w, S in zip(sizes, weights, constraints, strict=True):
+            assert w is None or len(w) == k, "The weights have another number of values than their block."
+            assert S is None or S.shape == (self.m, k), "The constraints have another shape than their block."
         self._weights = [np.zeros(k) if w is None else w for k, w in zip(sizes, weights, strict=True)]
         self._S = [scipy.sparse.csr_matrix((self.m, k)) if S is None else S for k, S in zip(sizes, constraints)]
         self._S = [scipy.sparse.csr_matrix(S) for S in self._S]

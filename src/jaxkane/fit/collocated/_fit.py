@@ -17,10 +17,11 @@ from ..._collocate.lobatto import lobatto
 from ..._collocate.program import Bounds, NonlinearProgram
 from ..._collocate.solvers import INTERRUPTED, Solution, Solver, default_solver, run
 from ..._collocate.transcription import Transcription
+from ..._integrate.jumps import refuse_jumps
 from ..._scalarjit.cache_key import jit
 from ..._system.system import System
 from ..problem.declarations import Items
-from ..problem.parameters import LOW_PASSES, Parameters
+from ..problem.parameters import Parameters
 from ..problem.problem import Problem
 from ..problem.specification import ProblemSpec
 from ..problem.trial import Trial
@@ -102,15 +103,17 @@ def _check_options(options: Mapping[str, Any]) -> None:
 
 
 def _check_problem(problem: Problem) -> None:
-    kinds = {
-        role[0] for entry in (*problem.parameters.all_entries, *problem.model.nuisance.trial) for role in entry.roles
-    }
-    wrong = kinds & {"delay of sensor", *(f"{kind} of sensor" for kind in LOW_PASSES)}
-    if wrong:
-        raise ValueError(
-            f"Collocation does not support the {wrong.pop()}: it compares measurements with the states at the same "
-            "time. Use windows instead, or add the sensor's dynamics to the system as a state."
+    supported = [f"{kind} of {of}" for kind in ("gain", "offset") for of in ("sensor", "input")] + ["delay of input"]
+    entries = (*problem.parameters.all_entries, *problem.model.nuisance.trial)
+    for kind, name in (role for entry in entries for role in entry.roles if role[0] not in supported):
+        remedy = (
+            f"Omit it, and add {name!r} to `unknown`."
+            if kind.endswith("start")
+            else "It compares measurements with the states at the same time. Use windows instead, or add the sensor's "
+            "dynamics to the system as a state."
         )
+        raise ValueError(f"Collocation does not support the {kind} {name}. {remedy}")
+    refuse_jumps(problem.system, "Collocation", "Its motions are smooth. Omit `transcription`.")
     if problem.model.nuisance.window:
         raise ValueError("Collocation has no windows: each='window' cannot be used. Pass each='trial'.")
     if problem.parameters.distributions:
@@ -123,7 +126,7 @@ def solved(problem: Problem, how: Collocation, progress: bool) -> CollocationFit
     densities = checked_inputs(problem, how.unknown_inputs)
     within = checked_within(problem, how.within, tuple(densities))
     method = lobatto(how.method)
-    phases = [TrialPhase(problem, k, densities, within) for k in range(len(problem.trials))]
+    phases = [TrialPhase(problem, k, densities, within) for k in range(len(problem.slices))]
     meshes = [phase.mesh(how.intervals_per_sample) for phase in phases]
     motions = [guessed(phase, mesh, method) for phase, mesh in zip(phases, meshes, strict=True)]
     every = how.intervals_per_sample * (len(method.c) - 1)
@@ -186,6 +189,7 @@ class CollocationFit:
     - `residuals`: (fitted - measured) / sigma (n_t,), by trial and channel.
     - `fitted`: the fitted measurements (n_t,), by trial and channel.
     - `motions`: the estimated states and inputs at the samples (n_t,), by trial and name.
+        All three are NaN at the first samples that `Delay(bounds=...)` excludes.
     - `status`, `message`: why the search ended, as a word and as a sentence.
     - `ok`: whether the search converged and the data determine all parameters.
     """
@@ -299,41 +303,49 @@ class CollocationFit:
         return {name: (float(a), float(b)) for name, a, b in zip(self.names, *ends, strict=True)}
 
     @functools.cached_property
-    def _at_samples(self) -> list[tuple[dict[str, np.ndarray], dict[str, np.ndarray]]]:
-        """For each trial, states and inputs by name, and fitted measurements by channel."""
+    def _at_samples(self) -> dict[str, tuple[dict[str, np.ndarray], dict[str, np.ndarray]]]:
+        """By trial, states and inputs by name, and fitted measurements by channel. NaN before the window."""
         every = self.transcription_options.intervals_per_sample * (len(self.transcription.method.c) - 1)
-        found = []
-        for layout, motion in zip(self.transcription.layouts, self.transcription.motions(self._x), strict=True):
+        found = {}
+        layouts = zip(self._slices, self.transcription.layouts, self.transcription.motions(self._x), strict=True)
+        for (trial, first), layout, motion in layouts:
             places = np.arange(0, layout.K, every)
             data = layout.node_data(layout.s[places])
             x = jnp.asarray(self._x[layout.columns[places]])
             read, inputs = _read(layout.variables, data, x)
             values = dict(zip(layout.problem.names, motion.Y[places].T, strict=True))
             values |= {name: np.asarray(value) for name, value in inputs.items()}
-            found.append((values, dict(zip(self.problem.channels, np.asarray(read).T, strict=True))))
+            both = values, dict(zip(self.problem.channels, np.asarray(read).T, strict=True))
+            found[trial] = [{k: np.append(np.full(first, np.nan), x) for k, x in each.items()} for each in both]
         return found
 
     @property
+    def _slices(self) -> list[tuple[str, int]]:
+        """For each phase, the name of its trial and the index of its first sample."""
+        names = names_of(self.problem.trials)
+        return [(names[k], first) for k, first, _ in self.problem.slices]
+
+    @property
     def motions(self) -> dict[str, dict[str, np.ndarray]]:
-        return dict(zip(names_of(self.problem.trials), (values for values, _ in self._at_samples), strict=True))
+        return {name: values for name, (values, _) in self._at_samples.items()}
 
     @property
     def fitted(self) -> dict[str, dict[str, np.ndarray]]:
-        return dict(zip(names_of(self.problem.trials), (read for _, read in self._at_samples), strict=True))
+        return {name: read for name, (_, read) in self._at_samples.items()}
 
     @property
     def residuals(self) -> dict[str, dict[str, np.ndarray]]:
-        pairs = zip(self.fitted.items(), self.problem.trials, strict=True)
+        trials = dict(zip(names_of(self.problem.trials), self.problem.trials, strict=True))
         return {
-            name: {c: (read[c] - np.asarray(x)) / np.asarray(trial.sigma[c]) for c, x in trial.measured.items()}
-            for (name, read), trial in pairs
+            name: {c: (read[c] - x) / trials[name].sigma[c] for c, x in trials[name].measured.items()}
+            for name, read in self.fitted.items()
         }
 
     def nuisance(self) -> dict[str, dict[str, float]]:
         """The estimates that belong to one trial only, by trial and name."""
         model, n = self.problem.model.nuisance, self.parameters.size
         rows = {}
-        for name, layout in zip(names_of(self.problem.trials), self.transcription.layouts, strict=True):
+        for (name, _), layout in zip(self._slices, self.transcription.layouts, strict=True):
             values = np.asarray(model.trial_center) + self._x[layout.parameters[n:]]
             rows[name] = dict(zip(model.trial_names, values.tolist(), strict=True))
         return rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -123,9 +124,9 @@ class Deviations(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class TrialPhase:
-    """One trial as a phase (see `PhaseProblem`).
+    """One trial as a phase (see `PhaseProblem`), from the first sample of its window on.
 
-    - `problem`: the problem of the fit. `k`: the index of the trial.
+    - `problem`: the problem of the fit. `k`: the index of the window. A trial without measurements has no window.
     - `unknown_inputs`: spectral densities by name. `within`: bounds by name.
     """
 
@@ -136,9 +137,12 @@ class TrialPhase:
 
     cost = final_cost = conditions = path = None
 
-    @property
+    @functools.cached_property
     def trial(self) -> Trial:
-        return self.problem.trials[self.k]
+        """The samples of the window: with `Delay(bounds=...)`, it begins later than the trial."""
+        owner, first, n = self.problem.slices[self.k]
+        whole = self.problem.trials[owner]
+        return whole.between(whole.t[first], whole.t[first + n - 1])
 
     @property
     def window(self) -> Windows:
@@ -255,7 +259,7 @@ def add_squares(problem: Problem, densities: Array, every: int, builder: Builder
     n = problem.parameters.size
     for k, layout in enumerate(layouts):
         window = jax.tree.map(lambda x, k=k: np.asarray(x)[k], problem.windows)
-        count = len(problem.trials[k].t)
+        count = problem.slices[k][2]
         places = np.arange(count) * every
         data = {
             "node": layout.node_data(layout.s[places]),
@@ -297,7 +301,7 @@ def guessed(phase: TrialPhase, mesh: np.ndarray, method: Lobatto) -> Motion:
     t = trial.t[0] + s * phase.durations[0]
     n_q, n_u = len(system.coordinates), len(system.speeds)
     Y = np.tile(np.asarray(phase.problem.starts(phase.problem.start))[phase.k], (len(s), 1))  # type: ignore[arg-type]
-    measured = {name: trial.measured[name] for name in names if name in trial.measured}
+    measured = {name: y for name, y in trial.measured.items() if name in names and np.isfinite(y).any()}
     for name, samples in measured.items():
         seen = np.isfinite(samples)
         Y[:, names.index(name)] = np.interp(t, trial.t[seen], np.asarray(samples)[seen])
