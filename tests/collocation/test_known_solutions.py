@@ -50,6 +50,24 @@ def test_a_range_at_the_end_does_not_replace_the_bounds_along_the_motion():
     assert np.min(plan["v"]) >= -atol
 
 
+def test_a_stationary_motion_that_is_not_a_minimum_is_not_ok():
+    """Rest is stationary by symmetry. In 4 s (less than 4.73 s, by cos s cosh s = 1) it is the minimum, in 6 s not."""
+
+    def problem(duration):
+        return Problem(
+            Sled(), duration, controls={"force": (-5.0, 5.0)}, cost=lambda t, now: now["force"] ** 2 - now["x"] ** 2,
+            start=REST, end=REST,
+        )  # fmt: skip
+
+    short = solve(problem(4.0), intervals=10, tolerance=None)
+    assert short.ok
+    long = solve(problem(6.0), intervals=10, tolerance=None)
+    assert not long.ok
+    assert long.cost == 0.0
+    assert long.reason == "stationary, but not a minimum: pass another guess"
+    assert solve(problem(6.0), {"x": [0.0, 1.0, 0.0]}, intervals=10, tolerance=None).cost < -10.0
+
+
 class Metered(Sled):
     """The impulse of the force is a state that no rate depends on."""
 

@@ -294,6 +294,11 @@ class Transcription:
         return layout.parameters[: len(layout.parameters) - layout.problem.n_local]
 
     @property
+    def shared(self) -> np.ndarray:
+        """The indices of all durations and parameters."""
+        return np.unique(np.concatenate([layout.shared for layout in self.layouts]))
+
+    @property
     def local_parameters(self) -> np.ndarray:
         """The indices of the parameters that belong to one phase, of all phases."""
         n = len(self.shared_parameters)

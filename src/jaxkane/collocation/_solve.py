@@ -13,6 +13,7 @@ import numpy as np
 
 from .._collocate.lobatto import Lobatto, lobatto
 from .._collocate.program import NonlinearProgram
+from .._collocate.second_order import refused_unless_minimum
 from .._collocate.solvers import INTERRUPTED, NOT_FINITE, Solution, Solver, default_solver, run
 from .._collocate.transcription import Motion, Transcription, nodes_of, system_at
 from .._common.lookup import positive_number
@@ -278,10 +279,11 @@ class _Search:
 
     def _solved(self, transcription: Transcription, is_warm: bool) -> Solution:
         program = transcription.program
-        return run(
+        solution = run(
             self.solver, program, transcription.z, progress=self.progress, is_warm=is_warm,
             max_iterations=self.max_iterations, options=self.options,
         )  # fmt: skip
+        return refused_unless_minimum(program, transcription.shared, solution)
 
     def _errors(self, transcription: Transcription, x: np.ndarray) -> list[np.ndarray]:
         """The error of each interval: of states, relative to their sizes, and of the cost, relative to the whole."""

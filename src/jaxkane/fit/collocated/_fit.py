@@ -15,6 +15,7 @@ import scipy.stats
 
 from ..._collocate.lobatto import lobatto
 from ..._collocate.program import Bounds, NonlinearProgram
+from ..._collocate.second_order import refused_unless_minimum
 from ..._collocate.solvers import INTERRUPTED, Solution, Solver, default_solver, run
 from ..._collocate.transcription import Transcription
 from ..._integrate.jumps import refuse_jumps
@@ -139,6 +140,7 @@ def solved(problem: Problem, how: Collocation, progress: bool) -> CollocationFit
     if densities:  # first the motion for the initial guess of the parameters
         program = with_fixed(program, shared, transcription.z)
     solution = run(solver, program, transcription.z, progress=progress, max_iterations=how.max_iterations)
+    solution = refused_unless_minimum(program, transcription.shared, solution)
     if densities and solution.ok:
         found = Marginal(transcription, shared, local).minimum(solution)
         point, covariance = found.point, found.covariance

@@ -18,9 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..._collocate.banded import BandedFactors
 from ..._collocate.solvers import Solution
 from ..._collocate.transcription import Layout, Transcription
-from ._kkt import BandedFactors, Kkt, inverse
+from ._kkt import Kkt, inverse
 
 
 class Point(NamedTuple):
