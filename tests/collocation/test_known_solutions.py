@@ -68,6 +68,16 @@ def test_a_stationary_motion_that_is_not_a_minimum_is_not_ok():
     assert solve(problem(6.0), {"x": [0.0, 1.0, 0.0]}, intervals=10, tolerance=None).cost < -10.0
 
 
+def test_a_plan_on_a_coarse_mesh_is_not_ok():
+    """A free oscillation of 0.99 s in intervals of 0.5 s, without refinement."""
+    problem = Problem(Sled(stiffness=40.0), 2.0, controls=[], start={"x": 1.0, "v": 0.0})
+    plan = solve(problem, intervals=4, tolerance=None)
+    assert not plan.ok
+    assert np.max(np.abs(plan["x"] - np.cos(np.sqrt(40.0) * plan.t))) > 0.1
+    assert "pass more `intervals` or a `tolerance`" in plan.reason
+    assert solve(problem, intervals=32, tolerance=None).ok
+
+
 class Metered(Sled):
     """The impulse of the force is a state that no rate depends on."""
 

@@ -1,7 +1,7 @@
 """Whether a stationary point of a nonlinear program is a minimum.
 
-A solver stops where the gradient of the Lagrangian is zero, which is also so at a maximum or a saddle. At a minimum, the
-Hessian H of the Lagrangian has no negative curvature along directions d with J d = 0, where J contains the active
+A solver stops where the gradient of the Lagrangian is zero, which is also so at a maximum or a saddle. At a minimum,
+the Hessian H of the Lagrangian has no negative curvature along directions d with J d = 0, where J contains the active
 constraints, and the variables at their bounds are fixed (J. Nocedal, S. Wright, Numerical Optimization, 2006, section
 12.5). The least curvature is found by the method of Lanczos, which needs products with H and projections onto J d = 0
 only. Each projection is a solution with banded factors.
@@ -49,7 +49,7 @@ def _has_negative_curvature(program: NonlinearProgram, border: np.ndarray, solut
     J: Any = scipy.sparse.csr_matrix((program.jacobian(z), program.jacobian_structure), (program.m, program.n))
     is_border = np.isin(np.arange(program.n), border)[free]
     project = _Projection(J[active][:, free], is_border)
-    v = project(np.random.default_rng(0).normal(size=int(free.sum())))
+    v = project(project(np.random.default_rng(0).normal(size=int(free.sum()))))
     if not np.linalg.norm(v) > 1e-3:  # the constraints determine all variables
         return False
     V, diagonal, beside = np.zeros((min(_STEPS, v.size) + 1, v.size)), [], []
@@ -64,14 +64,14 @@ def _has_negative_curvature(program: NonlinearProgram, border: np.ndarray, solut
             break
         V[k + 1] = w / beside[-1]
     _, vectors = scipy.linalg.eigh_tridiagonal(diagonal, beside[: len(diagonal) - 1])
-    # The direction is a proof, whether or not Lanczos converged, if it meets the constraints: steps beyond the number of
-    # directions add vectors of rounding errors, which the projection removes.
+    # The direction is a proof, whether or not Lanczos converged, if it meets the constraints: steps beyond the number
+    # of directions add vectors of rounding errors, which the projection removes.
     d = project(V[: len(diagonal)].T @ vectors[:, 0])
     negligible = max(1e-7 * float(np.max(np.abs(H.data), initial=0.0)), 1e-8)
     return bool(abs(np.linalg.norm(d) - 1.0) < 1e-3 and d @ (H @ d) < -negligible)
 
 
-_STEPS = 120  # of the method of Lanczos
+_STEPS = 80  # of the method of Lanczos
 
 
 def _at_bound(x: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
@@ -96,9 +96,8 @@ class _Projection:
         self.schur = np.eye(len(self.border)) - self.coupling.T @ self.solved
 
     def __call__(self, v: np.ndarray) -> np.ndarray:
-        for _ in range(2):  # the second one removes the rounding errors of the first
-            right = np.concatenate([v[self.inner], np.zeros(len(self.coupling) - len(self.inner))])
-            step = self.factors.solve(right[:, None])[:, 0]
-            v, x = v.copy(), np.linalg.solve(self.schur, v[self.border] - self.coupling.T @ step)
-            v[self.border], v[self.inner] = x, (step - self.solved @ x)[: len(self.inner)]
-        return v
+        right = np.concatenate([v[self.inner], np.zeros(len(self.coupling) - len(self.inner))])
+        step = self.factors.solve(right[:, None])[:, 0]
+        d, x = np.empty_like(v), np.linalg.solve(self.schur, v[self.border] - self.coupling.T @ step)
+        d[self.border], d[self.inner] = x, (step - self.solved @ x)[: len(self.inner)]
+        return d

@@ -24,6 +24,8 @@ from ._plan import Multipliers, Plan, trajectory_of
 from ._problem import Phases, Problem
 
 MAX_MESHES = 10
+COARSE = 1e-2
+"""The largest local error with which a plan on a mesh that is not refined is `ok`."""
 
 
 def solve(
@@ -59,7 +61,7 @@ def solve(
     - `intervals`: the number of intervals of the first mesh.
     - `method`: "trapezoid" (order 2), "hermite-simpson" (order 4) or "lobatto" (order 6).
     - `tolerance`: the largest permitted local error of an interval, relative to the size of each state. None: the first
-        mesh is not refined.
+        mesh is not refined, and a plan with a local error above 1 % is not `ok`.
     - `solver`: a `Solver`; by default `Ipopt` if CasADi is installed, else `Cyipopt`, else `TrustConstr`.
     - `options`: options of the solver, by the names that the solver uses.
     - `starts`: the number of searches. The first one starts from `guess`. For the others, random deviations are added
@@ -239,7 +241,7 @@ class _Search:
             costs.append(program.objective(solution.z) * program.f_scale)
             motions, theta = transcription.motions(x), transcription.theta(x)
             errors = None
-            if self.tolerance is not None and solution.ok:
+            if solution.ok:
                 try:
                     errors = self._errors(transcription, x)
                 except KeyboardInterrupt:
@@ -286,15 +288,18 @@ class _Search:
         return refused_unless_minimum(program, transcription.shared, solution)
 
     def _errors(self, transcription: Transcription, x: np.ndarray) -> list[np.ndarray]:
-        """The error of each interval: of states, relative to their sizes, and of the cost, relative to the whole."""
+        """The error of each interval: of states, relative to their sizes, and, if the mesh may be refined, of the cost,
+        relative to the whole."""
         program = transcription.program
         size = program.f_scale * max(abs(program.objective(x / transcription.x_scale)), 1e-3)
         found = []
         for p, (layout, motion) in enumerate(zip(transcription.layouts, transcription.motions(x), strict=True)):
             scales, system = transcription.x_scale[layout.node(0)], system_at(transcription, p, x)
-            errors = local_errors(layout, system, motion, self.method, scales, self.tolerance or 1.0)
-            errors = np.maximum(errors, quadrature_errors(layout, x, motion, self.method) / size)
-            found.append(np.maximum(errors, switch_errors(layout, motion, self.method)))
+            errors = local_errors(layout, system, motion, self.method, scales, self.tolerance or COARSE)
+            if self.tolerance is not None:  # no mesh resolves a cost of noisy measurements, which have their own nodes
+                errors = np.maximum(errors, quadrature_errors(layout, x, motion, self.method) / size)
+                errors = np.maximum(errors, switch_errors(layout, motion, self.method))
+            found.append(errors)
         return found
 
     def _refined(self, meshes: Sequence[np.ndarray], errors: Sequence[np.ndarray] | None) -> list[np.ndarray] | None:
@@ -317,8 +322,10 @@ class _Search:
     ) -> Plan:
         program, x = transcription.program, solution.z * transcription.x_scale
         ok, reason = solution.ok, solution.status
-        if ok and is_coarse:
-            worst = max(float(np.max(e)) for e in errors or ())
+        worst = max((float(np.max(e)) for e in errors or ()), default=0.0)
+        if ok and self.tolerance is None and worst > COARSE:
+            ok, reason = False, f"solved, but the local error is {worst:.1e}: pass more `intervals` or a `tolerance`"
+        elif ok and is_coarse:
             ok, reason = False, f"solved, but the local error is {worst:.1e} instead of {self.tolerance:g}"
         if reason == NOT_FINITE and (names := transcription.not_finite(x)):
             reason = f"{', '.join(names)} is not finite at the last iterate"

@@ -13,8 +13,6 @@ it in a fraction of a second. SuperLU took 40 to 90 s for 23 000 variables: the 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
