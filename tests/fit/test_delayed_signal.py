@@ -109,6 +109,20 @@ def test_delays_and_time_constants_in_any_unit_of_time(unit, kind, true):
     assert (gain * unit**2, time / unit) == pytest.approx((1.2, true), rel=0.02)
 
 
+@pytest.mark.slow
+def test_excluded_samples_do_not_count_in_the_variance_accounted_for():
+    """The first 0.5 s precede the first delayed input. There, the measurements are far from all others."""
+    t = np.linspace(0.0, 2.0, 21)
+    x = np.where(t < 0.45, 1e3, 0.1 * np.sin(3.0 * t))
+    trial = Trial(t, {"x": x}, {"push": np.sin(5.0 * t)}, sigma=0.1, initial={"x": 0.0, "x_dot": 0.0})
+    free = ("gain", Delay("push", bounds=(0.0, 0.5)))
+    found = fit(Track(), trial, free, steps=0, simulation=Simulation(step=0.1))
+    used, r = x[5:], found.residuals["trial"]["x"][5:] * 0.1
+    assert np.all(np.isnan(found.residuals["trial"]["x"][:5]))
+    share = 1.0 - np.sum(r**2) / np.sum((used - used.mean()) ** 2)
+    assert found.variance_accounted_for["x"] == pytest.approx(share, rel=1e-9)
+
+
 def test_invalid_low_pass_filters_are_rejected():
     trials = tracks(1)[:1]
     for item, said in (

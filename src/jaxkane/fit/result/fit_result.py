@@ -77,7 +77,7 @@ class Fit(FitState):
     - `fitted`: by trial and channel, the simulated measurements (n_t,). With process noise: predictions from all
         earlier measurements.
     - `tests`: by trial and channel, a `ResidualTest`.
-    - `variance_accounted_for`: by channel, over all trials.
+    - `variance_accounted_for`: by channel, over all samples that the fit uses.
     - `nuisance`: by trial and name, values of the trial unknowns and of the initial states of the windows. With process
         noise, initial states that have a standard deviation are part of the filter (`smoothed`).
     - `step_error`: change of the residuals if the integration steps are refined.
@@ -451,7 +451,8 @@ class Fit(FitState):
 
     @property
     def variance_accounted_for(self) -> dict[str, float]:
-        """By channel, the share of the variance accounted for, over all trials. Below zero is worse than a constant."""
+        """By channel, the share of the variance accounted for, over all samples that the fit uses. Below zero is worse
+        than a constant."""
         shares, trials = {}, list(zip(self.fitted.values(), self.problem.trials, strict=True))
         for channel in self.problem.channels:
             measured = [trial.measured[channel] for _, trial in trials if channel in trial.measured]

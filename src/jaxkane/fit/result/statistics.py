@@ -366,9 +366,11 @@ def by_trial(problem: Problem, simulated: np.ndarray) -> ByTrial:
 
 
 def variance_accounted_for(measured: Sequence[np.ndarray], fitted: Sequence[np.ndarray]) -> float:
-    """1 - sum (y - fit)^2 / sum (y - mean y)^2, with the mean of each series. NaN for constant measurements."""
-    left = sum(np.nansum((f - y) ** 2) for y, f in zip(measured, fitted, strict=True))
-    total = sum(np.nansum((y - np.nanmean(y)) ** 2) for y in measured)
+    """1 - sum (y - fit)^2 / sum (y - mean y)^2 over the samples that the fit uses, with the mean of each series. NaN
+    for constant measurements."""
+    used = [(y[both], f[both]) for y, f in zip(measured, fitted, strict=True) for both in [np.isfinite(y + f)]]
+    left = sum(np.sum((f - y) ** 2) for y, f in used)
+    total = sum(np.sum((y - np.mean(y)) ** 2) for y, _ in used if y.size)
     return float(1 - left / total) if total > 0 else float("nan")
 
 
