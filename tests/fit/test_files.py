@@ -126,9 +126,9 @@ def test_multi_start_stops_with_ctrl_c(problem):
 def test_a_profile_stops_with_ctrl_c(problem, monkeypatch):
     import jaxkane.fit.result.studies as module
 
-    fit = minimize(problem, LeastSquares())
-    stopped = lambda *args, **options: minimize(*args, **{**options, "callback": after(0)})  # noqa: E731
-    monkeypatch.setattr(module, "minimize", stopped)
+    fit, search = minimize(problem, LeastSquares()), module.search
+    stopped = lambda *args, **options: search(*args, **{**options, "callback": after(0)})  # noqa: E731
+    monkeypatch.setattr(module, "search", stopped)
     with pytest.raises(KeyboardInterrupt):
         profile(fit, "gain")
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from systems import POSED, PUSH, Cart, Track, of_x
+from systems import POSED, PUSH, TRIAL, Cart, Track, of_x
 from systems import T as SAMPLED
 from test_transcriptions import GUESS, TRUTH, record
 
@@ -21,8 +21,10 @@ from jaxkane.fit import (
     Problem,
     Simulation,
     Trial,
+    bootstrap,
     check_signs,
     cross_validate,
+    fit,
     identifiability,
     minimize,
     multi_start,
@@ -145,6 +147,24 @@ def test_the_profile_interval_of_a_nearly_linear_problem(result):
     assert likelihood.costs.min() == pytest.approx(result.cost, rel=1e-4)
     with pytest.raises(ValueError, match="gravity is not a free parameter"):
         profile(result, "gravity")
+
+
+@pytest.mark.slow
+def test_the_profile_of_an_estimate_near_a_bound_has_both_ends():
+    """The bound is a tenth of a standard error below the estimate. The cost is a parabola, so the other end is that of
+    the interval."""
+    free = fit(Track(), TRIAL, ("gain", "drift"), **POSED)
+    error, upper = free.standard_errors["drift"], free.intervals()["drift"][1]
+    bound = free.estimates["drift"] - 0.1 * error
+    near = fit(Track(), TRIAL, ("gain", Free("drift", start=bound + error, bounds=(bound, None))), **POSED)
+    assert profile(near, "drift", n=5).interval == pytest.approx((bound, upper), abs=1e-2 * error)
+
+
+def test_studies_of_a_fit_that_has_not_converged_are_refused(problem):
+    ended = minimize(problem, LeastSquares(), steps=0)
+    for name, study in (("profile", lambda: profile(ended, "mass")), ("bootstrap", lambda: bootstrap(ended))):
+        with pytest.raises(ValueError, match=f"{name}: The fit has not converged"):
+            study()
 
 
 def test_residuals_are_not_written_to(result):

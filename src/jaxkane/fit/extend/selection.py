@@ -14,7 +14,7 @@ from ..._common.lookup import refuse_unknown
 from ..problem.from_declarations import parameters_of
 from ..problem.specification import refuse_other
 from ..result.comparison import Plausible, energy_sources, plausible_of
-from ..result.diagnostics import AT_A_MINIMUM
+from ..result.diagnostics import refuse_unless_at_a_minimum
 from ..result.fit_result import Fit
 from ..result.statistics import check_level
 from ..result.tables import Rows, Tables, html_tables, text_tables
@@ -250,11 +250,7 @@ def _check_arguments(fit: Fit, depth: int, beam: int, refits: int | None, level:
             "forward_selection: the fit has process noise, which can hide missing physics. Fit without `noise`, or "
             "compare `fit.marginal_likelihood()` of fits with each candidate."
         )
-    if fit.status not in AT_A_MINIMUM:
-        raise ValueError(
-            f"forward_selection: the fit has not converged ({fit.status}), and a score test is only valid at a "
-            "minimum. Continue with `minimize(fit.problem, LeastSquares(), start=fit.point)`."
-        )
+    refuse_unless_at_a_minimum(fit.status, "forward_selection")  # a score test is only valid at a minimum
     for name, value, smallest in (
         ("depth", depth, 1),
         ("beam", beam, 1),

@@ -41,6 +41,12 @@ def not_converged(status: str) -> Iterator[str]:
         )
 
 
+def refuse_unless_at_a_minimum(status: str, function: str) -> None:
+    """**Raises:** `ValueError` if a fit has not converged."""
+    for sentence in not_converged(status):
+        raise ValueError(f"{function}: {sentence}")
+
+
 def left_out_for_delays(problem: Problem) -> Iterator[str]:
     """The first samples of trials, which are left out because they depend on unrecorded inputs."""
     late, _ = delayed_inputs(problem.specification)

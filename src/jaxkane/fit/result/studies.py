@@ -22,7 +22,7 @@ from ..problem.windows import Windows
 from ..solve.fit import minimize, search, uninterrupted
 from ..solve.local_unknowns import solve_nuisance
 from ..solve.optimizers import LeastSquares, Optimizer
-from .diagnostics import AT_A_MINIMUM, poorly_fitted_channels
+from .diagnostics import AT_A_MINIMUM, poorly_fitted_channels, refuse_unless_at_a_minimum
 from .fit_result import Fit
 from .statistics import FEWEST_TRIALS, bootstrap_steps, clustered, t_quantile
 from .tables import text_table
@@ -197,38 +197,40 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
 
     - `fit`: a `Fit`.
     - `name`: a free parameter.
-    - `n`: number of values, half of them on either side of the estimate.
+    - `n`: number of values, half of them on either side of the estimate. A side without an end has more.
     - `span`: half-width of the range of values, in formal standard errors. By default 1.5 times the half-width of the
-        interval.
+        interval, and on a side without an end up to six times.
     - `level`: confidence level of the interval, between 0 and 1.
 
     **Returns:** a `Profile`.
 
-    **Raises:** `ValueError` for a name that is not free, for a parameter that the data do not determine, and if no fit
-    with the parameter fixed converges.
+    **Raises:** `ValueError` for a name that is not free, for a fit that has not converged, for a parameter that the
+    data do not determine, and if no fit with the parameter fixed converges.
     """
     refuse_other(fit, Fit, "profile", "profile(fit(...), name)")
     if name not in fit.names:
         raise ValueError(f"{name} is not a free parameter; {hint(name, fit.names, 'the free parameters are')}")
     if n < 3 or not (span is None or 0 < span < np.inf):
         raise ValueError(f"profile: `n` must be at least 3, and `span` must be positive; got n = {n}, span = {span}.")
-    error, best = fit.standard_errors[name], fit.estimates[name]
+    refuse_unless_at_a_minimum(fit.status, "profile")
+    i, error, best = fit.names.index(name), fit.standard_errors[name], fit.estimates[name]
     if not np.isfinite(error):
         raise ValueError(
             f"profile: these data do not determine {name}: {fit.message}. Add a prior, or omit it from `free`."
         )
-    if span is None:
-        low, high = fit.intervals(level)[name]
-        span = 0.75 * (high - low) / error
-    i = fit.names.index(name)
+    half = float(fit.half_widths(level)[i])  # of the interval before it is truncated at the bounds
+    step = (1.5 * (half if np.isfinite(half) else error) if span is None else span * error) / (n // 2)
     prior = float(fit.parameters.prior_mean[i]), float(fit.parameters.prior_deviation[i])
-    values, fits = best + span * error * np.linspace(-1, 1, n | 1), {}
-    for side in (values[values >= best], values[values < best][::-1]):
-        point = fit.point
-        for value in side:
-            pinned = fit.problem.with_priors({name: (float(value), 1e-4 * error)})
+    # At one standard error, computed with `sigma` as it was passed, the cost exceeds its minimum by one.
+    fits, rise = {}, (half / fit.identifiability.given_sigma_errors[i]) ** 2
+    for side in (1, -1):
+        point, cost, k = fit.point, fit.cost, int(side < 0)
+        # Near a bound on the other side, the cost is not a parabola: continue until it exceeds the limit.
+        while k <= n // 2 or (span is None and k <= 2 * n and cost <= fit.cost + rise < np.inf):
+            value = best + side * k * step
+            pinned = fit.problem.with_priors({name: (value, 1e-4 * error)})
             try:
-                start = pinned.at({name: float(value)}, point)
+                start = pinned.at({name: value}, point)
                 result = uninterrupted(search(pinned, LeastSquares(), start=start))
             except ValueError:  # outside its bounds, or it cannot be simulated
                 break
@@ -236,16 +238,14 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
                 break
             pin = (result.estimates[name] - value) / (1e-4 * error)
             cost = result.cost - pin**2 + ((result.estimates[name] - prior[0]) / prior[1]) ** 2
-            fits[float(value)], point = (cost, result.estimates), result.point
+            fits[value], point, k = (cost, result.estimates), result.point, k + 1
     if not fits:
         raise ValueError(
             f"profile: no fit converges with {name} fixed near {best:.6g}: {fit.message}. Pass another `span`."
         )
     values = np.array(sorted(fits))
     costs = np.array([fits[v][0] for v in values])
-    # At one standard error, computed with `sigma` as it was passed, the cost exceeds its minimum by one.
-    limit = costs.min() + (fit.half_widths(level)[i] / fit.identifiability.given_sigma_errors[i]) ** 2
-    low, high = np.clip(_crossings(values, costs, limit), *fit.parameters.bounds[i])
+    low, high = np.clip(_crossings(values, costs, costs.min() + rise), *fit.parameters.bounds[i])
     return Profile(name, values, costs, level, (float(low), float(high)), tuple(fits[v][1] for v in values))
 
 
@@ -323,9 +323,11 @@ def bootstrap(fit: Fit, *, n: int = 2000, seed: int = 0) -> Bootstrap:
     **Returns:** a `Bootstrap`. For a parameter that one cluster alone determines, the values are NaN and the interval
     is infinite.
 
-    **Raises:** `ValueError` with too few trials and windows (`Fit.clusters`), and for a validated fit.
+    **Raises:** `ValueError` with too few trials and windows (`Fit.clusters`), for a fit that has not converged, and for
+    a validated fit.
     """
     refuse_other(fit, Fit, "bootstrap", "bootstrap(fit(...))")
+    refuse_unless_at_a_minimum(fit.status, "bootstrap")
     if not isinstance(n, int) or isinstance(n, bool) or n < 100:
         raise ValueError(f"bootstrap: `n` must be an integer of at least 100, got {n!r}.")
     if fit.status == "validated":
