@@ -417,12 +417,12 @@ def test_the_score_test_of_a_parameter_determined_by_one_trial(kicked):
 
 
 def test_a_fold_that_has_not_converged_is_reported(kicked, monkeypatch):
-    first = iter([{"status": "steps"}])
+    first, search = iter([{"status": "steps"}]), validation.search
 
     def unlucky(*args, **options):
-        return dataclasses.replace(minimize(*args, **options), **next(first, {}))
+        return dataclasses.replace(search(*args, **options), **next(first, {}))
 
-    monkeypatch.setattr(validation, "minimize", unlucky)
+    monkeypatch.setattr(validation, "search", unlucky)
     folds = cross_validate(kicked, [[0, 1], [2, 3, 4], [5, 6, 7]])
     assert folds.failures[0].startswith("Without run 0, run 1 the fit has not converged (stopped after the last step")
     assert np.isnan(folds.held_out[:5]).all()

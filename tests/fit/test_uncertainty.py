@@ -167,6 +167,15 @@ def test_studies_of_a_fit_that_has_not_converged_are_refused(problem):
             study()
 
 
+def test_a_start_from_a_problem_with_other_initial_guesses_is_refused(trials, problem, result):
+    """Of the same shape."""
+    other = Problem.of(TRUTH, trials, NAMES, **UNKNOWN)
+    with pytest.raises(ValueError, match="`start` belongs to another problem, with other names, initial guesses"):
+        minimize(other, LeastSquares(), start=result.point)
+    again = minimize(problem, LeastSquares(), start=problem.at(result.estimates, result.point))
+    assert again.cost == pytest.approx(result.cost, rel=1e-6)
+
+
 def test_residuals_are_not_written_to(result):
     for series in (result.residuals, result.fitted):
         with pytest.raises(ValueError, match="read-only"):

@@ -17,8 +17,8 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
-from ..._collocate.banded import BandedFactors
 from ..._collocate.program import NonlinearProgram
+from ..._collocate.second_order import BandedFactors
 
 
 class Kkt:

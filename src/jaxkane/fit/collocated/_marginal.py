@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..._collocate.banded import BandedFactors
+from ..._collocate.second_order import BandedFactors
 from ..._collocate.solvers import Solution
 from ..._collocate.transcription import Layout, Transcription
 from ._kkt import Kkt, inverse

@@ -122,11 +122,13 @@ class Unknowns(eqx.Module):
     - `parameters` (p,): the unconstrained variables of the parameters (see `Parameters`).
     - `trial_unknowns` (T, n_b): the unknowns of every trial, such as the offsets of its sensors and inputs.
     - `window_starts` (W, n_z): the unknown part of the initial state of every window, relative to its initial guess,
-        and gains and offsets of every window."""
+        and gains and offsets of every window.
+    - `meaning`: the names of all these, and the initial guesses and scales of the parameters; () if not known."""
 
     parameters: Float[Array, " p"]
     trial_unknowns: Float[Array, "T n_b"]
     window_starts: Float[Array, "W n_z"]
+    meaning: tuple[Any, ...] = eqx.field(static=True, default=())
 
 
 class Nuisance(eqx.Module):

@@ -204,7 +204,12 @@ class Problem:
         def zeros(*shape):
             return on_device(np.zeros(shape, self.windows.t.dtype))
 
-        return Unknowns(zeros(p), zeros(T, len(nuisance.trial)), zeros(W, len(nuisance.window_names)))
+        return Unknowns(zeros(p), zeros(T, len(nuisance.trial)), zeros(W, len(nuisance.window_names)), self._meaning)
+
+    @property
+    def _meaning(self) -> tuple[Any, ...]:
+        names = self.parameters.names, self.model.nuisance.trial_names, self.model.nuisance.window_names
+        return (*names, *(np.asarray(x).tobytes() for x in (self.parameters.start, self.parameters.scale)))
 
     def at(self, values: Mapping[str, float], point: Unknowns | None = None) -> Unknowns:
         """The point with given values of parameters.
@@ -392,7 +397,7 @@ class Problem:
 
     def trajectories(self, point: Unknowns) -> list[Trajectory]:
         """The trajectory of every window, in the order of `slices`."""
-        rides = trajectories_of(self.model, self.windows, point, self.starts(point))
+        rides = trajectories_of(self.model, self.windows, dataclasses.replace(point, meaning=()), self.starts(point))
         return [
             jax.tree.map(lambda x, i=i, n=n: x[i, :n] if x.ndim > 1 else x[i], rides)
             for i, (_, _, n) in enumerate(self.slices)
@@ -417,10 +422,8 @@ class Problem:
     def point_of(self, point: Unknowns, trials: Sequence[int]) -> Unknowns:
         """Convert a point of this problem to the problem with a subset of its trials, given by index."""
         own = np.isin(np.asarray(self.windows.trial), trials)
-        return Unknowns(
-            point.parameters,
-            *(on_device(np.asarray(x)[i]) for x, i in ((point.trial_unknowns, [*trials]), (point.window_starts, own))),
-        )
+        b, z = (on_device(np.asarray(x)[i]) for x, i in ((point.trial_unknowns, [*trials]), (point.window_starts, own)))
+        return dataclasses.replace(point, trial_unknowns=b, window_starts=z)
 
     def parts(self, room: Shape | None, most_added: int) -> list[tuple[Problem, list[int]]]:
         """Split this problem into parts of successive trials that can reuse the compiled program of another problem.

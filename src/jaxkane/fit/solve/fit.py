@@ -284,7 +284,7 @@ def _resting(result: Fit, place: int, method: Any, run: dict[str, Any]) -> Fit:
         return result
     fixed, x = parameters.resting(place, point.parameters)
     problem = dataclasses.replace(result.problem, model=dataclasses.replace(result.problem.model, parameters=fixed))
-    start = dataclasses.replace(point, parameters=on_device(x))
+    start = dataclasses.replace(point, parameters=on_device(x), meaning=problem.start.meaning)
     try:
         again = search(problem, method, start=start, **run)
     except Unsimulated:
@@ -301,6 +301,11 @@ def _refuse_start_of_another(problem: Problem, start: Any) -> None:
         raise ValueError(
             "`start` belongs to another problem: its parameters, unknowns of trials and initial values of windows "
             f"have the shapes {shapes}, but this problem has {own}. If a fit omitted trials, use `fit.problem`."
+        )
+    if start.meaning not in ((), problem.start.meaning):
+        raise ValueError(
+            "`start` belongs to another problem, with other names, initial guesses or scales of its parameters. Pass "
+            "values by name: start=problem.at({name: fit.estimates[name], ...})."
         )
 
 

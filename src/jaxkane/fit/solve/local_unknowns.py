@@ -24,7 +24,8 @@ def moved(point: Unknowns, x: Any, eliminated: Eliminated) -> Unknowns:
     def after(before, step):
         return on_device(np.asarray(before) + step)
 
-    return Unknowns(after(point.parameters, x), after(point.trial_unknowns, b), after(point.window_starts, z))
+    numbers = zip((point.parameters, point.trial_unknowns, point.window_starts), (x, b, z), strict=True)
+    return Unknowns(*(after(*pair) for pair in numbers), point.meaning)
 
 
 def usable(at: Linearization | None) -> bool:
@@ -161,7 +162,8 @@ def _chosen(better: np.ndarray, owner: np.ndarray, new: Any, old: Any) -> tuple[
     of_windows = of(better[owner])
     R, seen = of_windows(there.blocks.R, at.blocks.R), jax.tree.map(of_windows, there.prediction, at.prediction)
     b, z = of(better)(tried.trial_unknowns, point.trial_unknowns), of_windows(tried.window_starts, point.window_starts)
-    return Unknowns(point.parameters, b, z), Linearization(eqx.tree_at(lambda blocks: blocks.R, at.blocks, R), seen)
+    point = Unknowns(point.parameters, b, z, point.meaning)
+    return point, Linearization(eqx.tree_at(lambda blocks: blocks.R, at.blocks, R), seen)
 
 
 def _event_names(problem: Problem) -> tuple[str, ...]:
