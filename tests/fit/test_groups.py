@@ -102,6 +102,7 @@ def test_every_driver_estimates_the_deviation_of_groups(mixed):
     for other in (minimize(problem, LeastSquares(), start=found.point), multi_start(problem, 1, spread=0.0).best):
         assert other.deviations["gain"] == pytest.approx(found.deviations["gain"], rel=1e-3)
         assert other.estimates == pytest.approx(found.estimates, rel=1e-3)
+    assert np.isnan([found.aic, found.bic]).all()  # the cost does not integrate out the groups
 
 
 @pytest.mark.slow

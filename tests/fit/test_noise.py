@@ -186,6 +186,13 @@ def test_the_fit_maximizes_the_likelihood(case, found):
         found.trajectories()
 
 
+@pytest.mark.slow
+def test_initial_states_of_the_filter_do_not_count_in_information_criteria(case, found):
+    n = sum(np.isfinite(v).sum() for v in case[1].values())
+    assert found.aic == pytest.approx(found.cost + 2 * 4, rel=1e-12)  # four parameters
+    assert found.bic == pytest.approx(found.cost + 4 * np.log(n), rel=1e-12)
+
+
 @pytest.mark.weekly
 def test_gradient_descent_converges_to_the_same_maximum(case, found):
     problem = case[2]

@@ -115,17 +115,26 @@ class Fit(FitState):
 
     @property
     def aic(self) -> float:
-        """Akaike's information criterion: twice the number of unknowns minus twice the log likelihood.
+        """Akaike's information criterion: twice the number of maximized unknowns minus twice the log likelihood.
 
         `sigma` is used as it was passed, unless `errors` estimates its scale. Priors are not part of the likelihood.
+        Unknowns that the filter integrates out (`noise`) are not counted. NaN with a distribution over groups.
         """
-        return 2 * self.problem.size[1] - 2 * self._log_likelihood
+        return 2 * self._n_maximized - 2 * self._log_likelihood
 
     @property
     def bic(self) -> float:
         """The Bayesian information criterion (Schwarz 1978), with the likelihood of `aic`."""
         n = np.count_nonzero(np.asarray(self.problem.windows.weight) > 0)
-        return self.problem.size[1] * math.log(n) - 2 * self._log_likelihood
+        return self._n_maximized * math.log(n) - 2 * self._log_likelihood
+
+    @property
+    def _n_maximized(self) -> float:
+        if self.parameters.distributions:  # the cost does not integrate out the groups
+            return math.nan
+        n, T = self.problem.model.nuisance, self.problem.clusters  # with process noise each trial is one window
+        known = np.isfinite(np.concatenate([n.start_deviation, n.trial_deviation])).sum()
+        return self.problem.size[1] - (T * int(known) if self.problem.model.noise is not None else 0)
 
     @property
     def _log_likelihood(self) -> float:
