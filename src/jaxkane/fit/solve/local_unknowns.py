@@ -25,7 +25,7 @@ def moved(point: Unknowns, x: Any, eliminated: Eliminated) -> Unknowns:
         return on_device(np.asarray(before) + step)
 
     numbers = zip((point.parameters, point.trial_unknowns, point.window_starts), (x, b, z), strict=True)
-    return Unknowns(*(after(*pair) for pair in numbers), point.meaning)
+    return Unknowns(*(after(*pair) for pair in numbers), meaning=point.meaning)
 
 
 def usable(at: Linearization | None) -> bool:
