@@ -43,6 +43,7 @@ from .inputs import (
     InputState,
     RateArguments,
     Samples,
+    SharedTimes,
     for_fixed_steps,
     inputs_are_valid,
     inputs_at,
@@ -88,17 +89,16 @@ def solve(
 
     **Returns:** a `Trajectory` with the times `origin + taus`.
     """
-    signals = restore_times(signals)
     if settings.adjoint is not None:
         return _solved(system, state, origin, taus, signals, discontinuities, closures, settings)
     if closures:
         signals = _with_captured_numbers(system, state, origin, signals)
 
     def run(arguments: Any, moved: Any, reverse: bool) -> Trajectory:
-        arguments, (settings, closures) = arguments
+        given, (settings, closures) = arguments
         adjoint = diffrax.RecursiveCheckpointAdjoint() if reverse else diffrax.ForwardMode()
         settings = dataclasses.replace(settings, adjoint=adjoint, progress=settings.progress and moved is None)
-        return _solved(*arguments, closures, settings, moved)
+        return _solved(*given, closures, settings, moved)
 
     arguments = system, state, origin, taus, signals, discontinuities
     how = (
@@ -114,6 +114,8 @@ def solve(
 def _with_captured_numbers(system: System, state: State, t: Array, signals: Any) -> Any:
     """The signals. Numbers that a function of them captures from outside, traced ones, become numbers of the signal."""
     context = InputState(state.q, state.u, state.x, t, system)
+    if isinstance(signals, SharedTimes):
+        return dataclasses.replace(signals, signals=_with_captured_numbers(system, state, t, signals.signals))
 
     def converted(f: Any) -> Any:
         return eqx.filter_closure_convert(f, t, context) if callable(f) and not is_samples(f) else f
@@ -134,7 +136,8 @@ def _solved(
 ) -> Trajectory:
     """`solve` with an adjoint of diffrax. `moved`: the arguments with True for each number that is differentiated, if
     the errors of tangents are controlled."""
-    fixed = settings.step is not None
+    # Here, not before: as arguments of an operation, shared times would no longer be the same array.
+    signals, fixed = restore_times(signals), settings.step is not None
     signals = for_fixed_steps(signals) if fixed else signals
     follows_from = parts_of((system, state, origin, taus, signals, discontinuities, closures))
     others_are_valid = inputs_are_valid(signals)

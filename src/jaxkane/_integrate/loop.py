@@ -185,7 +185,7 @@ def fast_loop(
     checkpoints = getattr(adjoint, "checkpoints", None)
     kind = "lax" if max_steps is None and checkpoints is None else kind
     solver = solver if kind == "checkpointed" else with_scan_kind(solver, kind)
-    term: Any = diffrax.ODETerm(rates) if probing is None else probing.term  # pyright: ignore[reportArgumentType]
+    term: Any = diffrax.ODETerm(rates if probing is None else probing.of_both)  # pyright: ignore[reportArgumentType]
     start, order = jnp.zeros_like(controller.duration), solver.error_order(term)
     end, state = controller.init(term, start, controller.duration, y0, None, args, solver.func, order)
     begin, probe = (y0, None) if probing is None else probing.start(y0, max_steps)

@@ -15,7 +15,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -62,18 +61,13 @@ class Probing(NamedTuple):
         e = jnp.sqrt(jnp.mean(share * share))
         return e, Probe(size, probe.errors.at[i].set(e.astype(jnp.float32)))
 
-    @property
-    def term(self) -> Any:
+    def of_both(self, t: Array, both: Array, args: RateArguments) -> Array:
         """The rates of motion and tangent, (2, n), as one state: the solver has as many operations as for one."""
-
-        def rates(t: Array, both: Array, args: RateArguments) -> Array:
-            direction = self._along(args)
-            moved = jax.tree.map(lambda d, x: None if d is None else x, direction, args, is_leaf=_is_none)
-            still = jax.tree.map(lambda d, x: x if d is None else None, direction, args, is_leaf=_is_none)
-            of_motion = lambda y, moved: self.rates(t, y, eqx.combine(moved, still))  # noqa: E731
-            return jnp.stack(jax.jvp(of_motion, (both[0], moved), (both[1], direction)))
-
-        return diffrax.ODETerm(rates)  # pyright: ignore[reportArgumentType]
+        direction = self._along(args)
+        moved = jax.tree.map(lambda d, x: None if d is None else x, direction, args, is_leaf=_is_none)
+        still = jax.tree.map(lambda d, x: x if d is None else None, direction, args, is_leaf=_is_none)
+        of_motion = lambda y, moved: self.rates(t, y, eqx.combine(moved, still))  # noqa: E731
+        return jnp.stack(jax.jvp(of_motion, (both[0], moved), (both[1], direction)))
 
     def _along(self, args: RateArguments) -> Any:
         """The direction of these arguments, in which a solver may have replaced samples by numbers."""

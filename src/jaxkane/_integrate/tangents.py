@@ -36,7 +36,7 @@ def with_own_tangents(run: Run, arguments: Any, constants: Any) -> Any:
     fixed, structure_of_fixed = jax.tree.flatten(arrays)
     after: list[Any] = []  # what the result contains beside float arrays, and its structure
 
-    def outputs(moving: list[Any], fixed: list[Any], moved: tuple[bool, ...] | None, reverse: bool) -> list[Any]:
+    def outputs(moving: list[Any], fixed: list[Any], moved: tuple[bool, ...] | None, reverse: bool) -> Any:
         other, constants = eqx.combine(jax.tree.unflatten(structure_of_fixed, fixed), rest)
         arguments = eqx.combine(jax.tree.unflatten(structure, moving), other)
         flags = None if moved is None else jax.tree.unflatten(structure, moved)
@@ -57,9 +57,9 @@ def with_own_tangents(run: Run, arguments: Any, constants: Any) -> Any:
         moving, fixed = primals
         moved = tuple(not isinstance(x_dot, SymbolicZero) for x_dot in tangents[0])
         floats, integers = value(moving, fixed)
-        types = tuple([jax.ShapeDtypeStruct(x.shape, x.dtype) for x in floats])
-        modes = [lambda *args, reverse=reverse: outputs(*args, moved, reverse) for reverse in (False, True)]
-        one = Simulated(*modes, moved, types)
+        types = tuple([jax.typeof(x).update(weak_type=False) for x in floats])
+        forward, reverse = (functools.partial(outputs, moved=moved, reverse=reverse) for reverse in (False, True))
+        one = Simulated(forward, reverse, moved, types)
         dots = [x_dot for x_dot, moves in zip(tangents[0], moved, strict=True) if moves]
         floats_dot = _tangents.bind(*moving, *fixed, *dots, simulated=one, n=len(moving) + len(fixed))
         no_dots = jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), integers)
@@ -72,7 +72,7 @@ def with_own_tangents(run: Run, arguments: Any, constants: Any) -> Any:
 
 class Simulated(NamedTuple):
     """The floats that a simulation returns, as two functions of (moving, fixed): with derivatives in forward mode, and
-    in reverse mode. `moved`: which of the `moving` are differentiated. `types`: shapes and dtypes of the floats."""
+    in reverse mode. `moved`: which of the `moving` are differentiated. `types`: the abstract values of the floats."""
 
     forward: Callable[..., list[Any]]
     reverse: Callable[..., list[Any]]
@@ -112,7 +112,7 @@ class Batch(NamedTuple):
 
     @property
     def types(self) -> tuple[Any, ...]:
-        return tuple([jax.ShapeDtypeStruct((self.size, *x.shape), x.dtype) for x in self.simulated.types])
+        return tuple([x.update(shape=(self.size, *x.shape)) for x in self.simulated.types])
 
     def tangents(self, values: Sequence[Any], dots: Sequence[Any]) -> list[Any]:
         dims = list(self.dims[: self.n]), list(self.dims[self.n :])
@@ -130,7 +130,7 @@ def _evaluated(*args: Any, simulated: Any, n: int) -> list[Any]:
 
 
 def _shapes(*args: Any, simulated: Any, n: int) -> list[Any]:
-    return [jax.core.ShapedArray(x.shape, x.dtype) for x in simulated.types]
+    return [*simulated.types]
 
 
 def _jvp(primals: Any, tangents: Any, *, simulated: Any, n: int) -> Any:
