@@ -98,7 +98,7 @@ def solve(
         given, (settings, closures) = arguments
         adjoint = diffrax.RecursiveCheckpointAdjoint() if reverse else diffrax.ForwardMode()
         settings = dataclasses.replace(settings, adjoint=adjoint, progress=settings.progress and moved is None)
-        return _solved(*given, closures, settings, moved)
+        return _solved(*given, closures=closures, settings=settings, moved=moved)
 
     arguments = system, state, origin, taus, signals, discontinuities
     how = (

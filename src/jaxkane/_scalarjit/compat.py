@@ -4,7 +4,7 @@ Each feature has a fallback. If a release removes a feature, results stay right;
 
 | feature | without it |
 |---|---|
-| jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `MISSING` is the reason; rates are plain JAX, without controlled tangents |
+| jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `MISSING`: rates are plain JAX, tangents not controlled |
 | the frontend attribute that makes one function of a program | XLA splits the program as any other |
 | `_filter_jit_cache` of equinox | compiled programs are never freed |
 | `reset_cache`, equinox's setting for its checks | programs are stored only if the environment sets it from the start |
