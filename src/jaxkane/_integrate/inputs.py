@@ -470,7 +470,7 @@ def times_since(origin: Any, ts: Any, dtype: DTypeLike) -> Array:
 def time_array(ts: Any, label: str, dtype: DTypeLike | None = None) -> Any:
     """Times as an array of a dtype; as a float64 array of NumPy if this dtype cannot resolve neighbouring times."""
     array = real_array(ts, label, dtype)
-    if isinstance(array, Tracer) or isinstance(ts, jax.Array) or array.size < 2:
+    if isinstance(ts, jax.Array) or array.size < 2:  # also traced times
         return array
     exact = np.asarray(ts, np.float64)
     return exact if is_coarse(exact, array.dtype) else array

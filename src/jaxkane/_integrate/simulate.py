@@ -214,9 +214,13 @@ def on_clock(ts: Any, trajectory: Trajectory) -> dict[str, Any]:
     """Times of a trajectory on the clock of `ts`: in float64 of NumPy if its own type could not resolve them."""
     if isinstance(ts, jax.Array):
         return {"t": ts}
-    own: dict[str, Any] = {"t": ts, "t_end": ts[0] + np.asarray(trajectory.t_end, np.float64)}
+
+    def on(since: Any) -> Any:  # a traced number keeps its own type
+        return ts[0].astype(since.dtype) + since if isinstance(since, Tracer) else ts[0] + np.asarray(since, np.float64)
+
+    own: dict[str, Any] = {"t": ts, "t_end": on(trajectory.t_end)}
     if trajectory.jumps is not None:
-        own["jumps"] = dataclasses.replace(trajectory.jumps, t=ts[0] + np.asarray(trajectory.jumps.t, np.float64))
+        own["jumps"] = dataclasses.replace(trajectory.jumps, t=on(trajectory.jumps.t))
     return own
 
 

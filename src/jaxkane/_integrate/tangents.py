@@ -48,7 +48,9 @@ def with_own_tangents(run: Run, arguments: Any, constants: Any) -> Any:
             return [leaves, integers]
         return leaves
 
+    # `jax.jit`, because JAX calls this function once to differentiate it, and once for its value.
     @jax.custom_jvp
+    @jax.jit
     def value(moving: list[Any], fixed: list[Any]) -> Any:
         return outputs(moving, fixed, None, False)
 
