@@ -512,7 +512,7 @@ def many(n):
         (BouncingBall, {}, ValueError, r"BouncingBall: an FMU cannot represent contacts: floor. Replace them"),
         (lambda: jk.with_multipliers(Bob()), {}, ValueError, r"Bob: an FMU cannot represent multipliers"),
         (lambda: many(13), {}, ValueError, r"at most 12 independent speeds, and this system has 13"),
-        (lambda: many(0), {}, ValueError, r"Many has no coordinates and no first-order states"),
+        (lambda: many(0), {}, ValueError, r"Many has no coordinates\. Name them"),
         (lambda: with_members(events=jumps_by_a_loop), {}, ValueError, r"`then` of the event e.*contains scan"),
         (lambda: with_members(inputs=("command", "a\nb")), {}, ValueError, r"contains '\\n', which an FMU"),
     ],

@@ -223,6 +223,6 @@ def test_every_public_function_of_a_trajectory_is_tested():
         name
         for name, f in functions.items()
         if "system" in inspect.signature(f).parameters
-        and ("return along(" in inspect.getsource(f) or {"trajectory", "motions"} & {*inspect.signature(f).parameters})
+        and (" along(" in inspect.getsource(f) or {"trajectory", "motions"} & {*inspect.signature(f).parameters})
     }
     assert taking == {*OF_A_TRAJECTORY}

@@ -356,7 +356,10 @@ def _check_description(members: PyTree, shared: PyTree, t: Component) -> None:
     if any(x.shape[0] == 0 for x in jax.tree.leaves(members)):
         return
     for i in (0, -1):
-        system, state, _, columns = eqx.combine(jax.tree.map(lambda x, i=i: x[i], members), shared)
+        own = jax.tree.map(lambda x, i=i: x[i], members)
+        if i == -1 and not all(map(_is_finite, jax.tree.leaves(own))):
+            return
+        system, state, _, columns = eqx.combine(own, shared)
         system, _ = _system(system, Row(columns))
         q = as_state(system, state).q if isinstance(state, State) else None
         if q is not None and is_concrete(q) and not np.all(np.isfinite(q)):
@@ -364,6 +367,10 @@ def _check_description(members: PyTree, shared: PyTree, t: Component) -> None:
         if i == 0:
             check_system(system, t, q, bodies=False)
         check_contacts(system, t, q, may_penetrate=True)
+
+
+def _is_finite(x: Any) -> bool:
+    return not is_concrete(x) or not eqx.is_inexact_array_like(x) or bool(np.all(np.isfinite(x)))
 
 
 def _signals(inputs: Inputs, system: System, columns: dict[str, Any], ts: Numbers) -> Any:
