@@ -77,16 +77,14 @@ def test_too_coarse_steps_are_reported_or_halved(trial):
     direct = minimize(problem, LeastSquares())
     told = fit(GUESS, trial, NAMES, optimizer=LeastSquares(), simulation=Simulation(step=H / 4))
     assert float(told.problem.windows.step[0]) == H / 4
-    for one in (told, direct):
-        assert one.status == "converged"
-        assert one.too_coarse
-        assert not one.ok
-        assert "is too coarse at the estimates" in one.message
-        assert one.message.split("; ")[-1] + "." in str(one)
-    finer = fit(slow, trial, NAMES, optimizer=LeastSquares())
-    assert finer.ok
-    assert finer.problem.windows.step[0] < problem.windows.step[0]
-    assert len(finer.history) > len(direct.history)
+    assert told.status == "converged"
+    assert told.too_coarse
+    assert not told.ok
+    assert "is too coarse at the estimates" in told.message
+    assert told.message.split("; ")[-1] + "." in str(told)
+    for finer in (direct, fit(slow, trial, NAMES, optimizer=LeastSquares())):
+        assert finer.ok
+        assert finer.problem.windows.step[0] < problem.windows.step[0]
 
 
 @pytest.mark.slow

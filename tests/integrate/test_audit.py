@@ -198,7 +198,9 @@ def test_work_between_too_few_samples_has_a_large_reported_error(times):
 
 @pytest.mark.slow
 def test_an_inaccurate_simulation_with_a_damper_fails_the_audit():
-    ride = jk.simulate(Oscillator(), jk.State([0.1], [0.0]), np.linspace(0.0, 1.0, 97), rtol=1e-2, atol=1e-2)
+    ride = jk.simulate(
+        Oscillator(), jk.State([0.1], [0.0]), np.linspace(0.0, 1.0, 97), rtol=1e-2, atol=1e-2, max_step=1.0
+    )
     audit = jk.audit(Oscillator(), ride)
     assert audit.energy_balance > 1e-3
     assert not audit.ok

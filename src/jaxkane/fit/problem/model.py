@@ -109,6 +109,9 @@ class Simulation:
             atol = 1e-2 * settings.rtol * sizes
             implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
             settings = dataclasses.replace(settings, atol=on_device(atol.min() if implicit else atol, t.dtype))
+        if not fixed:
+            # Steps end at the samples of inputs, and a window may be as short as a few steps.
+            settings = dataclasses.replace(settings, max_step=np.inf)
         return with_array_tolerances(settings, t.dtype)
 
 
