@@ -82,9 +82,9 @@ def test_too_coarse_steps_are_reported_or_halved(trial):
     assert not told.ok
     assert "is too coarse at the estimates" in told.message
     assert told.message.split("; ")[-1] + "." in str(told)
-    for finer in (direct, fit(slow, trial, NAMES, optimizer=LeastSquares())):
-        assert finer.ok
-        assert finer.problem.windows.step[0] < problem.windows.step[0]
+    for refined in (direct, fit(slow, trial, NAMES, optimizer=LeastSquares())):
+        assert refined.ok
+        assert refined.problem.windows.step[0] < problem.windows.step[0]
 
 
 @pytest.mark.slow
