@@ -52,7 +52,8 @@ def with_own_tangents(run: Run, arguments: Any, constants: Any) -> Any:
     @jax.custom_jvp
     @jax.jit
     def value(moving: list[Any], fixed: list[Any]) -> Any:
-        return outputs(moving, fixed, None, False)
+        floats, integers = outputs(moving, fixed, None, False)
+        return [_in_one_batch.bind(*floats, *moving, *fixed, n=len(floats)), integers]
 
     @functools.partial(value.defjvp, symbolic_zeros=True)
     def _(primals: Any, tangents: Any) -> Any:
@@ -200,4 +201,29 @@ _forward_only: Any = None if MISSING else new_primitive(
     batch=lambda x, dims: (_forward_only.bind(*x), dims),
     traced=_same,
     lower_on_cpu=as_lowering(_same),
+)  # fmt: skip
+
+
+def _first(*args: Any, n: int) -> list[Any]:
+    return [*args[:n]]
+
+
+def _batch_all(args: Any, dims: Any, *, n: int) -> Any:
+    size = next(x.shape[dim] for x, dim in zip(args, dims, strict=True) if dim is not None)
+    pairs = zip(args[:n], dims[:n], strict=True)
+    first = [jnp.broadcast_to(x, (size, *x.shape)) if dim is None else jnp.moveaxis(x, dim, 0) for x, dim in pairs]
+    return _in_one_batch.bind(*first, *args[n:], n=n), [0] * n
+
+
+# The first n arguments. In a batch all of them are in the batch if any argument is, because all tangents are: JAX does
+# not support an operation with values outside of a batch and tangents in it.
+_in_one_batch: Any = None if MISSING else new_primitive(
+    "in_one_batch",
+    evaluate=_first,
+    shapes=_first,
+    jvp=_refused,
+    transpose=_refused,
+    batch=_batch_all,
+    traced=_first,
+    lower_on_cpu=as_lowering(_first),
 )  # fmt: skip
