@@ -73,7 +73,7 @@ def interpolated(motion: Motion, mesh: np.ndarray, method: Lobatto, s: np.ndarra
 def local_errors(
     layout: Layout, system: System, motion: Motion, method: Lobatto, scales: np.ndarray, tolerance: float
 ) -> np.ndarray:
-    """The error (N,) of each interval at its end, relative to the sizes of the states.
+    """The error (N,) of each interval at its end, relative to the sizes of the states, or to half of their range.
 
     Each interval is simulated from its own start with the polynomials of its controls. An interval whose simulation
     fails has an infinite error.
@@ -94,7 +94,9 @@ def local_errors(
             _simulated(system, layout.problem.signals, layout.variables.controls, *arguments, rtol, atol)
         )  # fmt: skip
     ends = np.concatenate(reached)[: len(times)]
-    errors = np.max(np.abs(ends - motion.Y[every::every]) / scales[:n_y], axis=1)
+    # A guess of coordinates alone tells little of speeds: their range in the solution may be fifty times as large.
+    sizes = np.maximum(scales[:n_y], 0.5 * np.ptp(motion.Y, axis=0))
+    errors = np.max(np.abs(ends - motion.Y[every::every]) / sizes, axis=1)
     return np.where(np.isfinite(errors), errors, np.inf)
 
 
