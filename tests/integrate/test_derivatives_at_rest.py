@@ -63,6 +63,20 @@ def test_derivatives_at_rest_are_those_of_the_closed_form(mode, start):
         np.testing.assert_allclose(found, right(), atol=1e-5)
 
 
+def test_steps_that_end_at_discontinuities_are_as_fine_at_rest():
+    """A step more or less before one of them must not shift the errors that later steps read."""
+    for n in (11, 51):
+        x0 = lambda x, n=n: end(jnp.array([0.0, 1.0, 0.0, 0.0, 0.0]) * x, discontinuities=np.linspace(0, 10, n)[1:-1])[1]
+        assert float(jax.jacfwd(x0)(0.0)) == pytest.approx(np.cos(200.0), abs=1e-5)
+
+
+def test_a_small_derivative_of_a_parameter_is_as_accurate_as_a_large_one():
+    """For example that of a heavy body by a force that is zero."""
+    rest = jk.State([0.0, 0.0], [0.0, 0.0])
+    small = lambda p: jk.simulate(Oscillator(amplitude=1e-9 * p), rest, [0.0, 10.0])["y"][-1]  # noqa: E731
+    assert 1e9 * float(jax.jacfwd(small)(0.0)) == pytest.approx(right()[1, 3], rel=1e-5)
+
+
 @pytest.mark.slow
 def test_derivatives_at_rest_become_as_accurate_as_their_tolerance():
     p = jnp.zeros(5)

@@ -190,7 +190,8 @@ def _solved(
         settings=settings,
     )
     if moved is not None and not fixed:
-        problem = problem._replace(args_dot=direction_of(problem.args, moved[0], any(jax.tree.leaves(moved[4]))))
+        args_dot = direction_of(problem.args, moved[0], any(jax.tree.leaves(moved[4])))
+        problem = problem._replace(args_dot=args_dot, start_moves=any(jax.tree.leaves(moved[1:4])))
     determined = None
     if touches is not None:
         problem, determined = problem.with_found_contacts(touches)
@@ -226,6 +227,7 @@ class Problem(NamedTuple):
     - `args`: the arguments of the right-hand side. `discontinuities`: where steps end, or None.
     - `events`: the event functions. `settings`: the options of `simulate`.
     - `args_dot`: the direction in which `args` move if the errors of tangents are controlled, else None.
+    - `start_moves`: whether the start is differentiated.
     """
 
     system: System
@@ -237,6 +239,7 @@ class Problem(NamedTuple):
     events: Events
     settings: Settings
     args_dot: Any = None
+    start_moves: bool = False
 
     @property
     def constrained(self) -> bool:
@@ -282,8 +285,11 @@ class Problem(NamedTuple):
         """The errors of a tangent in all steps, None if they are not controlled."""
         if self.args_dot is None:
             return None
-        n = self.start.size - self.events.layout.memory_size  # the states of contacts have no tangent
-        probing = Probing(self.rates(True), generic(self.start, n), self.args_dot)
+        # The states of contacts have no tangent. A start that is not differentiated does not move: its tangent would hide
+        # a smaller one of a parameter, 1e-9 m/N for a heavy body for example.
+        n = self.start.size - self.events.layout.memory_size if self.start_moves else 0
+        noise = 10 * jnp.finfo(self.start.dtype).eps / controller.rtol
+        probing = Probing(self.rates(True), generic(self.start, n), self.args_dot, constant(noise))
         controller, start, args, taus, valid = constant((controller, self.start, self.args, self.taus[-1:], self.valid))
         how = probing.rates, solver, controller, start, args, taus, diffrax.ForwardMode(), self.settings.max_steps
         errors = fast_loop(*how, valid, jumps, probing).errors

@@ -38,11 +38,13 @@ class Probe(NamedTuple):
 
 class Probing(NamedTuple):
     """How a loop moves motion and tangent, (2, n), as one state: with these `rates` of the motion, from the direction
-    `y` (n,), while the arguments of the rates move in the direction `args` (None where they do not)."""
+    `y` (n,), while the arguments of the rates move in the direction `args` (None where they do not). A component below
+    the share `noise` of the largest one counts as rounding errors of others."""
 
     rates: Callable[..., Array]
     y: Array
     args: Any
+    noise: Array
 
     def start(self, y: Array, most: int | None) -> tuple[Array, Probe]:
         """Motion and tangent at the start of a simulation of at most so many steps, and the probe."""
@@ -52,14 +54,17 @@ class Probing(NamedTuple):
     def again(self, y: Array, probe: Probe) -> Array:
         """Motion and tangent after a jump of the motion to y. The direction is generic again, and its components keep
         their size, because an event may reset a coordinate."""
-        return jnp.stack([y, jnp.sign(self.y) * probe.size])
+        return jnp.stack([y, jnp.sign(generic(y, y.size)) * probe.size])
 
     def step(self, probe: Probe, both: Array, error: Array, i: Array) -> tuple[Array, Probe]:
         """The error of the tangent in the step i, which ends at these values, relative to its size; and the probe."""
         size = jnp.maximum(probe.size, jnp.abs(both[1]))
-        share = jnp.where(size > 0, error[1] / jnp.where(size > 0, size, 1.0), 0.0)
-        e = jnp.sqrt(jnp.mean(share * share))
-        return e, Probe(size, probe.errors.at[i].set(e.astype(jnp.float32)))
+        least = jnp.maximum(size, self.noise * jnp.max(size))
+        share = jnp.where(least > 0, error[1] / jnp.where(least > 0, least, 1.0), 0.0)
+        # Both loops use the rounded number: one that differs in the last digit can decide about an additional step before a
+        # discontinuity, and from then on each step would read the error of its neighbour.
+        e = jnp.sqrt(jnp.mean(share * share)).astype(jnp.float32)
+        return e.astype(both.dtype), Probe(size, probe.errors.at[i].set(e))
 
     def of_both(self, t: Array, both: Array, args: RateArguments) -> Array:
         """The rates of motion and tangent, (2, n), as one state: the solver has as many operations as for one."""
