@@ -107,6 +107,35 @@ class Clock(jk.System):
         }
 
 
+class Switches(jk.System):
+    """Two particles in a line, without forces. `log` contains a digit for each jump."""
+
+    place: jk.Scalar = jk.parameter(0.7)
+    coordinates, speeds, states = ("x", "y"), ("vx", "vy"), ("log",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[i] * N.x, u[i] * N.x), name="xy"[i]) for i in (0, 1)])
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return {}
+
+    def events(self, t, q, u, x):
+        def log(digit, **new):
+            return {"log": 10.0 * x["log"] + digit, **new}
+
+        return {
+            "couples": jk.rising(q["x"] - 1.0, then=(jk.Impact(u["vx"] - u["vy"]), log(4.0))),
+            "double": jk.rising(q["x"], then=log(1.0, vx=2.0 * u["vx"])),
+            "place": jk.rising(q["x"] - self.place, then=log(2.0)),
+            "pulled": jk.rising(q["y"], then=log(5.0)),
+            "time": jk.falling(2.1 - 3.0 * t, then=log(3.0)),
+            "touch": jk.falling((t - 0.7) ** 2, then=log(8.0)),
+            "turns": jk.rising(q["x"] - 1.2, then=log(6.0, vx=-u["vx"])),
+            "turns_late": jk.rising(q["x"] - 1.2, then=log(9.0)),
+        }
+
+
 STATES = {
     "Driven": jk.State([0.1], [0.2], [0.3]),
     "Bob": jk.State([0.6, -0.8], [0.5]),
@@ -394,6 +423,32 @@ def test_time_events_occur_once(kind, fmu_of):
     """Also at the start, and at a communication point. The sine rises through zero at 0, 0.314, 0.628 and 0.942 s."""
     last = fmpy.simulate_fmu(fmu_of(Clock(), "3.0"), fmi_type=kind, stop_time=1.0, output_interval=0.1)[-1]
     assert [last[name] for name in ("waves", "at", "twice")] == [4.0, 1.0, 1.0]
+
+
+@pytest.mark.slow_cases(all_but=["3.0"])
+@needs_compiler
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_events_occur_as_in_simulate(fmi, tmp_path):
+    """A kick that does not reverse, events of place and time at one instant, a function that touches zero, an impact
+    that only slows, an event after the jump of another, and one that is reversed before it occurs."""
+    start, names = jk.State([-0.35, 0.0], [1.0, 0.0], [0.0]), ["x", "y", "vx", "vy", "log"]
+    expected = jk.simulate(Switches(), start, jnp.linspace(0.0, 1.28, 9))
+    assert float(expected["log"][-1]) == 123456.0
+    # In many short steps, rounding errors would separate the events that occur at one instant.
+    path = str(jk.export.fmu(Switches(), tmp_path / "switches.fmu", fmi=fmi, step=0.01, state=start))
+    for kind in KINDS:
+        found = fmpy.simulate_fmu(
+            path, fmi_type=kind, stop_time=1.28, output_interval=0.16, relative_tolerance=1e-10, record_events=False,
+            output=names,
+        )  # fmt: skip
+        for name in names:
+            np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-9, err_msg=f"{kind} {name}")
+    with Unit(path) as unit:  # a changed parameter makes a function cross zero
+        unit.start()
+        unit.set({"place": -1.0})
+        unit.step(0.0, 0.1)
+        unit.step(0.1, 0.1)
+        assert unit.get("log")[0] == 2.0
 
 
 @needs_compiler

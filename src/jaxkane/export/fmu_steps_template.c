@@ -13,38 +13,19 @@ static bool has_crossed(const model_state *s, int j, double g) {
     return s->side[j] * g < -s->slack[j] && (directions[j] == 0 || directions[j] == -s->side[j]);
 }
 
-/* Whether an event occurs now: its function has crossed zero, or crosses it within a rounding error. */
-static bool is_due(const model_state *s, int j, const double *g, const double *g_dot, const double *condition) {
-    const bool comes = s->side[j] * g_dot[j] < 0.0 && (directions[j] == 0 || directions[j] == -s->side[j]);
-    return is_possible(j, condition)
-        && (has_crossed(s, j, g[j]) || (comes && fabs(g[j]) <= fabs(g_dot[j]) * rounding(s->t)));
+/* The side from which an event function comes, at the start or after a jump that changes it. At zero, an event with a
+   direction is still ahead; one without direction has occurred. */
+static int side_of(int j, double t, double g, double g_dot) {
+    if (fabs(g) > fabs(g_dot) * rounding(t)) return g > 0.0 ? 1 : -1;
+    return directions[j] != 0 ? -directions[j] : g_dot < 0.0 ? -1 : 1;
 }
 
-/* What a jump does to the function of its event: MOVES it away from zero, or leaves it at zero, from where it goes BACK
-   or is PASSED through zero, without another jump. */
-enum { NOTHING, MOVES, BACK, PASSED };
-
-/* Stores the side of zero of each event function, at the start and after jumps. At zero, an event with a direction is
-   still ahead, unless its condition is not met; one without direction has occurred. `effects`: of the jumps that just
-   occurred. */
-static void set_sides(model_state *s, const int *effects) {
+static void set_sides(model_state *s) {
     double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
     int j;
     if (N_E == 0) return;
     events_of(s->t, s->y, s->w, s->p, g, g_dot, condition);
-    for (j = 0; j < N_E; j++) {
-        const bool is_zero = fabs(g[j]) <= fabs(g_dot[j]) * rounding(s->t);
-        const bool is_ahead = directions[j] * g_dot[j] > 0.0;
-        const int previous = s->side[j], effect = effects ? effects[j] : NOTHING;
-        s->side[j] = g[j] > 0.0 ? 1 : -1;
-        if (is_zero && directions[j] == 0) s->side[j] = g_dot[j] < 0.0 ? -1 : 1;
-        else if (is_zero) s->side[j] = is_ahead && !is_possible(j, condition) ? directions[j] : -directions[j];
-        if (effect == PASSED) s->side[j] = -previous;
-        if (effect == BACK) s->side[j] = previous;
-        /* Within a rounding error, the function may not be on this side yet. Without this slack, a ball whose bounces
-           are shorter than the importer's tolerance falls through the floor. */
-        s->slack[j] = effect == PASSED || effect == BACK ? 2.0 * fmax(0.0, -s->side[j] * g[j]) : 0.0;
-    }
+    for (j = 0; j < N_E; j++) s->side[j] = side_of(j, s->t, g[j], g_dot[j]);
 }
 
 /* Updates the sides where no jump has occurred. A function that is zero stays on its side, so that an event that has
@@ -60,37 +41,83 @@ static void follow_sides(model_state *s) {
     }
 }
 
-/* The effect of a jump at the event j, from the states before and after it; -1 if the event would occur again. */
-static int effect_of(const model_state *s, int j, double t, const double *y, const double *after) {
-    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0}, g_before, rate_before, rate;
-    events_of(t, y, s->w, s->p, g, g_dot, condition);
-    g_before = g[j];
-    rate_before = g_dot[j];
-    events_of(t, after, s->w, s->p, g, g_dot, condition);
-    rate = g_dot[j];
-    if (fabs(g[j] - g_before) > (fabs(rate_before) + fabs(rate)) * rounding(t)) return MOVES;
-    if (s->side[j] * rate >= 0.0) return BACK;
-    /* Functions of the time, for example, cross zero at the same rate after the jump. */
-    if (fabs(rate - rate_before) <= sqrt(DBL_EPSILON) * fabs(rate_before) || !is_possible(j, condition)) return PASSED;
-    return -1;
+/* A step of the classical method of Runge and Kutta, of order 4. */
+static void advance(const model_state *s, double h, double *y) {
+    static const double places[] = {0.0, 0.5, 0.5, 1.0}, weights[] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
+    double stage[SIZE(N_Y)], rate[SIZE(N_Y)] = {0.0};
+    int i, k;
+    memcpy(y, s->y, N_Y * sizeof(double));
+    for (k = 0; k < 4; k++) {
+        for (i = 0; i < N_Y; i++) stage[i] = s->y[i] + places[k] * h * rate[i];
+        rate_of(s->t + places[k] * h, stage, s->w, s->p, rate);
+        for (i = 0; i < N_Y; i++) y[i] += weights[k] * h * rate[i];
+    }
+}
+
+/* The event functions and their rates after a short time. */
+static void events_later(const model_state *s, double dt, double *g, double *g_dot) {
+    double y[SIZE(N_Y)], condition[SIZE(N_C)] = {0.0};
+    advance(s, dt, y);
+    events_of(s->t + dt, y, s->w, s->p, g, g_dot, condition);
+}
+
+/* Whether an event occurs now, if its condition is met: its function has crossed zero, or crosses it within a rounding
+   error. A function that only touches zero does not cross it. */
+static bool is_due(const model_state *s, int j, double g, double g_dot) {
+    double later[SIZE(N_E)], rates[SIZE(N_E)];
+    if (has_crossed(s, j, g)) return true;
+    if (s->slack[j] > 0.0 || !(s->side[j] * g_dot < 0.0 && fabs(g) <= fabs(g_dot) * rounding(s->t))) return false;
+    events_later(s, 1e-3 * STEP, later, rates);
+    return has_crossed(s, j, later[j]);
 }
 
 /* Whether the function of an event returns to its side after a jump, by its speed and acceleration. A ball with a
    restitution of zero does not, and a ball whose bounces are shorter than the importer's tolerance does not. */
-static bool returns(const model_state *s, int j) {
-    double g[SIZE(N_E)], g_dot[SIZE(N_E)], later[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
-    double rate[SIZE(N_Y)], y[SIZE(N_Y)], depth, speed, acceleration;
-    const double dt = 1e-3 * STEP;
-    int i;
+static bool returns(const model_state *s, int j, bool rests) {
+    double g[SIZE(N_E)], g_dot[SIZE(N_E)], later[SIZE(N_E)], rates[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
+    double depth, speed, acceleration;
     events_of(s->t, s->y, s->w, s->p, g, g_dot, condition);
+    events_later(s, 1e-3 * STEP, later, rates);
     depth = -s->side[j] * g[j];
     speed = s->side[j] * g_dot[j];
-    rate_of(s->t, s->y, s->w, s->p, rate);
-    for (i = 0; i < N_Y; i++) y[i] = s->y[i] + dt * rate[i];
-    events_of(s->t + dt, y, s->w, s->p, g, later, condition);
-    acceleration = s->side[j] * (later[j] - g_dot[j]) / dt;
-    if (depth < 0.0 || (speed >= 0.0 && acceleration >= 0.0)) return true;
-    return speed > 0.0 && speed * speed > -2.0 * acceleration * depth;
+    acceleration = s->side[j] * (rates[j] - g_dot[j]) / (1e-3 * STEP);
+    if (rests) return acceleration >= 0.0;
+    return depth < 0.0 || acceleration >= 0.0 || speed * speed > -2.0 * acceleration * depth;
+}
+
+/* Updates the sides after a jump of the event `which` from y to `after`. A function that the jump does not change stays
+   on its side, so that its event is still due, or does not occur again. The function of the event itself changes to its
+   other side if it then crosses zero. Returns false if it crosses zero more than once within a rounding error. */
+static bool pass_jump(model_state *s, int which, double at, const double *y, const double *after) {
+    double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
+    double g_before[SIZE(N_E)], before[SIZE(N_E)], now[SIZE(N_E)], rate_now[SIZE(N_E)];
+    bool is_single = true;
+    int j;
+    events_of(at, y, s->w, s->p, g_before, before, condition);
+    events_of(at, after, s->w, s->p, g, g_dot, condition);
+    events_of(s->t, s->y, s->w, s->p, now, rate_now, condition);
+    for (j = 0; j < N_E; j++) {
+        const double limit = (fabs(before[j]) + fabs(g_dot[j])) * rounding(at);
+        const bool is_own = j == which, rests = fabs(g_dot[j]) <= sqrt(DBL_EPSILON) * fabs(before[j]);
+        /* A function that has crossed is zero except for the error of the time, unless a changed parameter moved it. */
+        const bool is_near = fabs(g_before[j]) <= STEP * fabs(before[j]);
+        const bool stays = is_own ? is_near && fabs(g[j]) <= fabs(g_before[j]) + limit
+                                  : fabs(g[j] - g_before[j]) <= limit;
+        if (!stays) {
+            s->side[j] = side_of(j, at, g[j], g_dot[j]);
+        } else if (is_own && !rests && directions[j] * g_dot[j] > 0.0) {
+            s->side[j] = directions[j];
+            is_single = directions[j] * before[j] >= 0.0;
+        } else if (is_own) {
+            is_single = returns(s, j, rests);
+        }
+        /* Within a rounding error, the function may not be on this side yet. Without this slack, a ball whose bounces
+           are shorter than the importer's tolerance falls through the floor. */
+        s->slack[j] = 0.0;
+        if (is_own || (is_near && s->side[j] * g_dot[j] >= 0.0))
+            s->slack[j] = limit + 2.0 * fmax(0.0, -s->side[j] * now[j]);
+    }
+    return is_single;
 }
 
 /* The time from now to the crossing of an event function, to first order; 0 if the function is not nearly linear. */
@@ -106,7 +133,7 @@ static double time_to_crossing(const model_state *s, int j, double g, double g_d
 
 /* The jump of an event. An importer stops a little after the crossing. So the state is continued to the time of the
    crossing, jumps there, and is continued to the present time. The error is quadratic in the difference. */
-static int jump(instance *m, int j, double g, double g_dot, int *effect) {
+static int jump(instance *m, int j, double g, double g_dot) {
     double rate[SIZE(N_Y)], y[SIZE(N_Y)], after[SIZE(N_Y)], change[SIZE(N_M)], shift, at;
     int i;
     rate_of(m->now.t, m->now.y, m->now.w, m->now.p, rate);
@@ -119,10 +146,9 @@ static int jump(instance *m, int j, double g, double g_dot, int *effect) {
                "constraint.", at, event_names[j]);
         return ERROR;
     }
-    *effect = effect_of(&m->now, j, at, y, after);
     rate_of(at, after, m->now.w, m->now.p, rate);
     for (i = 0; i < N_Y; i++) m->now.y[i] = after[i] - shift * rate[i];
-    if (*effect < 0 || (*effect == BACK && !returns(&m->now, j))) {
+    if (!pass_jump(&m->now, j, at, y, after)) {
         report(m, ERROR, "t = %.17g: after the jump at the event '%s', its function crosses zero again at once. "
                "The jumps accumulate at this time.", at, event_names[j]);
         return ERROR;
@@ -139,48 +165,30 @@ static int jump(instance *m, int j, double g, double g_dot, int *effect) {
     return OK;
 }
 
-/* All events that occur now, in alphabetical order. An event is skipped if an earlier one has changed the direction in
-   which its function crosses zero. `found`: an event that occurs now except for rounding errors, or -1. */
+/* The events that occur now. The first due event in alphabetical order jumps, until none is due. `found`: an event that
+   occurs now except for rounding errors, or -1. */
 static int perform_events(instance *m, int found, bool *changed) {
     double g[SIZE(N_E)], g_dot[SIZE(N_E)], condition[SIZE(N_C)] = {0.0};
-    bool due[SIZE(N_E)];
-    int effects[SIZE(N_E)], j;
+    model_state *s = &m->now;
+    int j;
     *changed = false;
-    if (N_E == 0 || m->now.ended_by >= 0) return OK;
-    events_of(m->now.t, m->now.y, m->now.w, m->now.p, g, g_dot, condition);
-    for (j = 0; j < N_E; j++) {
-        due[j] = is_due(&m->now, j, g, g_dot, condition) || (j == found && is_possible(j, condition));
-        effects[j] = NOTHING;
-    }
-    for (j = 0; j < N_E; j++) {
-        if (!due[j] || (*changed && !(m->now.side[j] * g_dot[j] < 0.0))) continue;
-        if (is_end[j]) {
-            m->now.ended_by = j;
-            return OK;
+    while (N_E > 0 && s->ended_by < 0) {
+        events_of(s->t, s->y, s->w, s->p, g, g_dot, condition);
+        for (j = 0; j < N_E; j++)
+            if (is_possible(j, condition) && (j == found || is_due(s, j, g[j], g_dot[j]))) break;
+        if (j == N_E) {
+            follow_sides(s);
+            break;
         }
-        if (jump(m, j, g[j], g_dot[j], &effects[j]) != OK) return ERROR;
-        *changed = true;
-        events_of(m->now.t, m->now.y, m->now.w, m->now.p, g, g_dot, condition);
+        if (is_end[j]) s->ended_by = j;
+        else if (jump(m, j, g[j], g_dot[j]) != OK) return ERROR;
+        else *changed = true;
+        found = -1;
     }
-    if (*changed) set_sides(&m->now, effects);
-    else follow_sides(&m->now);
     return OK;
 }
 
 /* ---- Integration, for co-simulation ---- */
-
-/* A step of the classical method of Runge and Kutta, of order 4. */
-static void advance(const model_state *s, double h, double *y) {
-    static const double places[] = {0.0, 0.5, 0.5, 1.0}, weights[] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
-    double stage[SIZE(N_Y)], rate[SIZE(N_Y)] = {0.0};
-    int i, k;
-    memcpy(y, s->y, N_Y * sizeof(double));
-    for (k = 0; k < 4; k++) {
-        for (i = 0; i < N_Y; i++) stage[i] = s->y[i] + places[k] * h * rate[i];
-        rate_of(s->t + places[k] * h, stage, s->w, s->p, rate);
-        for (i = 0; i < N_Y; i++) y[i] += weights[k] * h * rate[i];
-    }
-}
 
 /* The length [s] of the step after which an event function crosses zero, by Newton's method between bounds. */
 static double length_to_crossing(const model_state *s, int j, double h) {

@@ -205,7 +205,7 @@ static int initialize(instance *m) {
         report(m, ERROR, "The rates of the states are not finite at the start values.");
         return ERROR;
     }
-    set_sides(&m->now, NULL);
+    set_sides(&m->now);
     m->now.mode = m->co_simulation ? STEPPING : EVENT_MODE;
     return m->co_simulation ? perform_events(m, -1, &changed) : OK;
 }
