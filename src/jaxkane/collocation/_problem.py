@@ -290,6 +290,11 @@ class Problem:
                 raise ValueError(f"Problem: the input {name!r} is an array. Pass jaxkane.Samples(times, values).")
         signals = as_signals(self.inputs, self.system.inputs, jnp.zeros(2), self.title)
         for name, signal in {} if callable(signals) else signals.items():
+            if is_samples(signal) and not (signal.ts[0] < self.durations[1] and signal.ts[-1] > 0):
+                raise ValueError(
+                    f"Problem: the samples of the input {name!r} are from {signal.ts[0]:.10g} to {signal.ts[-1]:.10g} "
+                    "s, but the motion starts at 0 s. Subtract the time of its start from `ts`."
+                )
             if is_samples(signal) and signal.zero_order_hold:
                 raise ValueError(
                     f"Problem: the input {name!r} is a zero-order hold, but collocation needs continuous inputs. Pass "

@@ -243,8 +243,8 @@ def begin(filter: Filter, state: State, deviation: Mapping[str, float], t: float
 
     **Returns:** a `Belief`.
 
-    **Raises:** `ValueError` for a name that the filter does not estimate, and for a state that is not finite or
-    violates a constraint.
+    **Raises:** `ValueError` for a name that the filter does not estimate, for a state that is not finite or violates a
+    constraint, and for a time that the type of the state cannot resolve.
     """
     names, state = filter.names, checked_state(filter.system, state)
     check_time("begin", t)
@@ -258,6 +258,11 @@ def begin(filter: Filter, state: State, deviation: Mapping[str, float], t: float
                 "a guess and a large `deviation`."
             )
     check_state(filter.system, t, state.q)
+    if is_concrete(t) and (step := float(np.spacing(np.abs(np.asarray(t, state.q.dtype))))) > 1e-3:
+        raise ValueError(
+            f"begin: {state.q.dtype} resolves times near t = {t:.10g} s only to {step:.3g} s. Pass the time since a "
+            "later origin, or enable float64: jaxkane.configure()."
+        )
     check_system(filter.system, t, state.q)
     for name, value in deviation.items():
         if name not in names:

@@ -462,9 +462,10 @@ def uses_time(system: System, inputs: Any, y: Array) -> tuple[bool, bool]:
 @jit
 def repeats(system: System, inputs: Any, t: Array, y: Array, period: Array, skipped: Array) -> Array:
     """Whether the equations near a packed state are the same at random times, one `period` later, and `skipped` [s]
-    later. True with `Samples`, which need not continue after one period."""
+    later. True with `Samples`, which need not continue after one period. Samples that an input function calls must
+    continue, because the function may delay them."""
     of_rates, of_events = uses_time(system, inputs, y)
-    if not (of_rates or of_events) or samples_of((system, inputs)) or captures_any(Samples, system, inputs):
+    if not (of_rates or of_events) or samples_of((system, inputs)) or captures_any(Samples, system):
         return jnp.array(True)
     rng, eps = np.random.default_rng(0), float(jnp.finfo(y.dtype).eps)
 

@@ -688,7 +688,8 @@ def _no_orbit(name: str, equations: OrbitEquations, entries: tuple[str, ...], fo
     if not found.repeats:
         return (
             f"{name}: the equations at t and t + period differ, or the type of the state cannot resolve these times. "
-            "Pass a period of the force with all its digits, e.g. as a function of the system."
+            "Pass a period of the force with all its digits, e.g. as a function of the system. Samples that an input "
+            "function calls must cover two periods, and its delays."
         )
     if not np.isfinite(residual):
         return (

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from ..._common.lookup import counted
 from ..._integrate.jumps import refuse_jumps
 from ..._integrate.trajectory import Trajectory
+from ..._kane.arguments import refuse_multipliers
 from ..._kane.consistent_state import NoConfiguration
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
@@ -106,6 +107,7 @@ class Problem:
                     "Simulation(step=...), or omit these options: the step is then halved until the result does not "
                     "change."
                 )
+            refuse_multipliers(system)
             refuse_jumps(system, "Fit with `noise`", "The filter cannot represent jumps. Omit `noise`.")
             deviations = jnp.concatenate([nuisance.start_deviation, nuisance.trial_deviation])
             noise = noise_of(system, spec.noise, deviations, spec.window)
