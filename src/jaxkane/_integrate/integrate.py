@@ -285,8 +285,8 @@ class Problem(NamedTuple):
         """The errors of a tangent in all steps, None if they are not controlled."""
         if self.args_dot is None:
             return None
-        # The states of contacts have no tangent. A start that is not differentiated does not move: its tangent would hide
-        # a smaller one of a parameter, 1e-9 m/N for a heavy body for example.
+        # The states of contacts have no tangent. A start that is not differentiated does not move: its tangent would
+        # hide a smaller one of a parameter, 1e-9 m/N for a heavy body for example.
         n = self.start.size - self.events.layout.memory_size if self.start_moves else 0
         noise = 10 * jnp.finfo(self.start.dtype).eps / controller.rtol
         probing = Probing(self.rates(True), generic(self.start, n), self.args_dot, constant(noise))

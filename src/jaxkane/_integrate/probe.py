@@ -61,8 +61,8 @@ class Probing(NamedTuple):
         size = jnp.maximum(probe.size, jnp.abs(both[1]))
         least = jnp.maximum(size, self.noise * jnp.max(size))
         share = jnp.where(least > 0, error[1] / jnp.where(least > 0, least, 1.0), 0.0)
-        # Both loops use the rounded number: one that differs in the last digit can decide about an additional step before a
-        # discontinuity, and from then on each step would read the error of its neighbour.
+        # Both loops use the rounded number: one that differs in the last digit can decide about an additional step
+        # before a discontinuity, and from then on each step would read the error of its neighbour.
         e = jnp.sqrt(jnp.mean(share * share)).astype(jnp.float32)
         return e.astype(both.dtype), Probe(size, probe.errors.at[i].set(e))
 
