@@ -81,6 +81,21 @@ def test_a_small_derivative_of_a_parameter_is_as_accurate_as_a_large_one():
     assert 1e9 * float(jax.jacfwd(small)(0.0)) == pytest.approx(right()[1, 3], rel=1e-5)
 
 
+class Kicked(Oscillator):
+    """After one second, the second block is moved to a place."""
+
+    place: jk.Scalar = jk.parameter(0.0)
+
+    def events(self, t, q, u):
+        return {"kick": jk.rising(t - 1.0, then={"y": self.place})}
+
+
+def test_a_parameter_of_a_jump_moves_nothing_before_the_jump():
+    rest = jk.State([0.0, 0.0], [0.0, 0.0])
+    last = lambda p: jk.simulate(Kicked(place=p), rest, [0.0, 11.0])["y"][-1]  # noqa: E731
+    assert float(jax.jacfwd(last)(0.0)) == pytest.approx(np.cos(200.0), abs=1e-5)
+
+
 @pytest.mark.slow
 def test_derivatives_at_rest_become_as_accurate_as_their_tolerance():
     p = jnp.zeros(5)

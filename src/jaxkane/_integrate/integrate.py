@@ -191,7 +191,9 @@ def _solved(
     )
     if moved is not None and not fixed:
         args_dot = direction_of(problem.args, moved[0], any(jax.tree.leaves(moved[4])))
-        problem = problem._replace(args_dot=args_dot, start_moves=any(jax.tree.leaves(moved[1:4])))
+        # A parameter of a jump moves nothing before the jump.
+        start_moves = problem.events.continue_ or any(jax.tree.leaves((*moved[1:4], moved[5])))
+        problem = problem._replace(args_dot=args_dot, start_moves=start_moves)
     determined = None
     if touches is not None:
         problem, determined = problem.with_found_contacts(touches)
@@ -227,7 +229,7 @@ class Problem(NamedTuple):
     - `args`: the arguments of the right-hand side. `discontinuities`: where steps end, or None.
     - `events`: the event functions. `settings`: the options of `simulate`.
     - `args_dot`: the direction in which `args` move if the errors of tangents are controlled, else None.
-    - `start_moves`: whether the start is differentiated.
+    - `start_moves`: whether the tangent that is controlled moves at the start.
     """
 
     system: System
@@ -285,8 +287,8 @@ class Problem(NamedTuple):
         """The errors of a tangent in all steps, None if they are not controlled."""
         if self.args_dot is None:
             return None
-        # The states of contacts have no tangent. A start that is not differentiated does not move: its tangent would
-        # hide a smaller one of a parameter, 1e-9 m/N for a heavy body for example.
+        # The states of contacts have no tangent. A tangent that moves at the start would hide a smaller one of a
+        # parameter, 1e-9 m/N for a heavy body for example.
         n = self.start.size - self.events.layout.memory_size if self.start_moves else 0
         noise = 10 * jnp.finfo(self.start.dtype).eps / controller.rtol
         probing = Probing(self.rates(True), generic(self.start, n), self.args_dot, constant(noise))
