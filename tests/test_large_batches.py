@@ -70,7 +70,7 @@ def test_elimination_in_large_batches_of_windows():
 
     def eliminated(R):
         windows = jnp.arange(len(R), dtype=jnp.int32)[:, None]
-        found = eliminate(Blocks(jnp.asarray(R), windows, n_z, 0, n_b), 0.0)
+        found = eliminate(Blocks(jnp.asarray(R), jnp.zeros((0, R.shape[-1] - n_z - n_b)), windows, n_z, 0, n_b), 0.0)
         z, b = found.back_substitute(jnp.arange(1.0, n_x + 1.0))
         return found.R.mT @ found.R, z, b
 

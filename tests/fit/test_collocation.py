@@ -12,7 +12,7 @@ import scipy.linalg
 from systems import Cart
 
 import jaxkane as jk
-from jaxkane.fit import Collocation, Delay, Free, Gain, Inertia, Offset, Trial, fit
+from jaxkane.fit import Collocation, Delay, Free, Gain, Inertia, JointPrior, Offset, Trial, fit
 
 pytest.importorskip("casadi")
 
@@ -51,7 +51,7 @@ def record(seed, density=0.0, sigma=(2e-3, 1e-2), t=T, **more):
 
 
 def by_collocation(trials, free=NAMES, guess=GUESS, unknown=("x", "x_dot"), **how):
-    options = {k: how.pop(k) for k in ("priors",) if k in how}
+    options = {k: how.pop(k) for k in ("priors", "constraints") if k in how}
     return fit(guess, trials, free, unknown=unknown, transcription=Collocation(**how), **options)
 
 
@@ -114,6 +114,19 @@ def test_gains_offsets_priors_and_several_trials():
         assert row["offset of x"] == pytest.approx(0.05, abs=0.01)
     held = by_collocation(trials, (*NAMES[1:], Free("mass", prior=(1.5, 1e-5))))
     assert held.estimates["mass"] == pytest.approx(1.5, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_collocation_and_simulation_use_the_same_priors():
+    """A normal, a log-normal and a joint prior that contradict the data: estimates within 0.5 %."""
+    normal, log_normal = Free(NAMES[0], prior=(1.2, 0.02)), Free(NAMES[1], prior=("lognormal", 5.0, 0.02))
+    joint = {"constraints": [JointPrior({NAMES[2]: 0.8, NAMES[1]: 5.0}, [[1e-3, 0.0], [0.0, 1.0]])]}
+    trial, free = record(1), (normal, log_normal, NAMES[2])
+    found = by_collocation(trial, free, **joint)
+    other = fit(GUESS, trial, free, unknown=("x", "x_dot"), **joint)
+    assert other.cost > 1.2 * fit(GUESS, trial, NAMES, unknown=("x", "x_dot")).cost
+    assert found.cost == pytest.approx(other.cost, rel=5e-3)
+    assert [*found.estimates.values()] == pytest.approx([*other.estimates.values()], rel=5e-3)
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ def blocks_in(units, n_z=1):
     A = np.random.default_rng(0).normal(size=(2, 20, n_z + len(units) + 1))
     A[:, :, n_z:-1] *= units
     R = jnp.linalg.qr(jnp.asarray(A), mode="r")
-    return A, Blocks(R, jnp.array([[0, 1]]), n_z, 0, 0)
+    return A, Blocks(R, jnp.zeros((0, R.shape[-1] - n_z)), jnp.array([[0, 1]]), n_z, 0, 0)
 
 
 @pytest.mark.parametrize("units", [(1.0, 1.0, 1.0), (1e-6, 1e3, 1.0)])

@@ -407,7 +407,7 @@ def test_a_parameter_determined_by_one_trial_has_no_clustered_error(kicked):
 
 def test_the_score_test_of_a_parameter_determined_by_one_trial(kicked):
     """The score test of a parameter that one trial determines is formal if residuals are white; else it is 1."""
-    rows = linearized_problem(kicked.problem, kicked.linearization, kicked.point)
+    rows = linearized_problem(kicked.linearization)
     rows.data[..., -1] -= rows.data[..., 2]  # about a point where the parameter is one less
     score = {c: score_test(rows, [0, 1], [2], degrees_of_freedom=150, correlation=c) for c in (0.0, 0.3)}
     assert score[0.0].degrees_of_freedom is None

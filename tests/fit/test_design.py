@@ -6,7 +6,7 @@ import pytest
 from slopes import differences, slopes
 from systems import Track
 
-from jaxkane.fit import LeastSquares, Offset, Problem, Trial, design, minimize
+from jaxkane.fit import Free, LeastSquares, Linear, Offset, Problem, Trial, design, minimize
 from jaxkane.fit.result.design import Design, covariance_of, objective_of
 
 t = np.arange(0.0, 4.0, 0.1)
@@ -86,6 +86,18 @@ def test_a_designed_input_reduces_the_standard_errors_as_predicted():
     assert seen.cost < 1e-12
     of_fit = np.sqrt(np.diag(np.linalg.inv(seen.identifiability.information)))
     assert list(plan.standard_errors.values()) == pytest.approx(of_fit, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_a_design_has_the_errors_of_a_fit_with_the_same_priors():
+    """A log-normal prior and a constraint, both much better than the data."""
+    free = (Free("gain", bounds=(0.0, None), prior=("lognormal", 1.0, 1e-3)), "drift")
+    known = {"constraints": [Linear({"gain": 1.0, "drift": 1.0}, 1.0, 2e-3)]}
+    plan = design(Track(), t[:11], push, C, free, sigma=SIGMA, initial={"x": 0.1}, steps=0, **known)
+    seen = minimize(Problem.of(Track(), plan.trial, free, **known), LeastSquares())
+    errors = [*plan.standard_errors.values()]
+    assert errors == pytest.approx(seen.identifiability.given_sigma_errors, rel=1e-6)
+    assert errors == pytest.approx([1e-3, 5**0.5 * 1e-3], rel=0.05)
 
 
 @pytest.mark.weekly

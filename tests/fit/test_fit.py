@@ -93,7 +93,9 @@ def test_elimination_equals_the_dense_solution():
     windows = jnp.array([[0, 1, W], [2, 3, 4]])
     k = n_z + n_b + n_x + 1
     A = rng.normal(size=(W, 20, k))
-    blocks = Blocks(jnp.linalg.qr(jnp.asarray(A), mode="r"), windows, n_z, 0, n_b)
+    blocks = Blocks(
+        jnp.linalg.qr(jnp.asarray(A), mode="r"), jnp.zeros((0, A.shape[-1] - n_z - n_b)), windows, n_z, 0, n_b
+    )
     eliminated = eliminate(blocks, 0.0)
     x, least = eliminated.step(1e-14)
     z, b = eliminated.back_substitute(x)

@@ -84,6 +84,9 @@ def test_a_measured_sum_and_a_joint_prior_equal_least_squares_rows(trial):
     assert joint.cost == pytest.approx(np.sum((A @ best - trial.measured["x"] / 0.05) ** 2)
                                        + np.sum((rows @ best - L @ [0.2, 1.0]) ** 2), rel=1e-9)  # fmt: skip
     assert "No evidence" in laplace(joint).message
+    # The priors of parameters are not part of the likelihood.
+    square, each = np.sum((A @ best - trial.measured["x"] / 0.05) ** 2), np.log(0.05 * np.sqrt(2 * np.pi))
+    assert joint.marginal_likelihood() == pytest.approx(-square / 2 - T.size * each, rel=1e-9)
 
 
 @pytest.mark.weekly
@@ -96,7 +99,7 @@ def test_the_cost_and_the_log_density_include_constraint_residuals(trial):
         point = more.at({"gain": 1.1, "drift": 0.4})
         assert more.cost(point) - plain.cost(point) == pytest.approx((0.4 / 0.1) ** 2, rel=1e-6)
     density = more.log_density()
-    value, slope = jax.value_and_grad(density)(point)
+    value, slope = jax.jit(jax.value_and_grad(density))(point)
     assert float(value - density(more.start)) == pytest.approx(
         -(more.cost(point) - more.cost(more.start)) / 2, rel=1e-9
     )

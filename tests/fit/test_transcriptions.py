@@ -58,7 +58,9 @@ def test_elimination_of_chained_windows_equals_the_dense_solution():
     k = 2 * n_z + n_b + n_x + 1
     A = rng.normal(size=(W, 20, k))
     A[[2, 4], :, n_z : 2 * n_z] = 0.0  # the last windows have no next
-    blocks = Blocks(jnp.linalg.qr(jnp.asarray(A), mode="r"), windows, n_z, n_z, n_b)
+    blocks = Blocks(
+        jnp.linalg.qr(jnp.asarray(A), mode="r"), jnp.zeros((0, A.shape[-1] - 2 * n_z - n_b)), windows, n_z, n_z, n_b
+    )
     eliminated = eliminate(blocks, 0.0)
     x, least = eliminated.step(1e-14)
     z, b = eliminated.back_substitute(x)

@@ -193,7 +193,8 @@ class CollocationFit:
     - `motions`: the estimated states and inputs at the samples (n_t,), by trial and name.
         All three are NaN at the first samples that `Delay(bounds=...)` excludes.
     - `status`, `message`: why the search ended, as a word and as a sentence.
-    - `ok`: whether the search converged and the data determine all parameters.
+    - `ok`: whether the search converged and the data determine all parameters. The error of the mesh is not checked:
+        increase `intervals_per_sample` until the estimates do not change.
     """
 
     problem: Problem

@@ -108,8 +108,7 @@ class Priors(eqx.Module):
     parameters: Parameters
 
     def __call__(self, data: Any, x: Array) -> Array:
-        joint = jnp.sum(jnp.asarray(self.parameters.joint_residuals(x)) ** 2)
-        return (jnp.sum(jnp.asarray(self.parameters.prior_residuals(x)) ** 2) + joint)[None]
+        return jnp.sum(jnp.asarray(self.parameters.prior_residuals(x)) ** 2)[None]
 
 
 class Deviations(eqx.Module):

@@ -136,11 +136,9 @@ class Model:
 
         **Raises:** `ValueError` if the residuals do not have finite derivatives at the minimum.
         """
-        at = without_priors(fit.problem).linearize(fit.point) if fit.parameters.has_prior.any() else fit.linearization
-        if at is None or not usable(at):
+        if not usable(fit.linearization):
             raise ValueError("the residuals have no finite derivatives at its minimum")
-        # `linearized_problem` adds the rows of the priors. If `at` contained them too, they would be counted twice.
-        linearized, correlation = linearized_problem(fit.problem, at, fit.point), _correlation(fit)
+        linearized, correlation = linearized_problem(fit.linearization), _correlation(fit)
         at_bound = fit.identifiability.at_bound
         free = [i for i, name in enumerate(fit.names) if name not in at_bound]
         held_out = None if folds is None else linearized.costs_left_out(free, folds)
@@ -185,11 +183,6 @@ class Model:
 def _correlation(fit: Fit) -> float:
     """The largest serial correlation of all channels, because a candidate may act on only that channel."""
     return max(serial_correlation(fit.residuals).values())
-
-
-def without_priors(problem: Problem) -> Problem:
-    """The same problem without priors of parameters. Nothing is recompiled."""
-    return problem.with_priors(dict.fromkeys(problem.parameters.names, (0.0, math.inf)))
 
 
 class Round(NamedTuple):
@@ -369,15 +362,16 @@ class Search:
         order = [c.name for c in self.terms.all]  # a fixed order, so that all rounds share a compiled program
         both = sorted((*model.terms, *members), key=lambda c: order.index(c.name))
         problem, point = augmented_problem(self.terms.base, (model.problem, model.point, model.names), both)
-        at = without_priors(problem).linearize(point)
+        at = problem.linearize(point)
         if at is None or not usable(at):
             raise ValueError("the simulation fails at its initial guess")
-        names, linearized = problem.parameters.names, linearized_problem(problem, at, point)
+        names, linearized = problem.parameters.names, linearized_problem(at)
         own = {c.name: [names.index(name) for name in c.names(problem.system)] for c in both}
         of_terms = {i for places in own.values() for i in places}
         base = [i for i, name in enumerate(names) if name in model.names and i not in of_terms]
         free = [names.index(name) for name in model.names]
-        cost = at.cost + float(np.sum(linearized.priors[free, -1] ** 2))
+        of_priors = linearized.priors[[*free, *range(len(names), len(linearized.priors))], -1]
+        cost = at.cost - at.prior_squares + float(np.sum(of_priors**2))
         # The absolute tolerance is for simulated measurements, whose cost is almost zero.
         nested = abs(cost - model.cost) <= NESTED * model.cost + 1e-9
         at_bound = [names.index(name) for name in model.at_bound]

@@ -226,7 +226,6 @@ def _projection(
         row = np.zeros(len(base.places))
         row[base.fixed] = 10.0 * np.sqrt(max(eigenvalues.max(initial=0.0), 1e-300))
         root = np.vstack([root, row])
-    has_prior = parameters.has_prior
     # `least_squares` calls `residuals` and `slopes` at the same x. Both come from one evaluation.
     memory: dict[bytes, Any] = {}
 
@@ -239,11 +238,11 @@ def _projection(
 
     def residuals(x: Any) -> np.ndarray:
         values, priors = evaluate(x)[0]
-        return np.concatenate([root @ (base.of(values) - base.estimates), _PULL * x, priors[has_prior]])
+        return np.concatenate([root @ (base.of(values) - base.estimates), _PULL * x, priors])
 
     def slopes(x: Any) -> np.ndarray:
         values, priors = evaluate(x)[1]
-        return np.vstack([root @ base.matrix @ values, _PULL * np.eye(len(x)), priors[has_prior]])
+        return np.vstack([root @ base.matrix @ values, _PULL * np.eye(len(x)), priors])
 
     jac: Any = slopes
     x = least_squares(residuals, np.zeros(len(parameters.names)), jac, method="trf", x_scale=1.0, max_nfev=200).x

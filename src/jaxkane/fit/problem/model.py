@@ -366,26 +366,25 @@ class Model(eqx.Module):
         end = packed_motion(ride.state())
         following = self.known(window.next_start, calibration)
         jump = jnp.where(window.linked > 0, (end - following)[self.unknown_places] / n.defect_std, 0.0)
-        priors, cost = self.priors(window, z, b, x), None
+        priors, cost = self.priors(window, z, b), None
         if self.errors is not None:
             _, difference, cost = self.errors.whitened(difference, window.weight)
             cost = cost + jnp.sum(priors**2)
         rows = [difference.ravel(), *([jump] if n.has_defects else []), priors]
         return jnp.concatenate(rows), Prediction(simulated, ride.status, cost=cost)
 
-    def priors(self, window: Windows, z: Array, b: Array, x: Array) -> Array:
-        """Prior residuals of initial states, unknowns of the trial and parameters, divided by standard deviations."""
+    def priors(self, window: Windows, z: Array, b: Array) -> Array:
+        """Prior residuals of the initial state and of the unknowns of the trial, divided by standard deviations."""
         n = self.nuisance
         # A prior with infinite standard deviation gives a row of zeros. The prior of a trial is counted only in its
         # first window. With `defect_std`, the same applies to the prior of the initial state.
         of_start = jnp.where(window.first, z / n.start_deviation, 0.0) if n.has_defects else z / n.start_deviation
         of_trial = jnp.where(window.first, b / n.trial_deviation, 0.0)
-        of_all = jnp.where(window.very_first, self.parameters.prior_residuals(x), 0.0)
         # Initial states are normalized, so the measurements do not determine the norm of unknown Euler parameters. This
         # row sets it to one. At a minimum the row is zero, so it adds nothing to the cost.
         raw = window.start.at[self.unknown_places].add(z[: len(n.start)])
         of_norms = jnp.array([(raw[np.array(four)] @ raw[np.array(four)] - 1) / 2 for four in self.norms], z.dtype)
-        return jnp.concatenate([of_start, of_trial, of_all, of_norms])
+        return jnp.concatenate([of_start, of_trial, of_norms])
 
 
 def _gain_and_offset(of: str, name: str, calibration: Calibration, dtype: Any) -> tuple[Array, Array]:

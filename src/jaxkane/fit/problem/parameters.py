@@ -98,8 +98,11 @@ class Parameters(eqx.Module):
     @property
     def has_prior(self) -> np.ndarray:
         """Whether each parameter (p,) has a prior, separate or joint."""
-        n, joint = self.rest.size, np.any(np.asarray(self.joint_matrix) != 0, axis=0)
-        return np.isfinite(np.asarray(self.prior_deviation)) | (joint[:n] | joint[n:])[np.asarray(self.places)]
+        return np.isfinite(np.asarray(self.prior_deviation)) | self._in_rows(slice(None))[np.asarray(self.places)]
+
+    def _in_rows(self, rows: Any) -> np.ndarray:
+        """Whether each parameter, free or fixed, is part of these joint priors."""
+        return np.any(np.asarray(self.joint_matrix)[rows] != 0, axis=0).reshape(2, -1).any(axis=0)
 
     @property
     def has_distribution(self) -> np.ndarray:
@@ -108,8 +111,7 @@ class Parameters(eqx.Module):
         rows = np.zeros(len(self.joint_target), bool)
         for _, first, last in self.distributions:
             rows[first:last] = True
-        used = np.any(np.asarray(self.joint_matrix)[rows] != 0, axis=0).reshape(2, -1).any(axis=0)
-        return (own & used)[np.asarray(self.places)]
+        return (own & self._in_rows(rows))[np.asarray(self.places)]
 
     @property
     def has_groups(self) -> bool:
@@ -324,33 +326,33 @@ class Parameters(eqx.Module):
                 leaves[number] = new if leaf.ndim == 0 else jnp.ravel(leaf).at[place].set(new).reshape(leaf.shape)
         return jax.tree.unflatten(structure, leaves), calibration
 
-    def prior_residuals(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
-        """(value - mean) / deviation; zero without a prior."""
-        numbers = self.values(x), self.prior_mean, self.prior_deviation
-        if _are_traced(numbers):
-            return (numbers[0] - numbers[1]) / numbers[2]
-        value, mean, deviation = map(np.asarray, numbers)
-        return on_device((value - mean) / deviation)
-
-    def joint_residuals(self, x: Float[Array, " p"]) -> Array:
-        """The residuals (k,) of joint priors and of priors of logarithms."""
-        if not self.joint_target.size:
-            return jnp.zeros(0, self.start.dtype)
-        values = jnp.asarray(self.all_values(x))
-        # A parameter without a log-normal prior may be negative. Its factor of zero times NaN would be NaN.
-        both = jnp.concatenate([values, jnp.log(jnp.where(self._logarithmic, values, 1.0))])
-        return (self.joint_matrix @ both - self.joint_target) / self.joint_deviation
-
-    def joint_slopes(self, x: Float[Array, " p"]) -> np.ndarray:
-        """d joint_residuals / d x (k, p)."""
-        matrix, n = np.asarray(self.joint_matrix, float), self.rest.size
-        values, slopes = np.asarray(self.all_values(x), float), np.asarray(self.all_slopes(x), float)
-        by_values = matrix[:, :n] + matrix[:, n:] / np.where(np.asarray(self._logarithmic), values, 1.0)
-        return by_values @ slopes[:, np.asarray(self.places)] / np.asarray(self.joint_deviation, float)[:, None]
-
     @property
-    def _logarithmic(self) -> Array:
-        return jnp.any(self.joint_matrix[:, self.rest.size :] != 0, axis=0)
+    def prior_terms(self) -> tuple[Any, Any, Any]:
+        """Matrix (p + k, 2 all), targets and standard deviations (p + k,) of all priors: one row per parameter, with an
+        infinite standard deviation without a prior, followed by the joint priors."""
+        xp = _numpy_of(self)
+        n, matrix, join = self.rest.size, xp.asarray(self.joint_matrix), xp.concatenate
+        own = xp.eye(n, 2 * n, dtype=matrix.dtype)[xp.asarray(self.places)]
+        targets, deviations = (self.prior_mean, self.joint_target), (self.prior_deviation, self.joint_deviation)
+        return join([own, matrix]), *(join([*map(xp.asarray, pair)]) for pair in (targets, deviations))
+
+    def prior_residuals(self, x: Float[Array, " p"]) -> Any:
+        """(matrix [values, log values] - target) / deviation (p + k,) of all priors; zero without a prior."""
+        (matrix, target, deviation), xp = self.prior_terms, _numpy_of(self, x)
+        values = xp.asarray(self.all_values(x))
+        return (matrix @ xp.concatenate([values, xp.log(self._positive(values))]) - target) / deviation
+
+    def prior_rows(self, x: Float[Array, " p"]) -> Any:
+        """The derivatives of `prior_residuals` by x, followed by the residuals: (p + k, p + 1)."""
+        (matrix, _, deviation), xp, n = self.prior_terms, _numpy_of(self, x), self.rest.size
+        by_values = matrix[:, :n] + matrix[:, n:] / self._positive(xp.asarray(self.all_values(x)))[None]
+        slopes = by_values @ xp.asarray(self.all_slopes(x))[:, xp.asarray(self.places)]
+        return xp.column_stack([slopes / deviation[:, None], self.prior_residuals(x)])
+
+    def _positive(self, values: Any) -> Any:
+        """The values (all,) with a prior of their logarithm; 1 for the others, which may be negative."""
+        xp = _numpy_of(self, values)
+        return xp.where(xp.any(xp.asarray(self.joint_matrix)[:, self.rest.size :] != 0, axis=0), values, 1.0)
 
     def sums(self, x: Float[Array, " p"]) -> np.ndarray:
         """All values (all,), in which each exact sum or inequality replaces one parameter."""
@@ -397,8 +399,7 @@ class Parameters(eqx.Module):
         """
         parts = [self._parts(np.asarray(x, float)) for x in self._all_priors]
         constants = [f.log_prior_constants(*pair) for f, *pair in zip(self.bijections, *parts, strict=True)]
-        n, joint = self.rest.size, np.any(np.asarray(self.joint_matrix) != 0, axis=0)
-        alone = ~(joint[:n] | joint[n:]) & (self.mixing is None)
+        alone = ~self._in_rows(slice(None)) & (self.mixing is None)
         return np.where(alone, np.concatenate(constants), np.nan)[np.asarray(self.places)]
 
     def with_priors(self, priors: Mapping[str, Prior]) -> Parameters:
@@ -425,6 +426,10 @@ _slope = jax.jit(lambda bijection, x: jax.jacfwd(bijection)(x))
 
 def _are_traced(*numbers: Any) -> bool:
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(numbers))
+
+
+def _numpy_of(*numbers: Any) -> Any:
+    return jnp if _are_traced(numbers) else np
 
 
 def with_entries(every: Any, places: Any, some: Any) -> Any:

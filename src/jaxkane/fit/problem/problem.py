@@ -22,7 +22,7 @@ from ..._kane.consistent_state import NoConfiguration
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
 from ...estimate._process_noise import noise_of
-from ..solve.blocks import Blocks, triangle
+from ..solve.blocks import Blocks
 from ..solve.linearization import (
     Linearization,
     blocks_of,
@@ -34,7 +34,7 @@ from ..solve.step_refinement import finer
 from .declarations import Items, Prior, with_time_scales
 from .errors import Errors, errors_of
 from .from_declarations import is_eliminated, parameters_of
-from .model import Model, Prediction, Simulation, Unknowns
+from .model import Model, Simulation, Unknowns
 from .parameters import Parameters
 from .specification import (
     ProblemSpec,
@@ -281,8 +281,7 @@ class Problem:
         def finite(x):
             return int(np.isfinite(np.asarray(x)).sum())
 
-        residuals = int(np.sum(np.asarray(self.windows.weight) > 0)) + finite(self.parameters.prior_deviation)
-        residuals += self.parameters.joint_target.size
+        residuals = int(np.sum(np.asarray(self.windows.weight) > 0)) + finite(self.parameters.prior_terms[2])
         residuals += (T if n.has_defects else int(active.sum())) * finite(n.start_deviation) + T * finite(
             n.trial_deviation
         )
@@ -326,27 +325,10 @@ class Problem:
         if windows.shape != self.windows.shape:
             W, n_t = self.windows.t.shape
             R, prediction = jax.tree.map(lambda x: on_device(np.asarray(x)[:W]), (R, prediction.until(n_t)))
-        blocks = Blocks.of(self.model.nuisance, R, self.by_trial)
+        blocks = Blocks.of(self.model, R, self.by_trial, point.parameters)
         if self.parameters.size < at.parameters.size:
             blocks = blocks.of_x(self.parameters.places)
-        return Linearization(*self._with_joint_priors(blocks, prediction, point.parameters))
-
-    def _with_joint_priors(self, blocks: Blocks, prediction: Prediction, x: Array) -> tuple[Blocks, Prediction]:
-        """Add the joint priors of several parameters to the first window. They are not part of the compiled program of
-        a window."""
-        first = np.flatnonzero(np.asarray(self.windows.very_first))
-        if not first.size or not self.parameters.joint_target.size:
-            return blocks, prediction
-        i, r = first[0], np.asarray(self.parameters.joint_residuals(x))
-        R, rows = np.array(blocks.R), np.zeros((r.size, blocks.R.shape[-1]), blocks.R.dtype)
-        rows[:, -1 - blocks.n_x : -1], rows[:, -1] = self.parameters.joint_slopes(x), r
-        k = R.shape[-1]
-        R[i, -k:] = triangle(np.concatenate([R[i, -k:], rows]))  # the last triangle of a window contains its priors
-        if prediction.cost is not None:
-            cost = np.array(prediction.cost)
-            cost[i] += r @ r
-            prediction = dataclasses.replace(prediction, cost=on_device(cost))
-        return eqx.tree_at(lambda b: b.R, blocks, on_device(R)), prediction
+        return Linearization(blocks, prediction)
 
     def _arguments(self, point: Unknowns) -> tuple[Model, Windows, Unknowns]:
         """The arguments of compiled programs, which depend only on the shape of the windows.

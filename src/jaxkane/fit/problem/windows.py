@@ -61,7 +61,6 @@ class Windows(eqx.Module):
     - `linked` (W,): one if a defect links the window to the next one, else zero.
     - `trial` (W,): the index of the trial.
     - `first` (W,): whether the window is the first of its trial.
-    - `very_first` (W,): whether the window is the first of all.
     - `applies` (W, p): whether each parameter applies to the trial of the window.
     - `n_acting`: the maximum number of input samples that act within a window.
     """
@@ -78,7 +77,6 @@ class Windows(eqx.Module):
     linked: Float[Array, " W"]
     trial: Int[Array, " W"]
     first: Bool[Array, " W"]
-    very_first: Bool[Array, " W"]
     applies: Bool[Array, "W p"]
     n_acting: int = eqx.field(static=True)
 
@@ -255,7 +253,6 @@ def cut(
         linked=floats(np.array(linked, float)),
         trial=on_device(owner, np.int32),
         first=on_device(np.append(True, owner[1:] != owner[:-1])),
-        very_first=on_device(np.arange(len(owner)) == 0),
         applies=on_device(applies[owner]),
         n_acting=min(n_in, max(_most_within(trials[k].t, float(lasts)) for k, lasts in longest.items())),
     )

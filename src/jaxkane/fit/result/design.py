@@ -120,8 +120,8 @@ def design(
     - `limits`: by channel, the magnitude that it should not exceed.
     - `steps`, `rate`: number of steps and learning rate of Adam.
     - `progress`: whether to show a progress bar.
-    - `**options`: as in `fit`, such as `unknown` and `window`. With `window` alone, every window starts at `initial`.
-        With `defect_std`, the plan is one trajectory that is divided into windows.
+    - `**options`: as in `fit`, such as `unknown`, `constraints` and `window`. With `window` alone, every window starts
+        at `initial`. With `defect_std`, the plan is one trajectory that is divided into windows.
 
     **Returns:** a `Design` at the best coefficients of the search. Print it for a table.
 
@@ -325,7 +325,8 @@ def _information(
         return _schur_complement(N.at[places[:, None], places[None, :]].add(known), n_z), None
 
     known, _ = jax.lax.scan(step, jnp.zeros((places.size, places.size), N.dtype), N)
-    information = _schur_complement(known[n_next:, n_next:], n_b)
+    priors = model.parameters.prior_rows(point.parameters)[:, :-1]
+    information = _schur_complement(known[n_next:, n_next:], n_b) + priors.T @ priors
     slopes = model.parameters.slopes(point.parameters)
     to_x = jnp.linalg.solve(slopes, jnp.diag(jnp.linalg.norm(slopes, axis=1)))
     return to_x.T @ information @ to_x, simulated

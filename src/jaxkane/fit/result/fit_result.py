@@ -138,8 +138,8 @@ class Fit(FitState):
 
     @property
     def _log_likelihood(self) -> float:
-        squares = float(np.sum(statistics.prior_rows(self.problem, self.point)[0][:, :, -1] ** 2))
-        return statistics.log_likelihood(self.problem, self.cost - squares)
+        of_nuisance = float(np.sum(statistics.nuisance_prior_rows(self.problem, self.point)[0][:, :, -1] ** 2))
+        return statistics.log_likelihood(self.problem, self.cost - self.linearization.prior_squares - of_nuisance)
 
     @property
     def measurement_errors(self) -> dict[str, dict[str, float]]:
@@ -563,7 +563,7 @@ class Fit(FitState):
         T = len(self.problem.trials)
         if T < 2 or self.problem.model.has_likelihood or self.status not in diagnostics.AT_A_MINIMUM:
             return math.nan
-        linearized = linearized_problem(self.problem, self.linearization, self.point, without_priors=True)
+        linearized = linearized_problem(self.linearization)
         free = [i for i, name in enumerate(self.names) if name not in self.identifiability.at_bound]
         cost = float(np.sum(linearized.costs_left_out(free, folds_of(None, T))))
         return cost if math.isfinite(cost) else math.nan

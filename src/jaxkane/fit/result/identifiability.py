@@ -184,7 +184,7 @@ def identifiability_at(
     to_x = np.linalg.pinv(to_values / scales[:, None], rcond=1e-9)
     eliminated = eliminate(at.blocks, 0.0)
     A = eliminated.rows[0] @ to_x
-    before = np.linalg.norm(np.asarray(at.blocks.R)[:, :, -1 - p : -1] @ to_x, axis=(0, 1))
+    before = np.linalg.norm(at.blocks.of_parameters @ to_x, axis=0)
     eps = float(jnp.finfo(eliminated.R.dtype).eps)
     most = before.max(initial=0.0)
     no_influence = before <= 1e4 * eps * most

@@ -5,12 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-import equinox as eqx
 import numpy as np
 
 from ..._scalarjit.compat import on_device
-from ..problem.model import Unknowns
-from ..problem.problem import Problem
 from ..solve.blocks import Blocks, eliminate
 from ..solve.linearization import Linearization
 from .statistics import (
@@ -21,7 +18,6 @@ from .statistics import (
     f_test,
     formal_covariance,
     jackknife,
-    prior_rows,
     wald_test,
 )
 
@@ -82,46 +78,18 @@ class LinearizedProblem:
         return np.array(costs)
 
 
-def linearized_problem(
-    problem: Problem,
-    at: Linearization,
-    point: Unknowns,
-    b: Sequence[int] | None = None,
-    without_priors: bool = False,
-) -> LinearizedProblem:
-    """A linearization for which priors of parameters are separate, with nuisance parameters eliminated.
+def linearized_problem(at: Linearization, b: Sequence[int] | None = None) -> LinearizedProblem:
+    """A linearization with nuisance parameters eliminated.
 
-    **Arguments:**
-
-    - `b`: trial unknowns that are eliminated together with the initial states, None for all. Others are fixed.
-    - `without_priors`: whether to remove the priors of parameters from `at`. Otherwise it must not contain any.
+    `b`: trial unknowns that are eliminated together with the initial states, None for all. Others are fixed.
     """
-    blocks, parameters = at.blocks, problem.parameters
-    if without_priors and parameters.has_prior.any():
-        blocks = _without_priors(blocks, prior_rows(problem, point)[0])
+    blocks = at.blocks
     b = range(blocks.n_b) if b is None else b
     first = blocks.n_z + blocks.n_next
     columns = [*range(first), *(first + i for i in b), *range(first + blocks.n_b, blocks.R.shape[-1])]
     R = on_device(np.asarray(blocks.R)[:, :, columns])
-    reduced = eliminate(Blocks(R, blocks.windows, blocks.n_z, blocks.n_next, len(b)), 0.0)
-    slopes = np.asarray(parameters.slopes(point.parameters)) / np.asarray(parameters.prior_deviation, float)[:, None]
-    priors = np.column_stack([slopes, np.asarray(parameters.prior_residuals(point.parameters))])
-    joint = parameters.joint_slopes(point.parameters), np.asarray(parameters.joint_residuals(point.parameters))
-    priors = np.concatenate([priors, np.column_stack(joint)])
-    return LinearizedProblem(reduced.R.astype(float), priors, blocks.column_norms.astype(float))
-
-
-def _without_priors(blocks: Blocks, rows: np.ndarray) -> Blocks:
-    """The blocks without the priors of parameters in the `rows` (W, m, k) of priors. They are subtracted from R^T R."""
-    R, rows = np.array(blocks.R, float), rows[:, blocks.n_z + blocks.n_b :]
-    for w in np.flatnonzero(np.any(rows, axis=(1, 2))):
-        squares = R[w].T @ R[w] - rows[w].T @ rows[w]
-        scale = np.sqrt(np.maximum(squares.diagonal(), np.finfo(float).tiny))
-        # No Cholesky decomposition: by rounding, the difference may have slightly negative eigenvalues.
-        values, V = np.linalg.eigh(squares / np.outer(scale, scale))
-        R[w] = 0.0
-        R[w, : len(V)] = np.sqrt(np.maximum(values, 0.0))[:, None] * V.T * scale
-    return eqx.tree_at(lambda blocks: blocks.R, blocks, R.astype(blocks.R.dtype))
+    reduced = eliminate(Blocks(R, blocks.priors, blocks.windows, blocks.n_z, blocks.n_next, len(b)), 0.0)
+    return LinearizedProblem(reduced.R.astype(float), reduced.priors.astype(float), blocks.column_norms.astype(float))
 
 
 def _rank(A: np.ndarray) -> int:

@@ -125,8 +125,8 @@ def _undetermined_nuisance(problem: Problem, eliminated: Eliminated) -> str:
 
 def marginal_likelihood(fit: Any) -> float:
     """See `Fit.marginal_likelihood`."""
-    problem, priors = fit.problem, float(np.sum(np.asarray(fit.parameters.prior_residuals(fit.point.parameters)) ** 2))
-    eliminated = eliminate(fit.linearization.blocks, 0.0)
+    problem, at = fit.problem, fit.linearization
+    eliminated = eliminate(at.blocks, 0.0)
     number = sum(map(np.count_nonzero, eliminated.informed))
     volume = 0.5 * number * LOG_2PI - 0.5 * eliminated.log_determinant
-    return log_likelihood(problem, fit.cost - priors) + log_nuisance_priors(problem) + volume
+    return log_likelihood(problem, fit.cost - at.prior_squares) + log_nuisance_priors(problem) + volume

@@ -101,7 +101,7 @@ def read_fit(path: Path, problem: Problem) -> FitState:
     state: dict[str, Any] = {name: tree_of(path, arrays, name, tree) for name, tree in like.items()}
     point, model = state["point"], dataclasses.replace(problem.model, errors=state["errors"])
     problem = dataclasses.replace(problem, model=model)
-    at = Linearization(Blocks.of(problem.model.nuisance, state["R"], problem.by_trial), state["prediction"])
+    at = Linearization(Blocks.of(model, state["R"], problem.by_trial, point.parameters), state["prediction"])
     if saved["program"] != key["program"]:
         now = problem.cost(point)
         if not abs(now - at.cost) <= SAME_COST * at.squares:

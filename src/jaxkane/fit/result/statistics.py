@@ -213,16 +213,17 @@ def clustered(problem: Problem, point: Unknowns, at: Linearization, directions: 
         clusters, shared = owner, np.zeros((len(problem.trials), 0), int)
         if kind == "window":  # treat each as a trial; trial unknowns are shared
             clusters, shared = np.arange(W, dtype=np.int32), of_b
-            blocks = Blocks(blocks.R, jnp.asarray(clusters[:, None]), n_z, 0, 0)
+            blocks = Blocks(blocks.R, blocks.priors, jnp.asarray(clusters[:, None]), n_z, 0, 0)
         data = squares(eliminate(blocks, 0.0).R.astype(float))
-        of_priors = np.zeros_like(data)
-        c, joint = shared.shape[1] + p + 1, problem.parameters.joint_target.size
-        np.add.at(of_priors, clusters, squares(prior_rows(problem, point)[0][:, -c + 1 - joint :, -c:]))
+        of_priors, n = np.zeros_like(data), shared.shape[1]
+        rows = nuisance_prior_rows(problem, point)[0]
+        np.add.at(of_priors, clusters, squares(rows[:, rows.shape[1] - n :, -n - p - 1 :]))
         data, used = (data - of_priors)[:, None], np.isin(np.arange(len(data)), clusters[measured])[:, None]
     first = int(shared.max(initial=-1)) + 1
     places = np.column_stack([shared, np.tile(np.arange(first, first + k), (len(shared), 1))])
     P = np.zeros((first + k, first + k))
     np.add.at(P, (places[:, :, None], places[:, None, :]), of_priors[:, :-1, :-1])
+    P[first:, first:] += squares(np.asarray(blocks.priors, float))[:-1, :-1]
     return Clusters(data[used][:, :-1, :-1], data[used][:, :-1, -1], places[np.nonzero(used)[0]], P)
 
 
@@ -248,40 +249,24 @@ def bootstrap_steps(clusters: Clusters, rng: np.random.Generator, n: int) -> np.
     return -np.einsum("rij,rj->ri", inverse, ((weights - 1) @ scores + of_priors) / scale) / scale
 
 
-def prior_rows(problem: Problem, point: Unknowns, random: bool = True) -> tuple[np.ndarray, int]:
-    """The rows (W, n_z + n_b + m, n) of all priors, and the number of priors.
+def nuisance_prior_rows(problem: Problem, point: Unknowns) -> tuple[np.ndarray, int]:
+    """The rows (W, n_z + n_b, n) of the priors of initial states and trial unknowns, and their number.
 
-    The columns are those of a window's block [z, z_next, b, x, r]. Rows without a prior are zero. `random`: whether to
-    include the distributions over groups. Their standard deviations are relative to that of the residuals, so they are
-    treated as data if the residuals are rescaled.
+    The columns are those of a window's block [z, z_next, b, x, r]. Rows without a prior are zero.
     """
-    parameters, windows, nuisance = problem.parameters, problem.windows, problem.model.nuisance
-    measured, owner = problem.active_windows, np.asarray(windows.trial)
-    z, b, x = (
-        np.asarray(u, float)
-        for u in (point.window_starts, point.trial_unknowns, parameters.prior_residuals(point.parameters))
-    )
+    windows, nuisance, measured = problem.windows, problem.model.nuisance, problem.active_windows
+    owner = np.asarray(windows.trial)
+    z, b = np.asarray(point.window_starts, float), np.asarray(point.trial_unknowns, float)[owner]
     of_trial = np.asarray(windows.first) & np.isin(owner, owner[measured])
-    counts = (of_trial if nuisance.has_defects else measured, of_trial, np.asarray(windows.very_first))
-    deviations = [np.asarray(d, float) for d in (nuisance.start_deviation, nuisance.trial_deviation)]
-    residuals = (z / deviations[0], b[owner] / deviations[1], np.broadcast_to(x, (len(owner), len(x))))
-    deviations.append(np.asarray(parameters.prior_deviation, float))
-    of_x = np.asarray(parameters.slopes(point.parameters), float) / deviations[2][:, None]
-    joint = np.asarray(parameters.joint_residuals(point.parameters), float)
-    residuals = (*residuals[:2], np.broadcast_to(np.append(x, joint), (len(owner), len(x) + len(joint))))
-    of_x = np.concatenate([of_x, parameters.joint_slopes(point.parameters)])
-    counted_joint = np.ones(len(joint))
-    for _, begin, end in parameters.distributions:
-        counted_joint[begin:end] = np.inf if not random else 1.0
-    deviations[2] = np.append(deviations[2], counted_joint)
-    slopes = np.asarray(scipy.linalg.block_diag(*(np.diag(1.0 / d) for d in deviations[:2]), of_x))
+    counted = [(of_trial if nuisance.has_defects else measured, z), (of_trial, b)]
+    counted = np.concatenate([np.tile(c[:, None], values.shape[1]) for c, values in counted], axis=1)
+    deviations = np.asarray(jnp.concatenate([nuisance.start_deviation, nuisance.trial_deviation]), float)
+    counted &= np.isfinite(deviations)
     n_z, n_next = z.shape[1], z.shape[1] if nuisance.has_defects else 0
-    slopes = np.insert(slopes, [n_z] * n_next, 0.0, axis=1)
-    known = np.isfinite(np.concatenate(deviations))
-    counted = np.concatenate([np.tile(c[:, None], r.shape[1]) for c, r in zip(counts, residuals, strict=True)], axis=1)
-    counted &= known
+    slopes = np.insert(np.diag(1.0 / deviations), [n_z] * n_next, 0.0, axis=1)
+    slopes = np.pad(slopes, ((0, 0), (0, point.parameters.size)))
     slopes = np.broadcast_to(slopes, (len(owner), *slopes.shape))
-    rows = np.concatenate([slopes, np.hstack(residuals)[..., None]], axis=2)
+    rows = np.concatenate([slopes, (np.hstack([z, b]) / deviations)[..., None]], axis=2)
     return counted[..., None] * rows, int(counted.sum())
 
 
@@ -304,15 +289,19 @@ class PriorInformation(NamedTuple):
 
 def prior_information(problem: Problem, point: Unknowns, eliminated: Eliminated) -> PriorInformation:
     """The information of the priors of a problem whose linearization at the point is `eliminated`."""
-    (rows, number), blocks, p = prior_rows(problem, point, False), eliminated.blocks, point.parameters.shape[0]
-    n_nuisance, determined = blocks.n_z + blocks.n_b, 0.0
-    of_x, of_nuisance = rows[:, n_nuisance:, -p - 1 : -1], rows[:, :n_nuisance]
-    information = np.einsum("wmi,wmj->ij", of_x, of_x)
+    (of_nuisance, number), parameters = nuisance_prior_rows(problem, point), problem.parameters
+    blocks, p, determined = eliminated.blocks, parameters.size, 0.0
+    # The standard deviations of distributions over groups are relative to that of the residuals, so these are treated
+    # as data if the residuals are rescaled.
+    parameters = parameters.with_deviations(np.full(len(parameters.distributions), np.inf))
+    rows = parameters.prior_rows(point.parameters).astype(float)
+    number += int(np.isfinite(parameters.prior_terms[2]).sum())
+    information, squares = rows[:, :-1].T @ rows[:, :-1], np.sum(rows[:, -1] ** 2)
     if of_nuisance.any():
         still, *moved = (eliminated.back_substitute(x) for x in np.eye(p + 1, p, -1, dtype=point.parameters.dtype))
         z, b = (np.array([new - old for new in news]).T for *news, old in zip(*moved, still, strict=True))  # by x
         follow = np.concatenate([z.swapaxes(0, 1), b.swapaxes(0, 1)[np.asarray(problem.windows.trial)]], axis=1)
-        places = [*range(blocks.n_z), *range(blocks.n_z + blocks.n_next, rows.shape[2] - p - 1)]
+        places = [*range(blocks.n_z), *range(blocks.n_z + blocks.n_next, of_nuisance.shape[2] - p - 1)]
         J = of_nuisance[:, :, places] @ follow
         information += np.einsum("wmi,wmj->ij", J, J)
         # d log det (N + e P) / de = tr (P N^-1), of initial states and trial unknowns
@@ -320,7 +309,7 @@ def prior_information(problem: Problem, point: Unknowns, eliminated: Eliminated)
         R = np.linalg.qr(np.concatenate([np.asarray(blocks.R), e**0.5 * of_nuisance], axis=1), mode="r")
         with_more = eliminate(eqx.tree_at(lambda blocks: blocks.R, blocks, R.astype(blocks.R.dtype)), 0.0)
         determined = (with_more.log_determinant - eliminated.log_determinant) / e
-    return PriorInformation(information, determined, number, float(np.sum(rows[:, :, -1] ** 2)))
+    return PriorInformation(information, determined, number, float(squares + np.sum(of_nuisance[:, :, -1] ** 2)))
 
 
 def intervals(parameters: Parameters, x: Array, half: np.ndarray) -> list[tuple[float, float]]:

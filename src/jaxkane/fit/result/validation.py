@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..._common.lookup import positive_number
@@ -148,8 +147,8 @@ def _joined(problem: Problem, fits: Sequence[Fit]) -> Fit:
     prediction = joined(lambda one: one.linearization.prediction)
     # The number of triangular factors per window depends on the number of windows. QR reduces all to one factor.
     R = joined(lambda one: np.linalg.qr(np.asarray(one.linearization.blocks.R), mode="r"))
-    at = Linearization(Blocks.of(problem.model.nuisance, R, problem.by_trial), prediction)
     point = Unknowns(fits[0].point.parameters, b, z)
+    at = Linearization(Blocks.of(problem.model, R, problem.by_trial, point.parameters), prediction)
     return Fit(problem, point, at, joined(lambda one: one.step_errors), (at.cost,), "validated", fits[0].method)
 
 
@@ -357,9 +356,6 @@ def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
     Priors of the initial states and unknowns of a trial are included. Priors of parameters are not, because they belong
     to no single trial. Infinite for trials that cannot be simulated.
     """
-    # `Model.priors` counts the priors of parameters in the very first window only, so without one they are not counted.
-    windows = eqx.tree_at(lambda w: w.very_first, problem.windows, jnp.zeros_like(problem.windows.very_first))
-    problem = dataclasses.replace(problem, windows=windows)
     try:
         _, at = solve_nuisance(problem, point, rtol=1e-5)
     except Unsimulated as error:
@@ -368,9 +364,7 @@ def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
             left_out = problem.with_trials([problem.trials[k] for k in left])
             costs[left] = costs_by_trial(left_out, dataclasses.replace(left_out.start, parameters=point.parameters))
         return costs
-    value = at.prediction.cost
-    costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1) if value is None else np.asarray(value)
-    return np.bincount(np.asarray(problem.windows.trial), costs, minlength=len(problem.trials))
+    return np.bincount(np.asarray(problem.windows.trial), at.costs, minlength=len(problem.trials))
 
 
 def spread_by_trial(problem: Problem) -> np.ndarray:

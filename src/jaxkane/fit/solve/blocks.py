@@ -24,6 +24,7 @@ class Blocks(eqx.Module):
     """Linearized residuals.
 
     - `R` (W, m, k): stacked triangles of every window, with k = n_z + n_next + n_b + n_x + 1.
+    - `priors` (m, n_x + 1): the rows of the priors of x, which belong to no window, with columns [x, r].
     - `windows` (T, m): indices of the windows of every trial, in order, padded with W.
     - `n_z`: the number of unknowns of a window.
     - `n_next`: n_z if windows are linked, else 0.
@@ -31,16 +32,18 @@ class Blocks(eqx.Module):
     """
 
     R: Float[Array, "W m k"]
+    priors: Float[Array, "m n"]
     windows: Int[Array, "T m"]
     n_z: int = eqx.field(static=True)
     n_next: int = eqx.field(static=True)
     n_b: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, nuisance: Any, R: Any, windows: Any) -> Blocks:
-        """Blocks with the numbers of unknowns from a `Nuisance`."""
+    def of(cls, model: Any, R: Any, windows: Any, x: Any) -> Blocks:
+        """Blocks with the numbers of unknowns and the priors of a `Model` at x."""
+        nuisance, priors = model.nuisance, model.parameters.prior_rows(x).astype(R.dtype)
         n_z = len(nuisance.window_names)
-        return cls(R, windows, n_z, n_z if nuisance.has_defects else 0, len(nuisance.trial))
+        return cls(R, priors, windows, n_z, n_z if nuisance.has_defects else 0, len(nuisance.trial))
 
     @property
     def n_x(self) -> int:
@@ -63,12 +66,18 @@ class Blocks(eqx.Module):
     @property
     def cost(self) -> Array:
         """The sum of squares of the residuals."""
-        return jnp.sum(self.R[:, :, -1] ** 2)
+        return jnp.sum(self.R[:, :, -1] ** 2) + jnp.sum(self.priors[:, -1] ** 2)
+
+    @property
+    def of_parameters(self) -> np.ndarray:
+        """The sensitivity (m, n_x) of all rows to x, before elimination."""
+        columns = np.asarray(self.R)[:, :, -1 - self.n_x : -1]
+        return np.concatenate([columns.reshape(-1, self.n_x), np.asarray(self.priors)[:, :-1]])
 
     @property
     def column_norms(self) -> np.ndarray:
         """Norms (n_x,) of the columns of the sensitivity, before elimination."""
-        return np.linalg.norm(np.asarray(self.R)[:, :, -1 - self.n_x : -1], axis=(0, 1))
+        return np.linalg.norm(self.of_parameters, axis=0)
 
     @property
     def without_influence(self) -> np.ndarray:
@@ -87,19 +96,22 @@ class Blocks(eqx.Module):
         b, x = shared[:, :, : self.n_b], shared[:, :, self.n_b :]
         W = self.R.shape[0]
         of_windows = jnp.zeros((W + 1, self.n_z), z.dtype).at[self.windows].set(z)[:W]
-        return of_windows, jnp.sum(b, axis=1), jnp.sum(x, axis=(0, 1))
+        of_priors = self.priors[:, :-1].T @ self.priors[:, -1]
+        return of_windows, jnp.sum(b, axis=1), jnp.sum(x, axis=(0, 1)) + of_priors
 
 
 class Eliminated(NamedTuple):
     """The least-squares problem in x, after the elimination of z and b.
 
     - `R` (T, n_x + 1, n_x + 1): triangles with columns [x, r].
+    - `priors` (m, n_x + 1): the rows of the priors of x.
     - `z_rows`, `b_rows`: rows for the back substitution of z and b.
     - `scale` (n_x,): column norms before the elimination, as units of the damping.
     - `blocks`: the blocks before the elimination.
     """
 
     R: Float[np.ndarray, "T n n"]
+    priors: Float[np.ndarray, "m n"]
     z_rows: Float[np.ndarray, "T m n_z k"]
     b_rows: Float[np.ndarray, "T n_b kb"]
     scale: Float[np.ndarray, " n_x"]
@@ -108,7 +120,7 @@ class Eliminated(NamedTuple):
     @property
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Sensitivity (m, n_x) and residual (m,) of the remaining problem."""
-        flat = self.R.reshape(-1, self.R.shape[-1])
+        flat = np.concatenate([self.R.reshape(-1, self.R.shape[-1]), self.priors])
         return flat[:, :-1], flat[:, -1]
 
     @property
@@ -192,7 +204,8 @@ def eliminate(blocks: Blocks, damping: np.ndarray | float) -> Eliminated:
     """
     R, n_z, n_next, n_b, n_x = np.array(blocks.R), blocks.n_z, blocks.n_next, blocks.n_b, blocks.n_x
     # Columns without influence contain only rounding errors, and a step along them would have an arbitrary length.
-    R[:, :, -1 - n_x : -1][:, :, np.asarray(blocks.without_influence)] = 0.0
+    without, priors = np.flatnonzero(blocks.without_influence), np.array(blocks.priors)
+    R[:, :, -1 - n_x : -1][:, :, without] = priors[:, without] = 0.0
     of_z, of_b = _column_squares(blocks)
     T, m = blocks.windows.shape
     # The damping must not be exactly zero: an unknown without influence would become NaN instead of keeping its value.
@@ -213,8 +226,8 @@ def eliminate(blocks: Blocks, damping: np.ndarray | float) -> Eliminated:
     b_rows, rest = _triangle(rest, n_b, damping * _safe(of_b))
     # `_safe` is not used here: it is relative to the largest column, so the damping of a small column would depend on
     # the units of the parameters.
-    scale = np.sqrt(np.sum(R**2, axis=(0, 1))[-1 - n_x : -1] + np.finfo(R.dtype).tiny)
-    return Eliminated(rest, z_rows, b_rows, scale, blocks)
+    squares = np.sum(R**2, axis=(0, 1))[-1 - n_x : -1] + np.sum(priors[:, :-1] ** 2, axis=0)
+    return Eliminated(rest, priors, z_rows, b_rows, np.sqrt(squares + np.finfo(R.dtype).tiny), blocks)
 
 
 def _column_squares(blocks: Blocks) -> tuple[np.ndarray, np.ndarray]:

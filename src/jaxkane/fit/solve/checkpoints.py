@@ -116,7 +116,7 @@ def described(problem: Problem) -> dict[str, Any]:
         model = eqx.combine(numbers, rest)
         start = model.consistent(window, z, x)
         if model.noise is not None:
-            return filtered(model, window, start, b, x)[:2], model.priors(window, z, b, x)
+            return filtered(model, window, start, b, x)[:2], model.priors(window, z, b)
         return model.residuals(window, start, z, b, x)[0]
 
     return {

@@ -149,7 +149,8 @@ def with_distributions(result: Fit, method: Any, run: dict[str, Any]) -> Fit:
     for _ in range(20 if result.problem.parameters.distributions else 0):
         if result.status not in AT_A_MINIMUM:
             break
-        before, after = result.problem.parameters.deviations, estimated_deviations(result.problem, result.point)
+        before = result.problem.parameters.deviations
+        after = estimated_deviations(result.problem, result.point, result.linearization)
         again = search(result.problem.with_deviations(after), method, start=result.point, **run)
         result = dataclasses.replace(again, history=(*result.history, *again.history[1:]))
         if np.all(np.abs(np.log(after / before)) < 1e-5):

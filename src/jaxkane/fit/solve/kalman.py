@@ -280,8 +280,9 @@ def information_of(model: Any, window: Windows, start: Array, start_dot: Array, 
         return jax.jvp(of, (start, b, x), direction, has_aux=True)
 
     (e, s), dots, result = jax.vmap(along, out_axes=(None, -1, None))(*directions)
-    priors = model.priors(window, z, b, x)
-    priors_dot = jnp.concatenate(jax.jacfwd(model.priors, argnums=(1, 2, 3))(window, z, b, x), axis=1)
+    priors = model.priors(window, z, b)
+    priors_dot = jnp.concatenate(jax.jacfwd(model.priors, argnums=(1, 2))(window, z, b), axis=1)
+    priors_dot = jnp.pad(priors_dot, ((0, 0), (0, x.size)))
     measured = (window.weight > 0).ravel()
     e, s = e.ravel(), s.ravel()
     dots = (jnp.where(measured[:, None], d.reshape(e.size, -1), 0.0) for d in dots)

@@ -57,8 +57,7 @@ def jacobian_of(model: Model, window: Windows, start: Array, start_dot: Array, z
     r, J, prediction = jax.vmap(along, out_axes=(None, -1, None))(*directions)
     if parameters.has_groups:
         applies = jnp.concatenate([jnp.full(n_z + n_b, True), window.applies[parameters.places]])
-        of_priors = jnp.concatenate(jax.jacfwd(model.priors, argnums=(1, 2, 3))(window, z, b, x), axis=1)
-        J = jnp.where(applies, J @ shared.T, 0.0).at[r.size - of_priors.shape[0] :].set(of_priors)
+        J = jnp.where(applies, J @ shared.T, 0.0)
     return r, J, prediction
 
 
@@ -131,23 +130,18 @@ def half_cost(model: Model, windows: Windows, by_trial: Array) -> Callable[[Unkn
 
     def linearized(point: Unknowns):
         R, prediction = blocks_of(model, windows, point, *starts_of(model, windows, point))
-        blocks = Blocks.of(model.nuisance, R, by_trial)
-        cost = blocks.cost if prediction.cost is None else jnp.sum(prediction.cost)
-        return blocks, cost + joint_cost(point.parameters)
-
-    def joint_cost(x: Array) -> Array:
-        return jnp.sum(model.parameters.joint_residuals(x) ** 2)
+        blocks = Blocks.of(model, R, by_trial, point.parameters)
+        of_priors = jnp.sum(blocks.priors[:, -1] ** 2)
+        return blocks, blocks.cost if prediction.cost is None else jnp.sum(prediction.cost) + of_priors
 
     @f.defjvp
     def f_jvp(primals, tangents):
         (blocks, cost), (direction,) = linearized(*primals), tangents
-        of_joint = jax.jvp(joint_cost, (primals[0].parameters,), (direction.parameters,))[1] / 2
         z, b, x = blocks.gradient
         slope = (
             jnp.sum(z * direction.window_starts)
             + jnp.sum(b * direction.trial_unknowns)
             + jnp.sum(x * direction.parameters)
-            + of_joint
         )
         return cost / 2, slope
 
@@ -209,13 +203,22 @@ class Linearization(eqx.Module):
     def cost(self) -> float:
         """The sum of squares, or minus twice the log likelihood with process noise or error models. NaN or infinite if
         the simulation of a window fails."""
-        return self.squares if self.prediction.cost is None else float(np.sum(self.prediction.cost))
+        return float(np.sum(self._own)) + self.prior_squares
 
     @property
     def costs(self) -> np.ndarray:
-        """The contribution of every window (W,) to the cost; infinite if the window is not `good`."""
-        own = self._squares if self.prediction.cost is None else np.asarray(self.prediction.cost)
-        return np.where(self.good, own, np.inf)
+        """The contribution of every window (W,) to the cost, without priors of parameters; infinite if the window is
+        not `good`."""
+        return np.where(self.good, self._own, np.inf)
+
+    @property
+    def _own(self) -> np.ndarray:
+        return self._squares if self.prediction.cost is None else np.asarray(self.prediction.cost)
+
+    @property
+    def prior_squares(self) -> float:
+        """The sum of squares of the priors of parameters."""
+        return float(np.sum(np.asarray(self.blocks.priors)[:, -1] ** 2))
 
     @property
     def squares(self) -> float:
@@ -224,7 +227,7 @@ class Linearization(eqx.Module):
         In ordinary least squares it equals the cost. With process noise, it is about twice the number of measurements,
         whereas the cost may be negative.
         """
-        return float(np.sum(self._squares))
+        return float(np.sum(self._squares)) + self.prior_squares
 
     @property
     def _squares(self) -> np.ndarray:
@@ -234,4 +237,5 @@ class Linearization(eqx.Module):
     @property
     def good(self) -> np.ndarray:
         """Whether a window (W,) has finite residuals and derivatives."""
-        return np.all(np.isfinite(np.asarray(self.blocks.R)), axis=(1, 2))
+        finite = np.all(np.isfinite(np.asarray(self.blocks.R)), axis=(1, 2))
+        return finite & np.all(np.isfinite(np.asarray(self.blocks.priors)))

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import numpy as np
 import scipy.linalg
 from scipy import optimize
 
+from ..._scalarjit.compat import on_device
 from ..problem.model import Unknowns
 from ..problem.problem import Problem
 from .blocks import eliminate, triangle
 from .linearization import Linearization
 
 
-def estimated_deviations(problem: Problem, point: Unknowns) -> np.ndarray:
+def estimated_deviations(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
     """The standard deviations (n,) of all distributions, in standard deviations of a residual.
 
     The restricted likelihood of the model, linearized at the point, is maximized (Lindstrom and Bates, Nonlinear mixed
@@ -26,13 +28,14 @@ def estimated_deviations(problem: Problem, point: Unknowns) -> np.ndarray:
     """
     parameters = problem.parameters
     # With infinite standard deviations, the rows of the distributions are zero. `criterion` adds them with its own.
-    first = problem.with_deviations(np.full(len(parameters.distributions), np.inf)).linearize(point)
-    assert first is not None
-    data = triangle(np.column_stack(eliminate(first.blocks, 0.0).rows).astype(float))
-    one = parameters.with_deviations(np.ones(len(parameters.distributions)))
-    rows = np.column_stack([one.joint_slopes(point.parameters), np.asarray(one.joint_residuals(point.parameters))])
+    infinite, one = (parameters.with_deviations(np.full(len(parameters.distributions), d)) for d in (np.inf, 1.0))
+    other_priors = on_device(infinite.prior_rows(point.parameters))
+    blocks = eqx.tree_at(lambda blocks: blocks.priors, at.blocks, other_priors)
+    data = triangle(np.column_stack(eliminate(blocks, 0.0).rows).astype(float))
+    p = parameters.size
+    rows = one.prior_rows(point.parameters)[p:].astype(float)
     places = [slice(begin, end) for _, begin, end in parameters.distributions]
-    q, p = np.array([s.stop - s.start for s in places]), data.shape[1] - 1
+    q = np.array([s.stop - s.start for s in places])
     scale = np.linalg.norm(np.concatenate([data, rows]), axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     nu = problem.size[0] - problem.size[1]
@@ -87,7 +90,7 @@ def degrees_of_freedom(problem: Problem, point: Unknowns, at: Linearization) -> 
     1985).
     """
     parameters, M = problem.parameters, np.column_stack(eliminate(at.blocks, 0.0).rows).astype(float)
-    rows = np.column_stack([parameters.joint_slopes(point.parameters), parameters.joint_residuals(point.parameters)])
+    rows = parameters.prior_rows(point.parameters)[parameters.size :].astype(float)
     scale = np.linalg.norm(M, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     parts = [(rows[begin:end] / scale).T @ (rows[begin:end] / scale) for _, begin, end in parameters.distributions]
