@@ -58,7 +58,7 @@ def is_wanted() -> bool:
 
 def is_on() -> bool:
     """Whether programs become native kernels. Warns once if LLVM is installed but kernels cannot be called."""
-    if not _wanted or _without_llvm():
+    if not _wanted or without_llvm():
         return False
     why = why_not()
     if why:
@@ -68,7 +68,7 @@ def is_on() -> bool:
 
 def why_not() -> str | None:
     """Why native kernels are not possible in this process; None if they are."""
-    return _without_llvm() or _refused()
+    return without_llvm() or _refused()
 
 
 def tell(why: str) -> None:
@@ -82,11 +82,6 @@ def tell(why: str) -> None:
             UserWarning,
             stacklevel=3,
         )
-
-
-@functools.cache
-def _without_llvm() -> str | None:
-    return without_llvm()
 
 
 @functools.cache
