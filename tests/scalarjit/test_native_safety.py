@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jaxkane._scalarjit.backends import compiler as objects
-from jaxkane._scalarjit.backends import ffi_layout, llvm, native
+from jaxkane._scalarjit.backends import ffi_layout, native
 from jaxkane._scalarjit.backends.compiler import LLVMCompiler
 from jaxkane._scalarjit.scalar_function import ScalarFunction
 
@@ -214,13 +214,6 @@ def test_fields_appended_to_a_structure_are_ignored(tmp_path):
     header = tmp_path / "c_api.h"
     header.write_text(text.replace(body, f"{body}  void* more;\n"))
     assert ffi_layout.mismatch(header) is None
-
-
-def test_a_handler_with_a_wrong_structure_size_raises(monkeypatch):
-    assert native.is_on()
-    monkeypatch.setattr(llvm, "LAYOUT", llvm.LAYOUT._replace(frame_size=4096))
-    with pytest.raises(jax.errors.JaxRuntimeError, match=r"uses another calling convention .*native=False"):
-        jax.block_until_ready(jax.jit(ScalarFunction(lambda x: jnp.cos(x) * 1.25))(0.5))
 
 
 class Text:

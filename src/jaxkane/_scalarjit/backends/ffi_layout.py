@@ -1,14 +1,12 @@
 """The structures by which XLA calls a native kernel, and whether this jaxlib has them.
 
 `llvm.wrapper_text` reads and writes these structures at fixed byte offsets. With wrong offsets it would use
-invalid pointers. Therefore `mismatch` compares their fields with the header of jaxlib before any kernel is compiled. In
-addition, every call compares the sizes that the structures contain in their first field (`llvm`).
+invalid pointers. Therefore `mismatch` compares their fields with the header of jaxlib before any kernel is compiled.
 """
 
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,37 +14,25 @@ import jax
 
 
 class Layout(NamedTuple):
-    """Byte offsets in the structures of xla/ffi/api/c_api.h, major version 0, with addresses of eight bytes.
+    """Byte offsets in the structures of xla/ffi/api/c_api.h, major version 0, with addresses of eight bytes."""
 
-    The `*_size` are sizes of structures, as the structures state them in their first field.
-    """
-
-    frame_size: int = 168
     frame_extension: int = 8
-    frame_api: int = 16
     frame_arguments: int = 40
     frame_results: int = 80
-    list_size: int = 40  # of the arguments, and of the results
-    list_count: int = 16
     list_items: int = 32
-    buffer_size: int = 48
     buffer_data: int = 24
     extension_type: int = 8
     extension_metadata: int = 24
     metadata_major: int = 24
     metadata_minor: int = 28
     metadata_traits: int = 32
-    api_error_create: int = 48
-    error_size: int = 28
-    error_message: int = 16
-    error_code: int = 24
 
 
 LAYOUT = Layout()
 
 # The fields of each structure that `LAYOUT` has an offset in. A later version may append fields to `_MAY_GROW`, which
 # no other structure contains. The wrapper does not read such fields.
-_MAY_GROW = ("CallFrame", "Buffer", "Metadata", "Api")
+_MAY_GROW = ("CallFrame", "Buffer", "Metadata")
 _STRUCTURES = {
     "InternalExtension": "size_t struct_size; InternalExtension_Type type; struct InternalExtension* next;",
     "Args": "size_t struct_size; InternalExtension* extension_start; int64_t size; ArgType* types; void** args;",
@@ -58,10 +44,6 @@ _STRUCTURES = {
     "Metadata_Extension": "InternalExtension extension_base; Metadata* metadata;",
     "Metadata": "size_t struct_size; Api_Version api_version; Handler_Traits traits;",
     "Api_Version": "size_t struct_size; InternalExtension* extension_start; int major_version; int minor_version;",
-    "Api": "size_t struct_size; InternalExtension* extension_start; Api_Version api_version; "
-    "const InternalApi* internal_api; _API_STRUCT_FIELD(Error_Create);",
-    "Error_Create_Args": "size_t struct_size; InternalExtension* extension_start; const char* message; "
-    "Error_Code errc;",
 }
 # Names in jaxlib 0.10, and those of later versions.
 _RENAMED = {
@@ -76,8 +58,6 @@ def mismatch(header: Path | None = None) -> str | None:
 
     `header`: the file to read, by default the one that jaxlib contains.
     """
-    if sys.maxsize < 2**32:
-        return "addresses do not have eight bytes"
     header = header or Path(jax.ffi.include_dir(), "xla/ffi/api/c_api.h")
     try:
         text = header.read_text(encoding="utf-8")
