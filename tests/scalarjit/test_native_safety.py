@@ -178,7 +178,7 @@ CHANGES = {
 @pytest.fixture
 def unknown(monkeypatch):
     """A process that has not compared the header yet."""
-    monkeypatch.setattr(native, "_told", set())
+    native.tell.cache_clear()
     native._refused.cache_clear()
     yield
     monkeypatch.undo()
@@ -227,7 +227,7 @@ class Text:
 
 
 def test_after_an_llvm_error_xla_is_used(monkeypatch):
-    monkeypatch.setattr(native, "_told", set())
+    native.tell.cache_clear()
     f = ScalarFunction(lambda x: jnp.sin(x) * 1.75)
     with monkeypatch.context() as broken:
         broken.setattr(native, "Writer", Text)

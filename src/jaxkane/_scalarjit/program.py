@@ -52,14 +52,11 @@ from .jaxpr import (
 
 _FEW = 8  # numbers: for XLA, this many separate arguments cost as much as making an array of them
 
-_warned: set[tuple[str, str]] = set()
 
-
+@functools.cache
 def warn_once(label: str, what: str, why: str) -> None:
     """Warn once about a property of a system that costs time."""
-    if (label, what) not in _warned:
-        _warned.add((label, what))
-        warnings.warn(f"{label}: its description uses {what}, which {why}.", UserWarning, stacklevel=2)
+    warnings.warn(f"{label}: its description uses {what}, which {why}.", UserWarning, stacklevel=2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -402,16 +399,16 @@ def _by_xla(*args, program, sizes, batch_mask):
     return as_one_function(program.program, args)
 
 
-def _by_kernel(*args, program, sizes, batch_mask, target):
-    # The kernel reads its arguments in this order (`Program.target` passes the same groups), so both must use `groups`.
-    groups = [[args[i] for i in group] for group in program.groups(batch_mask)]
-    outputs = specs_of(_abstract(program=program, sizes=sizes, batch_mask=batch_mask))
-    return jax.ffi.ffi_call(target, outputs)(*(jnp.stack(xs, axis=-1) if len(xs) > 1 else xs[0] for xs in groups))
-
-
 def _lower_on_cpu(context, *args, program, sizes, batch_mask):
     target = program.target(sizes, batch_mask)
-    rule = _by_xla if target is None else functools.partial(_by_kernel, target=target)
+
+    def by_kernel(*args, **_):
+        # The kernel reads its arguments in this order: `Program.target` passes the same groups.
+        groups = [[args[i] for i in group] for group in program.groups(batch_mask)]
+        outputs = specs_of(_abstract(program=program, sizes=sizes, batch_mask=batch_mask))
+        return jax.ffi.ffi_call(target, outputs)(*(jnp.stack(xs, axis=-1) if len(xs) > 1 else xs[0] for xs in groups))
+
+    rule = _by_xla if target is None else by_kernel
     return as_lowering(rule)(context, *args, program=program, sizes=sizes, batch_mask=batch_mask)
 
 

@@ -30,7 +30,6 @@ def switched_on(word: str) -> bool:
 
 _wanted = switched_on(os.environ.get("JAXKANE_NATIVE", ""))
 _lock = threading.RLock()
-_told: set[str] = set()
 
 
 def llvm_compiler() -> LLVMCompiler:
@@ -71,17 +70,12 @@ def why_not() -> str | None:
     return without_llvm() or _refused()
 
 
+@functools.cache
 def tell(why: str) -> None:
     """Warn that XLA replaces native kernels; once for each reason."""
-    with _lock:
-        is_new = why not in _told
-        _told.add(why)
-    if is_new:
-        warnings.warn(
-            f"jaxkane does not use native kernels: {why}. XLA compiles the equations instead.",
-            UserWarning,
-            stacklevel=3,
-        )
+    warnings.warn(
+        f"jaxkane does not use native kernels: {why}. XLA compiles the equations instead.", UserWarning, stacklevel=3
+    )
 
 
 @functools.cache
