@@ -142,7 +142,7 @@ def _split_cpu(devices: int) -> None:
 def _made_folder(cache: bool | str | os.PathLike[str]) -> Path | None:
     """The folder of the cache; None, with a warning, if it cannot be created, e.g. in a read-only home."""
     home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "~/.cache"
-    folder = Path(_jax.jax_compilation_cache_dir or Path(home, "jaxkane") if cache is True else cache)
+    folder = Path(_jax.jax_compilation_cache_dir or Path(home, "jaxkane") if isinstance(cache, bool) else cache)
     try:
         folder = folder.expanduser().absolute()
         folder.mkdir(parents=True, exist_ok=True)
