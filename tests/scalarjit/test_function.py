@@ -331,8 +331,8 @@ SLOW = {
 
 @pytest.mark.slow_cases(all_but=["cond", "while"])
 @pytest.mark.parametrize("name", SLOW)
-def test_operations_that_prevent_a_single_program_cause_one_warning(name, monkeypatch):
-    monkeypatch.setattr(programs, "_warned", set())
+def test_operations_that_prevent_a_single_program_cause_one_warning(name):
+    programs.warn_once.cache_clear()
     f = ScalarFunction(SLOW[name])
     ball, x = Ball(jnp.array(1.5)), jnp.array(0.4)
     with pytest.warns(UserWarning, match=rf"Ball: its description uses .*`{name}`.* cannot be part of one") as told:
@@ -365,8 +365,8 @@ def test_lapack_calls_of_the_library_cause_no_warning():
 
 
 @pytest.mark.usefixtures("native")
-def test_operations_unsupported_by_native_kernels_cause_one_warning(monkeypatch):
-    monkeypatch.setattr(programs, "_warned", set())
+def test_operations_unsupported_by_native_kernels_cause_one_warning():
+    programs.warn_once.cache_clear()
     f = ScalarFunction(lambda ball, x: ball.a * jnp.asarray(x).astype(jnp.int32).astype(float))
     match = "Ball: its description uses convert_element_type of float64, which native"
     with pytest.warns(UserWarning, match=match) as told:

@@ -163,7 +163,7 @@ def test_shared_arguments_are_passed_to_a_kernel_as_one_array(native, monkeypatc
 def test_unsupported_operations_are_left_to_xla(native):
     whole = lambda x: x.astype(jnp.int32).astype(x.dtype)  # noqa: E731
     f = ScalarFunction(lambda x: whole(x) + jnp.sin(x))
-    programs._warned.clear()
+    programs.warn_once.cache_clear()
     with pytest.raises(native_kernels.NotScalarError, match="convert_element_type of float64"):
         native_kernels.Scalars(jax.make_jaxpr(whole)(jnp.array(1.0)))
     match = "uses convert_element_type of float64, which native kernels do not support"

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jaxkane._scalarjit.backends import compiler as objects
-from jaxkane._scalarjit.backends import ffi_layout, llvm, native
+from jaxkane._scalarjit.backends import ffi_layout, native
 from jaxkane._scalarjit.backends.compiler import LLVMCompiler
 from jaxkane._scalarjit.scalar_function import ScalarFunction
 
@@ -143,10 +143,9 @@ def test_a_deleted_cache_folder_and_concurrent_writers(tmp_path):
 HEADER = Path(jax.ffi.include_dir(), "xla/ffi/api/c_api.h")
 
 
-def test_structure_offsets_agree_with_the_header_of_jaxlib():
+def test_structures_agree_with_the_header_of_jaxlib():
     if not HEADER.exists():
         pytest.skip(f"this jaxlib ships no header: {HEADER}")
-    assert ffi_layout.layout_of(HEADER.read_text()) == ffi_layout.LAYOUT
     assert ffi_layout.mismatch() is None
 
 
@@ -154,28 +153,32 @@ CHANGES = {
     "another order": (
         "XLA_FFI_DataType dtype;\n  void* data;",
         "void* data;\n  XLA_FFI_DataType dtype;",
-        "buffer_data is",
+        "struct XLA_FFI_Buffer has changed",
     ),
     "another field": (
         "  const XLA_FFI_Api* api;\n",
         "  const XLA_FFI_Api* api;\n  void* more;\n",
-        "frame_arguments is",
+        "struct XLA_FFI_CallFrame has changed",
     ),
-    "another version": ("XLA_FFI_API_MAJOR 0", "XLA_FFI_API_MAJOR 1", "XLA_FFI_API_MAJOR is not 0"),
-    "another name": ("XLA_FFI_Metadata_Extension", "XLA_FFI_MetadataExtension", "KeyError"),
+    "another version": ("XLA_FFI_API_MAJOR 0", "XLA_FFI_API_MAJOR 1", "XLA_FFI_API_MAJOR has changed"),
+    "another name": (
+        "XLA_FFI_Metadata_Extension",
+        "XLA_FFI_MetadataExtension",
+        "struct XLA_FFI_Metadata_Extension has changed",
+    ),
     "arguments otherwise than results": (
         "  void** rets;",
         "  int64_t more;\n  void** rets;",
-        "not listed in the same way",
+        "struct XLA_FFI_Rets has changed",
     ),
-    "nothing in it": (None, "", "XLA_FFI_API_MAJOR is not 0"),
+    "nothing in it": (None, "", "XLA_FFI_API_MAJOR has changed"),
 }
 
 
 @pytest.fixture
 def unknown(monkeypatch):
     """A process that has not compared the header yet."""
-    monkeypatch.setattr(native, "_told", set())
+    native.tell.cache_clear()
     native._refused.cache_clear()
     yield
     monkeypatch.undo()
@@ -208,20 +211,9 @@ def test_fields_appended_to_a_structure_are_ignored(tmp_path):
     """Fields that a later jaxlib appends are not read."""
     text = HEADER.read_text()
     (body,) = re.findall(r"struct XLA_FFI_Buffer \{[^}]*", text)
-    grown = text.replace(body, f"{body}  void* more;\n").replace(
-        "XLA_FFI_DEFINE_STRUCT_TRAITS(XLA_FFI_Buffer, dims)", "XLA_FFI_DEFINE_STRUCT_TRAITS(XLA_FFI_Buffer, more)"
-    )
     header = tmp_path / "c_api.h"
-    header.write_text(grown)
-    assert ffi_layout.layout_of(grown).buffer_size > ffi_layout.LAYOUT.buffer_size
+    header.write_text(text.replace(body, f"{body}  void* more;\n"))
     assert ffi_layout.mismatch(header) is None
-
-
-def test_a_handler_with_a_wrong_structure_size_raises(monkeypatch):
-    assert native.is_on()
-    monkeypatch.setattr(llvm, "LAYOUT", llvm.LAYOUT._replace(frame_size=4096))
-    with pytest.raises(jax.errors.JaxRuntimeError, match=r"uses another calling convention .*native=False"):
-        jax.block_until_ready(jax.jit(ScalarFunction(lambda x: jnp.cos(x) * 1.25))(0.5))
 
 
 class Text:
@@ -235,7 +227,7 @@ class Text:
 
 
 def test_after_an_llvm_error_xla_is_used(monkeypatch):
-    monkeypatch.setattr(native, "_told", set())
+    native.tell.cache_clear()
     f = ScalarFunction(lambda x: jnp.sin(x) * 1.75)
     with monkeypatch.context() as broken:
         broken.setattr(native, "Writer", Text)

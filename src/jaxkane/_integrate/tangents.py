@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
-from .._scalarjit.compat import MISSING, as_lowering, is_no_tangent, is_undefined_primal, new_primitive
+from .._scalarjit.compat import as_lowering, is_no_tangent, is_undefined_primal, new_primitive
 
 Run = Callable[..., Any]
 """(arguments, moved, reverse) -> result. `moved`: the arguments with True for each array that is differentiated; None
@@ -28,8 +28,6 @@ for the value alone. `reverse`: whether the result supports reverse mode, else f
 def with_own_tangents(run: Run, arguments: Any, constants: Any) -> Any:
     """`run((arguments, constants), None, False)`, which can be differentiated with respect to `arguments` in both
     modes, and in forward mode again. `run` must not use traced numbers from outside."""
-    if MISSING:
-        return run((arguments, constants), None, True)
     moving, other = eqx.partition(arguments, eqx.is_inexact_array)
     arrays, rest = eqx.partition((other, constants), eqx.is_array)
     moving, structure = jax.tree.flatten(moving)
@@ -175,7 +173,7 @@ def _once(x: Any) -> Any:
 
 
 _once.defjvp(_refused)
-_tangents: Any = None if MISSING else new_primitive(
+_tangents: Any = new_primitive(
     "tangents_of_a_simulation",
     evaluate=_evaluated,
     shapes=_shapes,
@@ -184,7 +182,7 @@ _tangents: Any = None if MISSING else new_primitive(
     batch=_batch,
     traced=_evaluated,
     lower_on_cpu=as_lowering(_evaluated),
-)  # fmt: skip
+)
 
 
 def _same(x: Any) -> list[Any]:
@@ -192,7 +190,7 @@ def _same(x: Any) -> list[Any]:
 
 
 # The identity, for a second derivative: the message of JAX in reverse mode would name its loop.
-_forward_only: Any = None if MISSING else new_primitive(
+_forward_only: Any = new_primitive(
     "forward_mode_only",
     evaluate=_same,
     shapes=_same,
@@ -201,7 +199,7 @@ _forward_only: Any = None if MISSING else new_primitive(
     batch=lambda x, dims: (_forward_only.bind(*x), dims),
     traced=_same,
     lower_on_cpu=as_lowering(_same),
-)  # fmt: skip
+)
 
 
 def _first(*args: Any, n: int) -> list[Any]:
@@ -217,7 +215,7 @@ def _batch_all(args: Any, dims: Any, *, n: int) -> Any:
 
 # The first n arguments. In a batch all of them are in the batch if any argument is, because all tangents are: JAX does
 # not support an operation with values outside of a batch and tangents in it.
-_in_one_batch: Any = None if MISSING else new_primitive(
+_in_one_batch: Any = new_primitive(
     "in_one_batch",
     evaluate=_first,
     shapes=_first,
@@ -226,4 +224,4 @@ _in_one_batch: Any = None if MISSING else new_primitive(
     batch=_batch_all,
     traced=_first,
     lower_on_cpu=as_lowering(_first),
-)  # fmt: skip
+)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._scalarjit.compat import MISSING, ClosedJaxpr, jaxpr_as_fun
+from .._scalarjit.compat import ClosedJaxpr, jaxpr_as_fun
 from .._scalarjit.components import ELIMINATE_UP_TO, as_vector, is_written_out
 from .._scalarjit.graph import Graph, NotScalarError, unrolled
 from .._scalarjit.jaxpr import Direction, cse, jacobian, tangent_program
@@ -127,8 +127,6 @@ class Formulas:
             )
         if not is_concrete(system):
             raise TypeError(f"{self.name} is traced. Call this function outside of jax.jit, vmap and grad.")
-        if MISSING is not None:
-            raise ImportError(f"{self.name} cannot be written as formulas: {MISSING}.")
         check_system(system, 0.0, None)
         paths, self.structure = jax.tree_util.tree_flatten_with_path(system)
         self.leaves = [leaf for _, leaf in paths]

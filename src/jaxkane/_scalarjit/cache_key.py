@@ -20,7 +20,7 @@ import itertools
 import threading
 import types
 import weakref
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -38,10 +38,7 @@ _captured = Cache()  # by the identity of the root
 
 
 class _Tracing(threading.local):
-    """The values that were captured at the start of the current traces of this thread."""
-
-    def __init__(self) -> None:
-        self.captured: dict[int, CapturedValues] = {}
+    captured: Mapping[int, CapturedValues] = {}  # at the start of the current traces of this thread; not mutated
 
 
 _tracing = _Tracing()
@@ -163,7 +160,7 @@ def trace_with_snapshot(f: Callable[..., Any]) -> Callable[..., Any]:
     def call(*args: Any, **kwargs: Any) -> Any:
         before = [(root, _captured_by(root)) for root in _roots((args, kwargs), [])]
         outer = _tracing.captured
-        _tracing.captured = {id(root): values for root, values in before} | outer
+        _tracing.captured = {id(root): values for root, values in before} | {**outer}
         try:
             with storable_checks():
                 result = f(*args, **kwargs)

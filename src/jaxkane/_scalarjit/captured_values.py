@@ -63,38 +63,6 @@ def is_of_library(kind: type) -> bool:
     return _is_library(kind.__module__)
 
 
-class CapturedValues:
-    """All places that the code of `root` uses, with their values.
-
-    root: a function, class or object. No reference to it is kept, so that a cache does not extend its lifetime.
-    lasting: whether the digest is the same in another process. Other objects are then pickled.
-    version: the digest.
-    seen: every object that was visited, by identity. An identity is unique only while the object exists.
-    tracers: traced values among these.
-    """
-
-    def __init__(self, root: Any, lasting: bool = False):
-        walk = _Walk(root, lasting)
-        walk.value(root)
-        walk.into_modules()
-        self.version, self.seen, self.tracers = walk.sha.digest(), walk.seen, walk.tracers
-        self._named, self._places, self._arrays = walk.named, walk.places, walk.arrays
-
-    def unchanged(self, root: Any) -> bool:
-        """Whether every place still has its value."""
-        try:
-            for names, name, before in self._named:
-                if names.get(name, _MISSING) is not before:
-                    return False
-            for read, thing, before in self._places:
-                now = read(root if thing is _ROOT else thing)
-                if len(now) != len(before) or not all(map(is_, now, before)):
-                    return False
-            return all(_numbers_of(array) == before for array, before in self._arrays)
-        except RuntimeError:  # a dict or a set that another thread is changing
-            return False
-
-
 def _definition_of(f: types.FunctionType) -> tuple[Any, ...]:
     """The parts of a function that autoreload replaces."""
     return f.__code__, f.__defaults__, f.__kwdefaults__
@@ -116,10 +84,18 @@ def _numbers_of(array: np.ndarray) -> tuple[Any, ...]:
     return array.dtype.str, array.shape, np.ma.getdata(array).tobytes(), np.ma.getmask(array).tobytes()
 
 
-class _Walk:
-    """Visits every place that the code of a root uses, records it and adds its value to a digest."""
+class CapturedValues:
+    """All places that the code of `root` uses, with their values. The constructor visits every place, records it and
+    adds its value to a digest.
 
-    def __init__(self, root: Any, lasting: bool):
+    root: a function, class or object. No reference to it is kept, so that a cache does not extend its lifetime.
+    lasting: whether the digest is the same in another process. Other objects are then pickled.
+    version: the digest.
+    seen: every object that was visited, by identity. An identity is unique only while the object exists.
+    tracers: traced values among these.
+    """
+
+    def __init__(self, root: Any, lasting: bool = False):
         self.root, self.lasting = root, lasting
         self.sha = hashlib.blake2b(digest_size=16)
         self.seen: dict[Any, tuple[int, Any]] = {}
@@ -130,6 +106,24 @@ class _Walk:
         self.depth = 0
         self.names: set[str] = set()  # in all the code; only attributes of modules with these names are read
         self.modules: list[types.ModuleType] = []
+        self.value(root)
+        self.into_modules()
+        self.version = self.sha.digest()
+        del self.root
+
+    def unchanged(self, root: Any) -> bool:
+        """Whether every place still has its value."""
+        try:
+            for names, name, before in self.named:
+                if names.get(name, _MISSING) is not before:
+                    return False
+            for read, thing, before in self.places:
+                now = read(root if thing is _ROOT else thing)
+                if len(now) != len(before) or not all(map(is_, now, before)):
+                    return False
+            return all(_numbers_of(array) == before for array, before in self.arrays)
+        except RuntimeError:  # a dict or a set that another thread is changing
+            return False
 
     def add(self, *words: Any) -> None:
         for word in words:

@@ -1,18 +1,9 @@
 """Everything that this library uses of JAX and equinox beyond their public API. Independent of programs and mechanics.
 
-Each feature has a fallback. If a release removes a feature, results stay right; only speed or a convenience is lost:
-
-| feature | without it |
-|---|---|
-| jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `MISSING`: rates are plain JAX, tangents not controlled |
-| the frontend attribute that makes one function of a program | XLA splits the program as any other |
-| `_filter_jit_cache` of equinox | compiled programs are never freed |
-| `reset_cache`, equinox's setting for its checks | programs are stored only if the environment sets it from the start |
-| `eval_context` | a sweep on a cluster may be refused, because programs that were first traced in a check differ |
-| whether JAX has started | a flag that repairs two releases may come too late, without a warning |
+All of it exists in the versions of JAX that `pyproject.toml` admits. equinox has no upper bound there. Without its
+private names, compiled programs are never freed, and are stored only if the environment sets `EQX_ON_ERROR=nan`.
 
 Jaxprs are read in this folder only: by `interpret` equation by equation, and by `jaxpr`, `graph` and `digest`.
-`tests/scalarjit/test_compat.py` names features that are missing.
 """
 
 from __future__ import annotations
@@ -30,26 +21,18 @@ from typing import Any, NamedTuple, TypeAlias
 import equinox as eqx
 import jax
 import numpy as np
+from jax._src.xla_bridge import backends_are_initialized
 from jax.core import Tracer as Tracer
-
-MISSING: str | None = None  # what this JAX lacks; scalar programs are then not possible
-try:
-    from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, Var, jaxpr_as_fun
-    from jax.interpreters import ad, batching, mlir
-    from jax.interpreters.ad import instantiate_zeros, is_undefined_primal
-    from jax.interpreters.partial_eval import custom_partial_eval_rules, dce_jaxpr
-
-    _ = Jaxpr.replace, Jaxpr.eqns, Jaxpr.invars, Jaxpr.constvars, Jaxpr.outvars
-    _ = JaxprEqn.replace, JaxprEqn.primitive, JaxprEqn.params, JaxprEqn.invars, JaxprEqn.outvars, JaxprEqn.effects
-    _ = ad.primitive_jvps, ad.primitive_transposes, ad.Zero
-    _ = ClosedJaxpr.jaxpr, ClosedJaxpr.consts, ClosedJaxpr.in_avals, ClosedJaxpr.out_avals, Primitive.get_bind_params
-except (ImportError, AttributeError) as error:
-    MISSING = f"this version of JAX does not have the required functions ({error})"
-    missing: Any = None
-    ClosedJaxpr = Jaxpr = Primitive = Var = missing
-    custom_partial_eval_rules = jaxpr_as_fun = dce_jaxpr = missing
-    instantiate_zeros = is_undefined_primal = ad = batching = mlir = missing
-
+from jax.core import eval_context
+from jax.experimental.compilation_cache.compilation_cache import reset_cache as reset_cache
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, Var
+from jax.extend.core import jaxpr_as_fun as jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
+from jax.interpreters.ad import instantiate_zeros as instantiate_zeros
+from jax.interpreters.ad import is_undefined_primal as is_undefined_primal
+from jax.interpreters.partial_eval import custom_partial_eval_rules
+from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 
 WRONG_FUSIONS = ((0, 10, 2), (0, 11, 0))
 NO_FUSIONS = "--xla_cpu_experimental_ynn_fusion_type"
@@ -66,13 +49,7 @@ def switch_off_wrong_fusions() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if jax.__version_info__ not in WRONG_FUSIONS or NO_FUSIONS in flags:
         return
-    try:
-        from jax._src.xla_bridge import backends_are_initialized
-
-        has_started = backends_are_initialized()
-    except ImportError:
-        has_started = False
-    if has_started:
+    if backends_are_initialized():
         warnings.warn(
             f"JAX {jax.__version__} has started. On a CPU, it may compute wrong matrix products in batches of more "
             "than 16 384 (jax issue 39103). Import jaxkane before anything is computed, or set XLA_FLAGS to "
@@ -275,12 +252,7 @@ def no_tangent(x: Any) -> Any:
 
 def one_function() -> contextlib.AbstractContextManager[Any]:
     """A context in which XLA:CPU compiles each call of a jitted function as one LLVM function."""
-    try:
-        from jax.experimental.xla_metadata import set_xla_metadata
-
-        return set_xla_metadata(xla_cpu_small_call="true", inlineable="false")
-    except (ImportError, TypeError):
-        return contextlib.nullcontext()
+    return set_xla_metadata(xla_cpu_small_call="true", inlineable="false")
 
 
 def concretely() -> contextlib.AbstractContextManager[Any]:
@@ -288,10 +260,6 @@ def concretely() -> contextlib.AbstractContextManager[Any]:
 
     Programs that are traced in it are the same as elsewhere. `jax.ensure_compile_time_eval` does not guarantee this.
     """
-    try:
-        from jax.core import eval_context
-    except ImportError:
-        return jax.ensure_compile_time_eval()
     return eval_context()
 
 
@@ -302,7 +270,7 @@ def on_device(x: Any, dtype: Any = None) -> jax.Array:
 
 def settings() -> Any:
     """The settings of JAX on which a traced program depends, in addition to its arguments."""
-    return tuple(getattr(jax.config, name, None) for name in _SETTINGS)
+    return tuple(getattr(jax.config, name) for name in _SETTINGS)
 
 
 _SETTINGS = (
@@ -310,18 +278,8 @@ _SETTINGS = (
     "jax_numpy_dtype_promotion",
     "jax_numpy_rank_promotion",
     "jax_default_matmul_precision",
-    "jax_default_dtype_bits",
     "jax_debug_nans",
 )
-
-
-def look_for_cache_again() -> None:
-    """Make JAX look again for the folder of stored programs. It looks only once, at its first compilation."""
-    try:
-        from jax.experimental.compilation_cache.compilation_cache import reset_cache
-    except ImportError:
-        return
-    reset_cache()
 
 
 class _Checks:

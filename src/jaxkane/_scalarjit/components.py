@@ -171,7 +171,10 @@ def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:
     if len(A) <= _CRAMER_UP_TO:
         return _solutions_and_det(A, rights)[0]
     blocks = _blocks(A)
-    return _solved_by_lapack_rows(A, rights) if blocks is None else _solved_by_blocks(A, rights, blocks)
+    if blocks is not None:
+        return _solved_by_blocks(A, rights, blocks)
+    solution = _solved_by_lapack(stack(A), jnp.stack([stack([b])[0] for b in rights], axis=-1))
+    return [tuple(solution[i, j] for i in range(len(A))) for j in range(len(rights))]
 
 
 def determinant(A: Rows) -> Component:
@@ -252,11 +255,6 @@ def _solved_by_blocks(A: Rows, rights: Sequence[Sequence[Component]], blocks: li
         for x, solved in zip(solutions, _solutions_and_det(_part(A, rows, columns), remaining)[0], strict=True):
             x.update(zip(columns, solved, strict=True))
     return [tuple(x[j] for j in range(len(A))) for x in solutions]
-
-
-def _solved_by_lapack_rows(A: Rows, rights: Sequence[Sequence[Component]]) -> list:
-    solution = _solved_by_lapack(stack(A), jnp.stack([stack([b])[0] for b in rights], axis=-1))
-    return [tuple(solution[i, j] for i in range(len(A))) for j in range(len(rights))]
 
 
 def _solutions_and_det(

@@ -13,8 +13,8 @@ import jax
 import numpy as np
 
 from .._common.files import remove_broken_programs
-from . import compat as internals
 from .backends import native as kernels
+from .compat import backends_are_initialized, reset_cache
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +34,7 @@ class Configuration:
 
 
 _last: Configuration | None = None
+_jax: Any = jax.config  # JAX does not declare the attributes
 
 
 def configure(
@@ -81,7 +82,9 @@ def configure(
             raise TypeError(f"configure: `{what}` must be True or False, got {flag!r}.")
     if not isinstance(cache, (bool, str, os.PathLike)):
         raise TypeError(f"configure: `cache` must be a folder, True or False, got {cache!r}.")
-    made = _float32_arrays() if float64 and not jax.config.jax_enable_x64 else 0  # pyright: ignore[reportAttributeAccessIssue]
+    made = 0
+    if float64 and not _jax.jax_enable_x64 and backends_are_initialized():  # `live_arrays` would start JAX
+        made = sum(array.dtype == np.float32 for array in jax.live_arrays())
     jax.config.update("jax_enable_x64", bool(float64))
     os.environ["JAX_ENABLE_X64"] = str(int(float64))
     if made:
@@ -92,7 +95,7 @@ def configure(
             stacklevel=2,
         )
     folder = _made_folder(cache) if cache else None
-    if folder is not None or jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
+    if folder is not None or _jax.jax_compilation_cache_dir:
         _store_programs(folder)
     if devices is not None:
         _split_cpu(devices)
@@ -110,7 +113,7 @@ def configure(
 @functools.cache
 def warn_of_float32() -> None:
     """Warn once if float64 is not enabled, and neither `configure` nor the environment has chosen this."""
-    if _last or jax.config.jax_enable_x64 or "JAX_ENABLE_X64" in os.environ:  # pyright: ignore[reportAttributeAccessIssue]
+    if _last or _jax.jax_enable_x64 or "JAX_ENABLE_X64" in os.environ:
         return
     warnings.warn(
         "This simulation is in float32, because float64 is not enabled. Call jaxkane.configure() right after the "
@@ -120,26 +123,10 @@ def warn_of_float32() -> None:
     )
 
 
-def _float32_arrays() -> int:
-    """The number of float32 arrays that exist. The search must not start JAX."""
-    return sum(array.dtype == np.float32 for array in jax.live_arrays()) if _has_started() else 0
-
-
-def _has_started() -> bool:
-    # JAX has no public function for this, but it refuses a new number of CPU devices after it has started.
-    number = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
-    try:
-        jax.config.update("jax_num_cpu_devices", number + 1)
-    except RuntimeError:  # no other cause raises it, because the setting is only stored
-        return True
-    jax.config.update("jax_num_cpu_devices", number)
-    return False
-
-
 def _split_cpu(devices: int) -> None:
     if not isinstance(devices, (int, np.integer)) or isinstance(devices, bool) or devices < 1:
         raise ValueError(f"configure: `devices` must be a number of CPU devices, 1 or more; got {devices!r}.")
-    if not _has_started():
+    if not backends_are_initialized():
         jax.config.update("jax_num_cpu_devices", int(devices))
         return
     there = len(jax.local_devices(backend="cpu"))
@@ -152,36 +139,25 @@ def _split_cpu(devices: int) -> None:
         )
 
 
-def _folder(cache: bool | str | os.PathLike[str]) -> Path:
-    if not isinstance(cache, bool):
-        return Path(cache).expanduser().absolute()
-    folder: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if folder:
-        return Path(folder)
-    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "~/.cache"
-    return Path(home).expanduser() / "jaxkane"
-
-
 def _made_folder(cache: bool | str | os.PathLike[str]) -> Path | None:
     """The folder of the cache; None, with a warning, if it cannot be created, e.g. in a read-only home."""
-    folder = why = None
+    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "~/.cache"
+    folder = Path(_jax.jax_compilation_cache_dir or Path(home, "jaxkane") if isinstance(cache, bool) else cache)
     try:
-        folder = _folder(cache)
+        folder = folder.expanduser().absolute()
         folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK):
-            why = "it cannot be written"
+        if os.access(folder, os.W_OK):
+            remove_broken_programs(folder)
+            return folder
+        why = "it cannot be written"
     except (FileExistsError, NotADirectoryError):
         raise ValueError(
             f"configure: cache={str(folder)!r} is a file, or is inside one. Pass the name of a folder."
         ) from None
     except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
         why = str(error)
-    if why is None and folder is not None:
-        remove_broken_programs(folder)
-        return folder
-    where = "" if folder is None else f" in {folder}"
     warnings.warn(
-        f"jaxkane.configure: compiled programs cannot be stored{where} ({why}). Each process compiles them again. "
+        f"jaxkane.configure: compiled programs cannot be stored in {folder} ({why}). Each process compiles them again. "
         "Pass a folder with write permission as configure(cache=...), or pass cache=False.",
         UserWarning,
         stacklevel=3,
@@ -191,15 +167,14 @@ def _made_folder(cache: bool | str | os.PathLike[str]) -> Path | None:
 
 def _store_programs(folder: Path | None) -> None:
     """Keep every compiled program in a folder, also in child processes. None: keep no programs."""
-    jax.config.update("jax_compilation_cache_dir", folder and str(folder))
-    if folder is None:
-        os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
-    else:
+    _jax.update("jax_compilation_cache_dir", folder and str(folder))
+    os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+    if folder is not None:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
         for name, value in _KEPT.items():
-            jax.config.update(name, value)
+            _jax.update(name, value)
             os.environ[name.upper()] = str(value)
-    internals.look_for_cache_again()  # JAX looks for a folder once, at its first compilation
+    reset_cache()  # JAX looks for a folder once, at its first compilation
 
 
 _KEPT = {
@@ -210,21 +185,17 @@ _KEPT = {
 }
 
 
-def _why_off() -> str | None:
-    return kernels.why_not() if kernels.is_wanted() else "switched off"
-
-
 def _told(done: Configuration) -> str:
-    lines = [f"jaxkane: {'float64' if done.float64 else 'float32'}"]
+    text = f"jaxkane: {'float64' if done.float64 else 'float32'}"
     if done.devices is not None:
-        lines[0] += f", {done.devices} CPU device{'s' if done.devices > 1 else ''}"
-    lines[0] += ", native kernels" if done.native else f", no native kernels ({_why_off()})"
+        text += f", {done.devices} CPU device{'s' if done.devices > 1 else ''}"
+    why = kernels.why_not() if kernels.is_wanted() else "switched off"
+    text += ", native kernels" if done.native else f", no native kernels ({why})"
     if done.cache is None:
-        return f"{lines[0]}; compiled programs are not stored."
+        return f"{text}; compiled programs are not stored."
     sizes = [entry.stat().st_size for entry in os.scandir(done.cache) if entry.name.endswith("-cache")]
     there = f"{len(sizes)} now, {sum(sizes) / 2**20:.1f} MB" if sizes else "none yet"
-    lines += [
-        f"  Compiled programs are stored in {done.cache} ({there}). You may delete this folder at any time.",
-        "  Stored programs return NaN instead of raising an exception. The `status` of a simulation states the reason.",
-    ]
-    return "\n".join(lines)
+    return (
+        f"{text}\n  Compiled programs are stored in {done.cache} ({there}). You may delete this folder at any time.\n"
+        "  Stored programs return NaN instead of raising an exception. The `status` of a simulation states the reason."
+    )

@@ -21,10 +21,9 @@ OPERATORS: dict[str, Callable[..., Any]] = {
 }
 """Arithmetic by JAX's names, for all objects with Python's operators."""
 
-CALLS = ("jit", "pjit")
 # Nested programs, and the parameter that contains them. Their rules for derivatives have been used before, or are not
 # needed.
-_OPENED = dict.fromkeys(CALLS, "jaxpr") | dict.fromkeys(("custom_jvp_call", "custom_vjp_call"), "call_jaxpr")
+_OPENED = {"jit": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
 
 # Operations by the names of JAX's primitives.
 FLOATS = ("float64", "float32")

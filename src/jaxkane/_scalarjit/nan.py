@@ -30,37 +30,28 @@ def nan_where(missing: Bool[Array, " *leading"], values: PyTree, origin: PyTree)
     The derivative of a missing value is NaN in every direction in which `origin` changes, and zero in the others. In
     reverse mode, a missing value that is not used contributes exactly zero.
     """
-    return _masked(False, missing, values, origin)
+    return _with_rough_zero(1, missing, values, origin, lambda missing, x: jnp.where(missing, jnp.nan, x))
 
 
 def nan_derivative_where(rough: Bool[Array, " *leading"], values: PyTree, origin: PyTree) -> PyTree:
     """`values` unchanged, with derivatives of any order that are NaN where they are `rough`. Arguments as
     `nan_where`."""
-    return _masked(True, rough, values, origin)
+    return _with_rough_zero(1, rough, values, origin, lambda rough, x: jnp.where(rough, jax.lax.stop_gradient(x), x))
 
 
 def all_finite(values: PyTree) -> Bool[Array, ""]:
     """Whether all float arrays in a tree are finite."""
-    return jnp.all(jnp.isfinite(flat(jax.lax.stop_gradient(eqx.filter(values, eqx.is_inexact_array)))))
-
-
-def flat(values: PyTree) -> Array:
-    """All float arrays in one row, with separate real and imaginary parts."""
-    parts = _raveled(values)
-    return jnp.concatenate(parts) if parts else jnp.zeros(0)
+    parts = parts_of(jax.lax.stop_gradient(eqx.filter(values, eqx.is_inexact_array)))
+    return jnp.all(jnp.isfinite(jnp.concatenate(parts or [jnp.zeros(0)])))
 
 
 def parts_of(values: PyTree) -> list[Array]:
     """All float arrays, with separate real and imaginary parts. Scalars are combined in one array, other arrays do not
     change."""
-    parts = _raveled(values)
+    rows = [jnp.ravel(x) for x in jax.tree.leaves(values) if eqx.is_inexact_array(x)]
+    parts = [part for x in rows for part in ((x.real, x.imag) if jnp.iscomplexobj(x) else (x,))]
     single = [x for x in parts if x.size == 1]
     return [*([jnp.concatenate(single)] if single else []), *[x for x in parts if x.size > 1]]
-
-
-def _raveled(values: PyTree) -> list[Array]:
-    parts = [jnp.ravel(x) for x in jax.tree.leaves(values) if eqx.is_inexact_array(x)]
-    return [part for x in parts for part in ((x.real, x.imag) if jnp.iscomplexobj(x) else (x,))]
 
 
 def constant(values: PyTree) -> PyTree:
@@ -74,11 +65,15 @@ def derivative_free_where_not_finite(f: Callable[..., Any], *arguments: Any) -> 
     For trial values that are discarded: they are not used, but in reverse mode 0 * NaN would make the derivatives with
     respect to the arguments NaN. Closed-over arrays count as arguments.
     """
-    value, moving, fixed = _of_arrays(f, arguments)
+    f = eqx.filter_closure_convert(f, *arguments)
+    moving, other = eqx.partition((f, arguments), eqx.is_inexact_array)
+    fixed, rest = eqx.partition(other, eqx.is_array)
 
-    @jax.custom_jvp
-    def gated(moving: PyTree, fixed: PyTree) -> PyTree:
-        return value(moving, fixed)
+    def value(moving: PyTree, fixed: PyTree) -> PyTree:
+        f, arguments = eqx.combine(moving, fixed, rest)
+        return f(*arguments)
+
+    gated = jax.custom_jvp(value)
 
     @gated.defjvp
     def _(primals: PyTree, tangents: PyTree) -> PyTree:
@@ -92,24 +87,37 @@ def derivative_free_where_not_finite(f: Callable[..., Any], *arguments: Any) -> 
 
 def nan_beyond_second_derivative(rough: Bool[Array, ""], values: PyTree, origin: PyTree) -> PyTree:
     """`values`, with derivatives that are NaN from the third order on if they are `rough`. Arguments as `nan_where`."""
+    return _with_rough_zero(3, rough, values, origin, lambda _, x: x)
+
+
+def _with_rough_zero(
+    order: int, rough: Array, values: PyTree, origin: PyTree, shown: Callable[[Array, Array], Array]
+) -> PyTree:
+    """`shown(rough, x)` for each array x of `values`; derivatives from this order on are NaN where `rough`."""
     parts = parts_of(origin)
 
     def one(x: Array) -> Array:
-        point = [part.astype(x.dtype) for part in parts]
-        return x + jnp.broadcast_to(_zero_until(3, rough, jnp.zeros((), x.dtype), point), x.shape)
+        if x.size == 0:
+            return x
+        where = jnp.reshape(rough, (*rough.shape, *(1,) * (x.ndim - rough.ndim)))
+        real = jnp.finfo(x.dtype).dtype
+        zero = _zero_until(order, where, jnp.zeros(x.shape, real), [part.astype(real) for part in parts])
+        # Subtracted, so that -0.0 keeps its sign.
+        return shown(where, x) - (jax.lax.complex(zero, zero) if jnp.iscomplexobj(x) else zero)
 
     return jax.tree.map(one, values)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _zero_until(order: int, rough: Array, zero: Array, point: list[Array]) -> Array:
-    """Zero; its derivatives are zero below this order and NaN from this order on."""
+    """Zero; its derivatives are zero below this order and NaN from this order on, where `rough`."""
     return jnp.where(_never(*point), jnp.nan, zero)
 
 
 @functools.partial(_zero_until.defjvp, symbolic_zeros=True)
 def _(order: int, primals: PyTree, tangents: PyTree) -> PyTree:
     (rough, zero, point), point_dot = primals, tangents[2]
+    # A part of the point without a tangent, e.g. the times of samples, does not contribute to the derivative.
     moving = [tangent for tangent in point_dot if not isinstance(tangent, SymbolicZero)]
     y = _zero_until(order, rough, zero, point)
     if order == 1:
@@ -117,56 +125,10 @@ def _(order: int, primals: PyTree, tangents: PyTree) -> PyTree:
     return y, _zero_until(order - 1, rough, zero, point) * sum(map(jnp.sum, moving), zero)
 
 
-def _of_arrays(f: Callable[..., Any], arguments: PyTree) -> tuple[Callable[..., Any], Any, Any]:
-    """`f(*arguments)` as a function of its float arrays and its other arrays, including closed-over ones. **Returns:**
-    this function, the float arrays and the others."""
-    f = eqx.filter_closure_convert(f, *arguments)
-    moving, other = eqx.partition((f, arguments), eqx.is_inexact_array)
-    fixed, rest = eqx.partition(other, eqx.is_array)
-
-    def value(moving: PyTree, fixed: PyTree) -> PyTree:
-        f, arguments = eqx.combine(moving, fixed, rest)
-        return f(*arguments)
-
-    return value, moving, fixed
-
-
 def _never(*points: Array) -> Array:
     """Always False, but batched if any of `points` is. Primal and tangent must have the same batch axes inside a
     `while_loop`."""
     return functools.reduce(jnp.logical_or, [jnp.any(jnp.isnan(x)) for x in points], jnp.array(False)) & False
-
-
-def _masked(shown: bool, missing: Array, values: PyTree, origin: PyTree) -> PyTree:
-    parts = parts_of(origin)
-
-    def one(x: Array) -> Array:
-        if x.size == 0:
-            return x
-        real = jnp.finfo(x.dtype).dtype
-        there = jnp.broadcast_to(jnp.reshape(missing, (*missing.shape, *(1,) * (x.ndim - missing.ndim))), x.shape)
-        point = [part.astype(real) for part in parts]
-        if jnp.iscomplexobj(x):
-            return jax.lax.complex(_mask(shown, there, x.real, point), _mask(shown, there, x.imag, point))
-        return _mask(shown, there, x, point)
-
-    return jax.tree.map(one, values)
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _mask(shown: bool, missing: Array, x: Array, point: list[Array]) -> Array:
-    missing = missing | _never(*point)
-    return jnp.where(missing, x if shown else jnp.full_like(x, jnp.nan), x)
-
-
-# A part of the point without a tangent, e.g. the times of samples, does not contribute to the derivative.
-@functools.partial(_mask.defjvp, symbolic_zeros=True)
-def _(shown: bool, primals: PyTree, tangents: PyTree) -> PyTree:
-    (missing, x, point), (_, x_dot, point_dot) = primals, tangents
-    if isinstance(x_dot, SymbolicZero):
-        x_dot = jnp.zeros_like(x)
-    moving = [tangent for tangent in point_dot if not isinstance(tangent, SymbolicZero)]
-    return _mask(shown, missing, x, point), jnp.where(missing, nan_if_moved(moving, point, x), x_dot)
 
 
 def nan_if_moved(tangents: list[Array], point: list[Array], like: Array) -> Array:

@@ -18,7 +18,7 @@ from jaxtyping import PyTree
 from .backends import native
 from .cache import Cache
 from .cache_key import CacheKey, explain_leaked_tracer, key_of, trace_with_snapshot
-from .compat import MISSING, ClosedJaxpr, Tracer
+from .compat import ClosedJaxpr, Tracer
 from .components import Replay, is_exact
 from .jaxpr import Solved, cse, is_fusable, program_of, replaced, specs_of, unsupported_primitives
 from .program import ArgumentRoles, Program, warn_once
@@ -100,8 +100,6 @@ class ScalarFunction:
 
     def program(self, *args: PyTree) -> tuple[list[Any], Program | None]:
         """The numbers of the arguments, and their program; None if it cannot be one operation."""
-        if MISSING is not None:
-            return [], None
         label, (numbers, key) = _label(args[0]), key_of(*args)
         try:
             with explain_leaked_tracer(label):
@@ -192,8 +190,6 @@ class ScalarFunction:
         `memory`: a dict of evaluated equations. Equations that do not depend on a direction are then evaluated only
         once. It belongs to one trace.
         """
-        if MISSING is not None:
-            return self.__wrapped__(arrays, components)[quantity]
         (numbers, key), row = key_of(arrays), jax.tree.leaves(components)  # only the numbers of components are read
         dtype = jnp.result_type(*([x for x in row if not is_exact(x)] or [float]))
         key = key._replace(structure=jax.tree.structure((arrays, components)), types=(key.types, len(row), dtype))

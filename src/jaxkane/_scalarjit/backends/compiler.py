@@ -62,7 +62,6 @@ def _seal(name: str, code: bytes) -> bytes:
     return _MARK + hashlib.sha256(name.encode() + b"\n" + code).hexdigest().encode() + b"\n"
 
 
-_OLDEST_LLVM = 20
 _MATHEMATICS = {"Linux": "libm.so.6", "Darwin": "/usr/lib/libSystem.B.dylib", "Windows": "ucrtbase.dll"}
 
 
@@ -155,15 +154,16 @@ class LLVMCompiler:
         return name if self.has_libmvec and kind and self.has(name) else None
 
 
+@functools.cache
 def without_llvm() -> str | None:
     """Why LLVM cannot be used in this process; None if it can."""
     try:
-        from llvmlite.binding import llvm_version_info
+        import llvmlite.binding  # noqa: F401
     except ImportError:
         return "llvmlite is not installed: pip install llvmlite"
     except OSError as error:  # its shared library cannot be loaded
         return f"LLVM does not work here: {error}"
-    return None if llvm_version_info >= (_OLDEST_LLVM,) else "llvmlite is too old: pip install 'llvmlite>=0.45'"
+    return None
 
 
 def _load(llvm: Any, file: str | None, name: str) -> bool:

@@ -1,7 +1,6 @@
 """Graphs of scalars as LLVM text, and the wrapper by which XLA calls a kernel. Does not compile.
 
-The wrapper reads and writes XLA's structures at fixed offsets (`ffi_layout`). Each call first compares the sizes that
-the structures state, and returns an error to XLA if they differ.
+The wrapper reads and writes XLA's structures at fixed offsets (`ffi_layout`).
 """
 
 from __future__ import annotations
@@ -16,11 +15,6 @@ from .ffi_layout import LAYOUT
 
 _METADATA = 1
 _API_VERSION = (0, 1)
-_INTERNAL = 13
-_MOVED = (
-    "jaxkane: this version of jaxlib uses another calling convention than the native kernels. "
-    "Disable native kernels: jaxkane.configure(native=False)."
-)
 
 
 def wrapper_text(
@@ -32,7 +26,7 @@ def wrapper_text(
     of_kernel: str = "",
 ) -> str:
     """The function that XLA calls. For each index of the outer dimensions it calls the kernel for the lanes of the last
-    dimension. If a structure has an unexpected size, it returns an error to XLA.
+    dimension.
 
     **Arguments:**
 
@@ -47,39 +41,31 @@ def wrapper_text(
     lines = [
         f"%in = alloca ptr, i64 {max(n_in, 1)}",
         f"%out = alloca ptr, i64 {max(n_out, 1)}",
-        f"%error = alloca i8, i64 {LAYOUT.error_size + 4}, align 8",
         *_load("extension", "ptr", "frame", LAYOUT.frame_extension),
         "%plain = icmp eq ptr %extension, null",
-        "br i1 %plain, label %check, label %asked",
+        "br i1 %plain, label %run, label %asked",
         "asked:",
         *_load("type", "i32", "extension", LAYOUT.extension_type),
         f"%is.metadata = icmp eq i32 %type, {_METADATA}",
-        "br i1 %is.metadata, label %tell, label %check",
+        "br i1 %is.metadata, label %tell, label %run",
         "tell:",
         *_load("metadata", "ptr", "extension", LAYOUT.extension_metadata),
         *_store("major", f"i32 {_API_VERSION[0]}", "metadata", LAYOUT.metadata_major),
         *_store("minor", f"i32 {_API_VERSION[1]}", "metadata", LAYOUT.metadata_minor),
         *_store("traits", "i32 0", "metadata", LAYOUT.metadata_traits),
         "ret ptr null",
-        "check:",
-        *_checks(n_in, n_out),
         "run:",
     ]
-    for side, n in (("in", n_in), ("out", n_out)):
+    for side, n, place in (("in", n_in, LAYOUT.frame_arguments), ("out", n_out, LAYOUT.frame_results)):
+        lines += _load(f"{side}.list", "ptr", "frame", place + LAYOUT.list_items)
         for i in range(n):
             b = f"{side}{i}"
             lines += _load(f"{b}.buffer", "ptr", f"{side}.list", 8 * i)
             lines += _load(f"{b}.data", "ptr", f"{b}.buffer", LAYOUT.buffer_data)
             lines.append(f"%{b}.slot = getelementptr ptr, ptr %{side}, i64 {i}")
-    lines += [*_calls(kernel, sizes, batch_mask, n_in, bytes_of), *_refusal()]
-    body = "\n".join(["entry:", *lines])
-    message = "".join(f"\\{byte:02X}" for byte in _MOVED.encode())
-    return (
-        f'@moved = private constant [{len(_MOVED) + 1} x i8] c"{message}\\00"\n'
-        + (of_kernel or f"declare void @{kernel}(ptr, ptr, i64)\n")
-        + "declare void @llvm.trap()\n"
-        f"define ptr @it(ptr %frame) {{\n{body}\n}}\n"
-    )
+    body = "\n".join(["entry:", *lines, *_calls(kernel, sizes, batch_mask, n_in, bytes_of)])
+    declared = of_kernel or f"declare void @{kernel}(ptr, ptr, i64)\n"
+    return f"{declared}define ptr @it(ptr %frame) {{\n{body}\n}}\n"
 
 
 def _load(name: str, kind: str, base: str, place: int) -> list[str]:
@@ -88,52 +74,6 @@ def _load(name: str, kind: str, base: str, place: int) -> list[str]:
 
 def _store(name: str, value: str, base: str, place: int) -> list[str]:
     return [f"%{name}.at = getelementptr i8, ptr %{base}, i64 {place}", f"store {value}, ptr %{name}.at"]
-
-
-def _checks(n_in: int, n_out: int) -> list[str]:
-    """Branch to %run or to %wrong. Sizes and counts are checked first, because pointers may be followed only if these
-    are right."""
-    lines: list[str] = []
-
-    def need(name: str, condition: str, base: str, place: int) -> None:
-        lines.extend(_load(name, "i64", base, place))
-        comparison, number = condition.split()
-        lines.append(f"%{name}.fine = icmp {comparison} i64 %{name}, {number}")
-        lines.append(f"br i1 %{name}.fine, label %{name}.yes, label %wrong")
-        lines.append(f"{name}.yes:")
-
-    need("frame.size", f"uge {LAYOUT.frame_size}", "frame", 0)
-    for side, place, count in (("in", LAYOUT.frame_arguments, n_in), ("out", LAYOUT.frame_results, n_out)):
-        need(f"{side}.size", f"eq {LAYOUT.list_size}", "frame", place)
-        need(f"{side}.count", f"eq {count}", "frame", place + LAYOUT.list_count)
-        lines.extend(_load(f"{side}.list", "ptr", "frame", place + LAYOUT.list_items))
-        if count:  # all elements have the same structure
-            lines.extend(_load(f"{side}.first", "ptr", f"{side}.list", 0))
-            need(f"{side}.first.size", f"uge {LAYOUT.buffer_size}", f"{side}.first", 0)
-    return [*lines, "br label %run"]
-
-
-def _refusal() -> list[str]:
-    """An error made by XLA's function. If that function is not at its offset either, the process is terminated, because
-    the results were not written."""
-    return [
-        "wrong:",
-        *_load("api", "ptr", "frame", LAYOUT.frame_api),
-        *_load("api.size", "i64", "api", 0),
-        f"%api.fine = icmp uge i64 %api.size, {LAYOUT.api_error_create + 8}",
-        "br i1 %api.fine, label %say, label %nothing",
-        "nothing:",
-        "call void @llvm.trap()",
-        "unreachable",
-        "say:",
-        *_load("create", "ptr", "api", LAYOUT.api_error_create),
-        f"store i64 {LAYOUT.error_size}, ptr %error",
-        *_store("error.extension", "ptr null", "error", 8),
-        *_store("error.message", "ptr @moved", "error", LAYOUT.error_message),
-        *_store("error.code", f"i32 {_INTERNAL}", "error", LAYOUT.error_code),
-        "%made = call ptr %create(ptr %error)",
-        "ret ptr %made",
-    ]
 
 
 def _calls(

@@ -30,7 +30,6 @@ def switched_on(word: str) -> bool:
 
 _wanted = switched_on(os.environ.get("JAXKANE_NATIVE", ""))
 _lock = threading.RLock()
-_told: set[str] = set()
 
 
 def llvm_compiler() -> LLVMCompiler:
@@ -58,7 +57,7 @@ def is_wanted() -> bool:
 
 def is_on() -> bool:
     """Whether programs become native kernels. Warns once if LLVM is installed but kernels cannot be called."""
-    if not _wanted or _without_llvm():
+    if not _wanted or without_llvm():
         return False
     why = why_not()
     if why:
@@ -68,25 +67,15 @@ def is_on() -> bool:
 
 def why_not() -> str | None:
     """Why native kernels are not possible in this process; None if they are."""
-    return _without_llvm() or _refused()
-
-
-def tell(why: str) -> None:
-    """Warn that XLA replaces native kernels; once for each reason."""
-    with _lock:
-        is_new = why not in _told
-        _told.add(why)
-    if is_new:
-        warnings.warn(
-            f"jaxkane does not use native kernels: {why}. XLA compiles the equations instead.",
-            UserWarning,
-            stacklevel=3,
-        )
+    return without_llvm() or _refused()
 
 
 @functools.cache
-def _without_llvm() -> str | None:
-    return without_llvm()
+def tell(why: str) -> None:
+    """Warn that XLA replaces native kernels; once for each reason."""
+    warnings.warn(
+        f"jaxkane does not use native kernels: {why}. XLA compiles the equations instead.", UserWarning, stacklevel=3
+    )
 
 
 @functools.cache

@@ -83,7 +83,11 @@ class Windows:
             own = x.shape[sum(mask) :]
             x = x.reshape(*(n if is_there else 1 for n, is_there in zip(sizes, mask, strict=True)), *own)
             rows.append(jnp.broadcast_to(x, (*sizes, *own)).reshape(*shape, math.prod(own)))
-        elements = [self._element(rows, shape, k, dtype) for k, _, dtype in self.elements]
+        places = [None if k is None else self.graph.nodes[k].operands for k, *_ in self.elements]
+        elements = [
+            jnp.zeros(shape, dtype) if place is None else rows[place[0]][..., place[1]]
+            for place, (*_, dtype) in zip(places, self.elements, strict=True)
+        ]
         starts, ones = tuple(np.zeros((), dtype)[()] for *_, dtype in self.elements), (1,) * len(shape)
 
         def combine(*xs: Any) -> Sequence[Array]:
@@ -105,12 +109,6 @@ class Windows:
     @property
     def is_long(self) -> bool:
         return len(self.order) > _LONG
-
-    def _element(self, rows: Sequence[Any], shape: tuple[int, ...], node: int | None, dtype: str) -> Array:
-        if node is None:
-            return jnp.zeros(shape, dtype)
-        argument, element, _ = self.graph.nodes[node].operands
-        return rows[argument][..., element]
 
     def _combined(self, _: Any, elements: Sequence[Any]) -> tuple[Any, ...]:
         values = {k: x for (k, *_), x in zip(self.elements, elements, strict=True)}
