@@ -524,6 +524,23 @@ def test_each_of_several_events_at_one_time_occurs_once_in_alphabetical_order():
 
 
 @pytest.mark.slow
+def test_a_jump_that_mirrors_the_function_of_another_event_does_not_cause_that_event():
+    """The jump takes x from 1 to -1, so x does not cross zero before it moves up again."""
+    count = {"mode": 1.0}
+    ride = moving(
+        lambda t, q, u, x: {
+            "mirror": jk.rising(t - 0.5, then={"x": -q["x"]}),
+            "down": jk.falling(q["x"], then=count),
+            "up": jk.rising(q["x"], then=count),
+        },
+        x=0.5,
+    )
+    assert ride.ok
+    assert [ride.jumps.name(i) for i in range(int(ride.jumps.count))] == ["mirror", "up"]
+    np.testing.assert_allclose(ride.jumps.t[:2], [0.5, 1.5], atol=1e-12)
+
+
+@pytest.mark.slow
 def test_an_event_that_ends_the_simulation_is_not_hidden_by_a_jump_at_the_same_time():
     ride = moving(lambda t, q, u, x: {"a": jk.rising(t - 1.0, then={"mode": 1.0}), "stop": q["x"] - 1.0})
     assert ride.reason == "stop"
