@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import t as student
 from systems import POSED, TRIAL, Track
 
 import jaxkane as jk
@@ -238,8 +239,10 @@ def test_a_fit_ends_at_a_declared_bound_if_the_optimum_is_outside():
     assert not found.ok
     best = 0.3 + 0.3 * (of_drift @ of_gain) / (of_drift @ of_drift)  # with a gain of 0.7
     assert found.estimates == pytest.approx({"gain": 0.7, "drift": best}, abs=1e-4)
-    with pytest.raises(ValueError, match="do not determine gain"):
-        profile(found, "gain")
+    # The sum of squares is proportional to (1 - gain)^2.
+    quantile = student.ppf(0.975, found.degrees_of_freedom["gain"])
+    end = 1.0 - 0.3 * (1.0 + quantile**2 * found.variance / found.cost) ** 0.5
+    assert profile(found, "gain", n=21).interval == pytest.approx((end, 0.7), rel=1e-3)
 
 
 def asked(parameters, x):

@@ -172,7 +172,8 @@ class Profile:
     - `level`: confidence level of the interval.
     - `interval`: profile-likelihood interval. Its ends are where `costs` exceed their minimum by the threshold for
         `level`, which uses the quantile and the errors of `Fit.intervals`. If an end is outside the values, it is the
-        parameter's bound or infinite. For a parabola it equals the interval of `Fit.intervals`.
+        parameter's bound or infinite. For a parabola it equals the interval of `Fit.intervals`. For an estimate at a
+        bound, the threshold uses `Fit.variance`.
     - `estimates`: for each value, the estimates of all parameters by name.
     """
 
@@ -214,32 +215,49 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
         raise ValueError(f"profile: `n` must be at least 3, and `span` must be positive; got n = {n}, span = {span}.")
     refuse_unless_at_a_minimum(fit.status, "profile")
     i, error, best = fit.names.index(name), fit.standard_errors[name], fit.estimates[name]
-    if not np.isfinite(error):
+    prior = float(fit.parameters.prior_mean[i]), float(fit.parameters.prior_deviation[i])
+
+    def fixed_at(value: float, deviation: float, point: Unknowns) -> tuple[float, Fit]:
+        pinned = fit.problem.with_priors({name: (value, deviation)})
+        result = uninterrupted(search(pinned, LeastSquares(), start=pinned.at({name: value}, point)))
+        pin = (result.estimates[name] - value) / deviation
+        return result.cost - pin**2 + ((result.estimates[name] - prior[0]) / prior[1]) ** 2, result
+
+    if name in fit.identifiability.at_bound:
+        # The fit has no standard error there. Find the distance from the bound at which the cost has its limit.
+        quantile = t_quantile(level, fit.degrees_of_freedom[name])
+        (low, high), rise = fit.parameters.bounds[i].tolist(), quantile**2 * fit.variance
+        inward, half = 1.0 if best - low < high - best else -1.0, 0.1 * float(fit.parameters.scale[i])
+        for _ in range(8):
+            half = min(half, 0.9 * (high - low))
+            excess = fixed_at(best + inward * half, 1e-4 * half, fit.point)[0] - fit.cost
+            if 0.5 * rise < excess < 2.0 * rise:
+                break
+            half *= float(np.clip((rise / max(excess, 1e-300)) ** 0.5, 0.1, 10.0))
+        error = half / quantile
+    elif not np.isfinite(error):
         raise ValueError(
             f"profile: these data do not determine {name}: {fit.message}. Add a prior, or omit it from `free`."
         )
-    half = float(fit.half_widths(level)[i])  # of the interval before it is truncated at the bounds
+    else:
+        half = float(fit.half_widths(level)[i])  # of the interval before it is truncated at the bounds
+        # At one standard error, computed with `sigma` as it was passed, the cost exceeds its minimum by one.
+        rise = (half / fit.identifiability.given_sigma_errors[i]) ** 2
     step = (1.5 * (half if np.isfinite(half) else error) if span is None else span * error) / (n // 2)
-    prior = float(fit.parameters.prior_mean[i]), float(fit.parameters.prior_deviation[i])
-    # At one standard error, computed with `sigma` as it was passed, the cost exceeds its minimum by one.
-    fits, rise = {}, (half / fit.identifiability.given_sigma_errors[i]) ** 2
+    fits = {best: (fit.cost, fit.estimates)}
     for side in (1, -1):
-        point, cost, k = fit.point, fit.cost, int(side < 0)
+        point, cost, k = fit.point, fit.cost, 1
         # Near a bound on the other side, the cost is not a parabola: continue until it exceeds the limit.
         while k <= n // 2 or (span is None and k <= 2 * n and cost <= fit.cost + rise < np.inf):
             value = best + side * k * step
-            pinned = fit.problem.with_priors({name: (value, 1e-4 * error)})
             try:
-                start = pinned.at({name: value}, point)
-                result = uninterrupted(search(pinned, LeastSquares(), start=start))
+                cost, result = fixed_at(value, 1e-4 * error, point)
             except ValueError:  # outside its bounds, or it cannot be simulated
                 break
             if result.status not in AT_A_MINIMUM:
                 break
-            pin = (result.estimates[name] - value) / (1e-4 * error)
-            cost = result.cost - pin**2 + ((result.estimates[name] - prior[0]) / prior[1]) ** 2
             fits[value], point, k = (cost, result.estimates), result.point, k + 1
-    if not fits:
+    if len(fits) < 2:
         raise ValueError(
             f"profile: no fit converges with {name} fixed near {best:.6g}: {fit.message}. Pass another `span`."
         )
