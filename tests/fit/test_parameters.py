@@ -1,5 +1,7 @@
 """Free parameters: entries of vectors, what is tied, bounds, scales, priors; each contradiction is one clear error."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,13 +15,17 @@ from jaxkane.fit import (
     Delay,
     Free,
     Gain,
+    Huber,
     LeastSquares,
     NoiseScale,
     Offset,
     Problem,
     SpectralDensity,
     Trial,
+    bootstrap,
+    cross_validate,
     fit,
+    minimize,
     profile,
 )
 from jaxkane.fit.problem.bijections import Interval, log_gaussian_mass
@@ -243,6 +249,26 @@ def test_a_fit_ends_at_a_declared_bound_if_the_optimum_is_outside():
     quantile = student.ppf(0.975, found.degrees_of_freedom["gain"])
     end = 1.0 - 0.3 * (1.0 + quantile**2 * found.variance / found.cost) ** 0.5
     assert profile(found, "gain", n=21).interval == pytest.approx((end, 0.7), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_studies_of_an_estimate_at_its_bound():
+    """The data are those of a small negative gain. Scales of errors are estimated with the bound, too."""
+    T, r = np.linspace(0.0, 1.0, 11), np.random.default_rng(0)
+    trials = [
+        Trial(T, {"x": x}, {"push": T}, sigma=0.001, initial={"x": 0.0, "x_dot": 0.0})
+        for x in 0.15 * T**2 - 0.01 * T**3 + 0.001 * r.normal(size=(12, 11))
+    ]
+    problem = Problem.of(Limited(), trials, ("gain", "drift"), simulation=POSED["simulation"])
+    robust = problem.with_specification(dataclasses.replace(problem.specification, errors={"x": Huber()}))
+    for found in (minimize(problem, LeastSquares()), minimize(robust, LeastSquares())):
+        assert found.status == "bound"
+        low, high = profile(found, "gain").interval
+        assert low == 0.0
+        assert 0.0 < high < 0.01
+    found = minimize(problem, LeastSquares())
+    assert bootstrap(found, n=200).intervals()["gain"] == (-np.inf, np.inf)
+    assert np.isfinite(cross_validate(found).held_out).all()
 
 
 def asked(parameters, x):

@@ -338,8 +338,8 @@ def bootstrap(fit: Fit, *, n: int = 2000, seed: int = 0) -> Bootstrap:
     - `n`: number of draws, at least 100.
     - `seed`: seed of the random generator.
 
-    **Returns:** a `Bootstrap`. For a parameter that one cluster alone determines, the values are NaN and the interval
-    is infinite.
+    **Returns:** a `Bootstrap`. For a parameter that one cluster alone determines, and for one at its bound, the values
+    are NaN and the interval is infinite. `profile` finds the interval of a parameter at its bound.
 
     **Raises:** `ValueError` with too few trials and windows (`Fit.clusters`), for a fit that has not converged, and for
     a validated fit.
@@ -365,6 +365,7 @@ def bootstrap(fit: Fit, *, n: int = 2000, seed: int = 0) -> Bootstrap:
     values = np.array(jax.vmap(fit.parameters.values)(x), float)
     # A draw without the only cluster that determines a parameter would not change its estimate and would look precise.
     values[:, np.isinf(np.array([*fit.clustered_errors.values()]))] = np.nan
+    values[:, np.isin(fit.names, fit.identifiability.at_bound)] = np.nan  # the slope of the bijection vanishes there
     return Bootstrap(dict(zip(fit.names, values.T, strict=True)), fit.clusters)
 
 

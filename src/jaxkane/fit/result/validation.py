@@ -321,6 +321,7 @@ def cross_validate(fit: Fit, folds: int | str | Sequence[Sequence[int]] | None =
         with np.errstate(invalid="ignore"):
             alone = 1 - (with_all / trained.identifiability.given_sigma_errors) ** 2 > LARGEST_LEVERAGE
         alone &= ~fit.parameters.has_distribution  # which predicts a group that is left out
+        alone &= ~np.isin(fit.names, trained.identifiability.at_bound)  # the bound determines it
         if trained.status not in AT_A_MINIMUM:
             failures.append(f"Without {without} the fit has not converged ({STATUS[trained.status]}).")
             values[:] = np.nan

@@ -9,10 +9,9 @@ import numpy as np
 from ..problem.model import Unknowns
 from ..problem.problem import Problem
 from ..result.diagnostics import AT_A_MINIMUM
-from .blocks import eliminate
 from .linearization import Linearization
 from .local_unknowns import moved, usable
-from .optimizers import Iterate
+from .optimizers import Iterate, proposed
 
 ROUNDS = 50
 SETTLED = 1e-8
@@ -47,7 +46,7 @@ def estimate_errors(problem: Problem, best: Iterate, status: str, history: list[
             before, estimated = at.cost, _with_estimated_errors(problem, at)
             again = estimated.linearize(point)
             assert again is not None  # the initial states exist, because they do not depend on error models
-            gain = again.squares - eliminate(again.blocks, 0.0).step(0.0)[1]
+            gain = proposed(estimated, again, 0.0).gain
             problem, (point, at) = estimated, _step(estimated, point, again) if converged else (point, again)
             best = dataclasses.replace(best, point=point, cost=at.cost, at=at)
             history.append(at.cost)
@@ -76,12 +75,11 @@ def _with_estimated_errors(problem: Problem, at: Linearization) -> Problem:
 def _step(problem: Problem, point: Unknowns, at: Linearization) -> tuple[Unknowns, Linearization]:
     """One step of Fisher scoring, damped if it does not reduce the cost. If no step does, the point is unchanged."""
     for damping in (0.0, 0.1, 1.0, 10.0):
-        eliminated = eliminate(at.blocks, damping)
-        x, predicted = eliminated.step(damping)
-        tried = moved(point, x, eliminated)
+        step = proposed(problem, at, damping)
+        tried = moved(point, step.x, step.eliminated)
         there = problem.linearize(tried)
         if there is not None and usable(there) and there.cost <= at.cost:
             return tried, there
-        if at.squares - predicted <= SMALL_GAIN:  # integration errors hide such a small gain
+        if step.gain <= SMALL_GAIN:  # integration errors hide such a small gain
             break
     return point, at
