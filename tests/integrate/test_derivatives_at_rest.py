@@ -54,6 +54,21 @@ def right():
     return np.array([[x0, 0.0, 1 - x0, 0.0, forced.y[0, -1]], [0.0, np.cos(200.0), 0.0, fast, 0.0]])
 
 
+class Plain(Oscillator):
+    """A parameter without `jk.parameter` is a float of Python, not an array."""
+
+    mass: float = 1.0
+
+
+def test_derivatives_by_a_number_in_an_input_function_of_a_system_with_plain_floats():
+    def x(amplitude):
+        push = {"push": lambda t, state: amplitude * state.system.mass}
+        return jk.simulate(Plain(), jk.State([0.0, 0.0], [0.0, 0.0]), [0.0, 10.0], push)["x"][-1]
+
+    slope = 1 - scipy.linalg.expm(10 * A)[0, 0]
+    np.testing.assert_allclose([jax.grad(x)(0.0), jax.jacfwd(x)(0.0)], slope, rtol=1e-5)
+
+
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 @pytest.mark.parametrize("start", [0.0, 1e-9])
 def test_derivatives_at_rest_are_those_of_the_closed_form(mode, start):

@@ -113,14 +113,31 @@ def solve(
 
 def _with_captured_numbers(system: System, state: State, t: Array, signals: Any) -> Any:
     """The signals. Numbers that a function of them captures from outside, traced ones, become numbers of the signal."""
-    context = InputState(state.q, state.u, state.x, t, system)
     if isinstance(signals, SharedTimes):
         return dataclasses.replace(signals, signals=_with_captured_numbers(system, state, t, signals.signals))
+    context = _with_arrays(InputState(state.q, state.u, state.x, t, system))
 
     def converted(f: Any) -> Any:
-        return eqx.filter_closure_convert(f, t, context) if callable(f) and not is_samples(f) else f
+        if not callable(f) or is_samples(f):
+            return f
+        return _Converted(eqx.filter_closure_convert(f, t, context))
 
     return converted(signals) if callable(signals) else {name: converted(f) for name, f in signals.items()}
+
+
+class _Converted(eqx.Module):
+    """An input function whose captured numbers are leaves. It accepts the types alone that it was converted with."""
+
+    f: Any
+
+    def __call__(self, t: Array, state: InputState) -> Any:
+        return self.f(t, _with_arrays(state))
+
+
+def _with_arrays(state: InputState) -> InputState:
+    """The same, with arrays as the numbers of its system. They are floats of Python where the system is not traced."""
+    as_array = lambda x: jnp.asarray(x, state.q.dtype) if isinstance(x, float) else x  # noqa: E731
+    return dataclasses.replace(state, system=jax.tree.map(as_array, state.system))
 
 
 def _solved(
