@@ -271,6 +271,21 @@ def test_studies_of_an_estimate_at_its_bound():
     assert np.isfinite(cross_validate(found).held_out).all()
 
 
+@pytest.mark.slow
+def test_errors_by_windows_with_an_unknown_of_the_trial_and_a_prior():
+    """The windows are the clusters. The offset belongs to all of them, the prior to none."""
+    T, r = np.linspace(0.0, 10.0, 201), np.random.default_rng(1)
+    push = np.sin(3 * T) + 0.5 * np.cos(7 * T)
+    x = 0.3 * T**2 / 2 + 0.5 * (-np.sin(3 * T) / 9 - np.cos(7 * T) / 98) + 0.01 * r.normal(size=201)
+    trial, free = Trial(T, {"x": x}, {"push": push}, sigma=0.01), ("gain", "drift", Offset("push", each="trial"))
+    options = {"window": 0.5, "priors": {"gain": (0.5, 0.1), "drift": (0.3, 0.1)}, "simulation": POSED["simulation"]}
+    found = minimize(Problem.of(Track(), trial, free, **options), LeastSquares())
+    assert found.clusters == ("window", 20)
+    for name, right in {"gain": 0.5, "drift": 0.3}.items():
+        assert 0.0 < found.clustered_errors[name] < np.inf
+        assert abs(found.estimates[name] - right) < 4.0 * found.standard_errors[name]
+
+
 def asked(parameters, x):
     y = parameters.values(x)
     return y, parameters.slopes(x), parameters.inverse(y), parameters.prior_residuals(x), parameters.all(x)

@@ -213,7 +213,8 @@ def clustered(problem: Problem, point: Unknowns, at: Linearization, directions: 
         clusters, shared = owner, np.zeros((len(problem.trials), 0), int)
         if kind == "window":  # treat each as a trial; trial unknowns are shared
             clusters, shared = np.arange(W, dtype=np.int32), of_b
-            blocks = Blocks(blocks.R, blocks.priors, jnp.asarray(clusters[:, None]), n_z, 0, 0)
+            priors = jnp.pad(blocks.priors, ((0, 0), (n_b, 0)))
+            blocks = Blocks(blocks.R, priors, jnp.asarray(clusters[:, None]), n_z, 0, 0)
         data = squares(eliminate(blocks, 0.0).R.astype(float))
         of_priors, n = np.zeros_like(data), shared.shape[1]
         rows = nuisance_prior_rows(problem, point)[0]
@@ -223,7 +224,7 @@ def clustered(problem: Problem, point: Unknowns, at: Linearization, directions: 
     places = np.column_stack([shared, np.tile(np.arange(first, first + k), (len(shared), 1))])
     P = np.zeros((first + k, first + k))
     np.add.at(P, (places[:, :, None], places[:, None, :]), of_priors[:, :-1, :-1])
-    P[first:, first:] += squares(np.asarray(blocks.priors, float))[:-1, :-1]
+    P[first:, first:] += squares(np.asarray(at.blocks.priors, float))[:-1, :-1]
     return Clusters(data[used][:, :-1, :-1], data[used][:, :-1, -1], places[np.nonzero(used)[0]], P)
 
 
