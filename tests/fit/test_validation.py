@@ -257,7 +257,7 @@ def test_notes_report_a_fit_that_has_not_converged():
     assert ended.notes[0].startswith("The fit has not converged (stopped after the last step")
 
 
-@pytest.mark.weekly
+@pytest.mark.slow
 def test_validation_of_a_system_with_given_parameter_values():
     """Of a system as of a fit with the same values: nothing but the starts is estimated."""
     posed = {"unknown": ("x", "x_dot"), "simulation": STEP}

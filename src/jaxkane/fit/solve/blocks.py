@@ -72,7 +72,7 @@ class Blocks(eqx.Module):
     def of_parameters(self) -> np.ndarray:
         """The sensitivity (m, n_x) of all rows to x, before elimination."""
         columns = np.asarray(self.R)[:, :, -1 - self.n_x : -1]
-        return np.concatenate([columns.reshape(-1, self.n_x), np.asarray(self.priors)[:, :-1]])
+        return np.concatenate([*columns, np.asarray(self.priors)[:, :-1]])
 
     @property
     def column_norms(self) -> np.ndarray:
