@@ -364,8 +364,8 @@ class EventValues(NamedTuple):
             rests = jnp.abs(self.rates) <= float(jnp.finfo(side.dtype).eps) ** 0.5 * jnp.abs(before.rates)
             self = self._replace(rates=jnp.where((event == places) & rests, 0.0, self.rates))
             side = jnp.where((event == places) & (way * self.rates > 0), way, side)
-            # A jump from x to -x changes a function, but not its size: the size must be that of a rounding error.
             is_due = (event != places) & (side * self.values < 0) & (jnp.abs(change) <= 4 * limit)
+            # A jump from x to -x does not change the size of a function. It is due only if it was near zero before.
             is_due &= jnp.abs(before.values) <= 4 * limit
             side = jnp.where(is_due | (jnp.abs(before.values) <= 2 * limit), side, 0.0)
         vanishes = jnp.abs(self.values) <= jnp.where(is_due, 4.0, 1.0) * limit

@@ -126,7 +126,7 @@ def _with_captured_numbers(system: System, state: State, t: Array, signals: Any)
 
 
 class _Converted(eqx.Module):
-    """An input function whose captured numbers are leaves. It accepts the types alone that it was converted with."""
+    """An input function whose captured numbers are leaves. Its arguments must have the types of its tracing."""
 
     f: Any
 
@@ -135,7 +135,7 @@ class _Converted(eqx.Module):
 
 
 def _with_arrays(state: InputState) -> InputState:
-    """The same, with arrays as the numbers of its system. They are floats of Python where the system is not traced."""
+    """The state, with arrays instead of Python floats in its system. A system that is not traced may contain both."""
     as_array = lambda x: jnp.asarray(x, state.q.dtype) if isinstance(x, float) else x  # noqa: E731
     return dataclasses.replace(state, system=jax.tree.map(as_array, state.system))
 

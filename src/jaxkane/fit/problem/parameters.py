@@ -336,12 +336,14 @@ class Parameters(eqx.Module):
         targets, deviations = (self.prior_mean, self.joint_target), (self.prior_deviation, self.joint_deviation)
         return join([own, matrix]), *(join([*map(xp.asarray, pair)]) for pair in (targets, deviations))
 
+    @np.errstate(invalid="ignore")  # a step of a search to an infinite value is rejected later
     def prior_residuals(self, x: Float[Array, " p"]) -> Any:
         """(matrix [values, log values] - target) / deviation (p + k,) of all priors; zero without a prior."""
         (matrix, target, deviation), xp = self.prior_terms, _numpy_of(self, x)
         values = xp.asarray(self.all_values(x))
         return (matrix @ xp.concatenate([values, xp.log(self._positive(values))]) - target) / deviation
 
+    @np.errstate(invalid="ignore")  # a step of a search to an infinite value is rejected later
     def prior_rows(self, x: Float[Array, " p"]) -> Any:
         """The derivatives of `prior_residuals` by x, followed by the residuals: (p + k, p + 1)."""
         (matrix, _, deviation), xp, n = self.prior_terms, _numpy_of(self, x), self.rest.size

@@ -172,8 +172,8 @@ class Profile:
     - `level`: confidence level of the interval.
     - `interval`: profile-likelihood interval. Its ends are where `costs` exceed their minimum by the threshold for
         `level`, which uses the quantile and the errors of `Fit.intervals`. If an end is outside the values, it is the
-        parameter's bound or infinite. For a parabola it equals the interval of `Fit.intervals`. For an estimate at a
-        bound, the threshold uses `Fit.variance`.
+        parameter's bound or infinite. For a parabola it equals the interval of `Fit.intervals`. If the estimate is at a
+        bound, the threshold is the square of the quantile times `Fit.variance`.
     - `estimates`: for each value, the estimates of all parameters by name.
     """
 
@@ -224,7 +224,7 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
         return result.cost - pin**2 + ((result.estimates[name] - prior[0]) / prior[1]) ** 2, result
 
     if name in fit.identifiability.at_bound:
-        # The fit has no standard error there. Find the distance from the bound at which the cost has its limit.
+        # The fit has no standard error there. Search the distance from the bound at which the cost has its limit.
         quantile = t_quantile(level, fit.degrees_of_freedom[name])
         (low, high), rise = fit.parameters.bounds[i].tolist(), quantile**2 * fit.variance
         inward, half = 1.0 if best - low < high - best else -1.0, 0.1 * float(fit.parameters.scale[i])
