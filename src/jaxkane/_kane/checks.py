@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import operator
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import jax
@@ -21,15 +21,9 @@ from .._scalarjit.components import (
     Bool,
     Component,
     Numbers,
-    Triple,
     as_vector,
-    cross,
-    dot,
     is_exact,
-    mul,
     stack,
-    sub,
-    total,
 )
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point
@@ -42,7 +36,7 @@ from .description import DescriptionEvaluator, at_random_point, frames_of, struc
 from .scaling import least_norm
 
 ROUNDING, MEASURED = 2e-3, 0.05
-ROTOR = 1e-12  # share of the largest moment of inertia: if the middle one is below this, the body is a rotor
+ROTOR = 1e-12  # share of the largest moment of inertia: if the others are below it, the body is a rotor
 ROTATION_ERROR = 1e-3
 """The largest permitted error of [R] [R]^T. Measured and integrated Euler parameters do not have exactly unit norm."""
 
@@ -94,76 +88,66 @@ def check_bodies(system: System, t: Component, q: Numbers) -> None:
     bodies = _masses_and_inertias.numpy(system, t, q)
     masses = np.array([mass for mass, _ in bodies], float)  # (b,) [kg]
     inertias = np.array([I for _, I in bodies], float).reshape(-1, 3, 3)  # (b,3,3) [kg m^2]
-    for i in np.flatnonzero(~_without_fault(masses, inertias)):
-        mass, I = masses[i], inertias[i]
-        fault = _fault(mass, I) or (_excess_in_words(I) if system.check_inertia else "")
-        if fault:
-            u = (0.0,) * (len(system.speeds) + len(system.dependent_speeds))
-            body = DescriptionEvaluator(system).motion(t, tuple(q), u).bodies[i]
-            message = f"{type(system).__name__}, body {body.name!r}: {fault}"
-            if body.about is not None:
-                message += f" These are central moments: the inertia was given about the point {body.about.name!r}."
-            if why_no_body(mass, I, system.check_inertia):
-                raise ValueError(message)
-            warnings.warn(message, UserWarning, stacklevel=4)
+    # All bodies at once, because a loop over 25 bodies takes 1 ms in each call of a public function.
+    for i in np.flatnonzero(~is_possible(masses, inertias.transpose(1, 2, 0), system.check_inertia, ROUNDING)):
+        u = (0.0,) * (len(system.speeds) + len(system.dependent_speeds))
+        body, at = DescriptionEvaluator(system).motion(t, tuple(q), u).bodies[i], (masses[i], inertias[i])
+        message = f"{type(system).__name__}, body {body.name!r}: " + why_no_body(*at, system.check_inertia, ROUNDING)
+        if body.about is not None:
+            message += f" These are central moments: the inertia was given about the point {body.about.name!r}."
+        if why_no_body(*at, system.check_inertia):
+            raise ValueError(message)
+        warnings.warn(message, UserWarning, stacklevel=4)
 
 
-def _without_fault(masses: np.ndarray, inertias: np.ndarray) -> np.ndarray:
-    """Which bodies (b,) have neither a `_fault` nor an excess.
-
-    This is vectorized, because a loop over 25 bodies takes 1 ms in each call of a public function.
-    """
-    slack = 1e-6 * np.maximum(np.abs(inertias).max(axis=(1, 2), initial=0.0), 1e-300)
-    is_symmetric = np.abs(inertias - inertias.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0) <= slack  # not NaN
-    least, middle, largest = np.linalg.eigvalsh(np.where(is_symmetric[:, None, None], inertias, 0.0)).T
-    is_possible = (middle <= ROTOR * largest) | (largest - middle - least <= ROUNDING * largest)
-    return (masses >= 0) & is_symmetric & (least >= -slack) & is_possible
-
-
-def why_no_body(mass: float, I: np.ndarray, check_inertia: bool) -> str:
-    """Why this mass and inertia (3, 3) are impossible, even with measurement errors. Return "" if they are possible."""
-    return _fault(mass, I) or (
-        _excess_in_words(I) if check_inertia and excess(np.linalg.eigvalsh(I)) > MEASURED else ""
-    )
-
-
-def _fault(mass: float, I: np.ndarray) -> str:
-    """An error in a mass or an inertia that measurement errors do not explain, or "" if there is none."""
-    slack = 1e-6 * max(np.abs(I).max(), 1e-300)
+def why_no_body(mass: float, I: np.ndarray, check_inertia: bool, accepted: float = MEASURED) -> str:
+    """Why this mass and inertia (3, 3) are impossible, see `is_possible`. Return "" if they are possible."""
+    if is_possible(mass, I, check_inertia, accepted):
+        return ""
     if not mass >= 0:
         return f"the mass is {mass:.6g} kg; it must not be negative."
     if not np.all(np.isfinite(I)):
         return f"the inertia is not finite: {I.tolist()}."
-    if np.abs(I - I.T).max() > slack:
+    if np.abs(I - I.T).max() > 1e-6 * np.abs(I).max():
         return f"the inertia matrix is not symmetric: {I.tolist()}."
-    moments = np.linalg.eigvalsh(I)
-    if moments[0] < -slack:
-        return f"the principal moments of inertia are {_listed(moments)} kg m^2; none may be negative."
-    return ""
-
-
-def _excess_in_words(I: np.ndarray) -> str:
-    moments = np.linalg.eigvalsh(I)
-    if excess(moments) <= ROUNDING:
-        return ""
+    moments = ", ".join(f"{x:.6g}" for x in np.linalg.eigvalsh(I))
+    if not is_possible(mass, I, False):
+        return f"the principal moments of inertia are {moments} kg m^2; none may be negative."
     return (
-        f"no body has the principal moments of inertia {_listed(moments)} kg m^2: the largest exceeds "
+        f"no body has the principal moments of inertia {moments} kg m^2: the largest exceeds "
         "the sum of the other two (triangle inequality). An excess of up to 5 % causes a warning; a larger excess is "
         "rejected. Correct the inertia, or set `check_inertia = False` in the class of the system."
     )
 
 
-def excess(moments: np.ndarray) -> float:
-    """The excess of the largest of three principal moments, in increasing order, over the sum of the other two.
+def is_possible(mass: Numbers, I: Any, check_inertia: bool, accepted: float = MEASURED) -> Any:
+    """Whether a mass and an inertia are possible. The only rule for this: for users, batches and files.
 
-    It is relative to the largest moment, and 0 for a rotor.
+    **Arguments:**
+
+    - `mass`: [kg], or (b,) for b bodies.
+    - `I`: (3, 3) or (3, 3, b) [kg m^2].
+    - `check_inertia`: whether to check the triangle inequality of the principal moments.
+    - `accepted`: the accepted excess of the largest moment over the sum of the others, relative to the largest.
     """
-    a, b, c = moments
-    return 0.0 if b <= ROTOR * c else float((c - a - b) / c)
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = I
+    slack = 1e-6 * (abs(xx) + abs(yy) + abs(zz)) + float(jnp.finfo(jnp.result_type(xx, float)).tiny)
+    skews = abs(xy - yx), abs(xz - zx), abs(yz - zy)
+    possible = (mass >= 0) & (skews[0] <= slack) & (skews[1] <= slack) & (skews[2] <= slack)
+    possible &= _is_semidefinite(xx + slack, yy + slack, zz + slack, xy, xz, yz)
+    if not check_inertia:
+        return possible
+    # For moments a <= b <= c, c - a - b > x c if c > trace / (2 - x). Then trace / (2 - x) - I is not semidefinite.
+    half, minors = (xx + yy + zz) / (2.0 - accepted) + slack, xx * yy + xx * zz + yy * zz - xy * xy - xz * xz - yz * yz
+    is_rotor = minors <= ROTOR * (xx + yy + zz) ** 2
+    return possible & (_is_semidefinite(half - xx, half - yy, half - zz, -xy, -xz, -yz) | is_rotor)
 
 
-def _listed(moments: np.ndarray) -> str:
-    return ", ".join(f"{x:.6g}" for x in moments)
+def _is_semidefinite(xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Any:
+    # Use pivots: LAPACK is slow for the eigenvalues of many small matrices, and solves them in sequence.
+    with np.errstate(all="ignore"):
+        second = yy - xy * xy / xx
+        return (xx > 0) & (second > 0) & (zz - xz * xz / xx - (yz - xy * xz / xx) ** 2 / second > 0)
 
 
 def bodies_are_possible(system: System, t: Component, q: Numbers) -> Bool:
@@ -175,52 +159,7 @@ def bodies_are_possible(system: System, t: Component, q: Numbers) -> Bool:
 def _bodies_are_possible(system: System, t: Component, q: Numbers) -> Bool:
     bodies = _masses_and_inertias.__wrapped__(system, t, q)
     rows = [(mass, [(x, y, z) for x, y, z in I]) for mass, I in bodies]
-    return functools.reduce(operator.and_, [_is_possible(mass, I, system.check_inertia) for mass, I in rows])
-
-
-Matrix = Sequence[Triple]
-
-
-def _is_possible(mass: Any, I: Matrix, check_inertia: bool) -> Bool:
-    # For moments a <= b <= c, the excess c - a - b is above 5 % of c if c > trace / 1.95. This is not the case if
-    # trace / 1.95 - I is positive semidefinite.
-    skew = _largest([sub(I[i][j], I[j][i]) for i, j in _PAIRS])
-    possible = (mass >= 0) & (skew <= 1e-6 * _size(I)) & _is_semidefinite(I)
-    if check_inertia:
-        trace = total(I[i][i] for i in range(3))
-        half = mul(1.0 / (2.0 - MEASURED), trace)
-        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = I
-        xx, yy, zz = sub(half, xx), sub(half, yy), sub(half, zz)
-        rest = [(xx, sub(0.0, xy), sub(0.0, xz)), (sub(0.0, yx), yy, sub(0.0, yz)), (sub(0.0, zx), sub(0.0, zy), zz)]
-        is_rotor = total(_minors(I)) <= mul(1e-12, mul(trace, trace))
-        possible &= _is_semidefinite(rest) | is_rotor
-    return possible
-
-
-_PAIRS = ((0, 1), (0, 2), (1, 2))
-
-
-def _is_semidefinite(A: Matrix) -> Bool:
-    # Use principal minors: LAPACK is slow for the eigenvalues of many small matrices, and solves them in sequence.
-    size = _size(A)
-    minors = [
-        *((A[i][i], size) for i in range(3)),
-        *((x, size**2) for x in _minors(A)),
-        (dot(A[0], cross(A[1], A[2])), size**3),
-    ]
-    return functools.reduce(operator.and_, [x >= -1e-6 * scale for x, scale in minors])
-
-
-def _size(A: Matrix) -> Component:
-    return _largest([x for row in A for x in row])
-
-
-def _largest(xs: Sequence[Component]) -> Component:
-    return functools.reduce(jax.lax.max, map(jnp.abs, xs))
-
-
-def _minors(A: Matrix) -> list[Any]:
-    return [sub(mul(A[i][i], A[j][j]), mul(A[i][j], A[j][i])) for i, j in _PAIRS]
+    return functools.reduce(operator.and_, [is_possible(mass, I, system.check_inertia) for mass, I in rows])
 
 
 # -- contradictions in a system

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from .._kane.checks import MEASURED, ROUNDING, excess
+from .._kane.checks import ROUNDING, is_possible
 
 Choice = Literal["refuse", "nearest"]
 
@@ -60,15 +60,16 @@ def possible_inertias(owner: str, bodies: Sequence[FileBody], choice: Choice, ba
             used.append(np.zeros((3, 3)))
             continue
         moments = np.linalg.eigvalsh(body.inertia)
+        excess = (moments[2] - moments[1] - moments[0]) / np.abs(moments).max()
+        fault = "which are negative" if moments[0] < 0.0 else f"excess {100 * excess:.2g} %"
         change, I = _changed(body, moments, choice, balance)
         used.append(body.inertia if I is None else I)
-        listed = ", ".join(f"{x:.4g}" for x in moments)
-        line = f"  {body.name}: principal moments {listed} kg m^2, {_fault(moments)}"
+        line = f"  {body.name}: principal moments {_listed(moments)} kg m^2, {fault}"
         if I is not None:
-            reported.append(f"{line}; {change} {', '.join(f'{x:.4g}' for x in np.linalg.eigvalsh(I))}")
+            reported.append(f"{line}; {change} {_listed(np.linalg.eigvalsh(I))}")
         elif change:
             refused.append(line)
-        elif excess(moments) > ROUNDING:
+        elif not is_possible(1.0, body.inertia, True, ROUNDING):
             reported.append(line)
     why = "The largest principal moment of inertia of a body is at most the sum of the other two, and none is negative."
     if refused:
@@ -83,7 +84,7 @@ def possible_inertias(owner: str, bodies: Sequence[FileBody], choice: Choice, ba
 
 def _changed(body: FileBody, moments: np.ndarray, choice: Choice, balance: bool) -> tuple[str, np.ndarray | None]:
     """Why an impossible inertia is changed or refused, and the changed inertia."""
-    if not _is_impossible(moments) and not (balance and excess(moments) > ROUNDING):
+    if is_possible(1.0, body.inertia, True, *([ROUNDING] if balance else [])):
         return "", None
     if balance and moments.sum() >= 0.0:
         return "balanced:", np.eye(3) * moments.sum() / 3.0
@@ -98,12 +99,8 @@ def _changed(body: FileBody, moments: np.ndarray, choice: Choice, balance: bool)
     return "impossible", None
 
 
-def _is_impossible(moments: np.ndarray) -> bool:
-    return bool(excess(moments) > MEASURED or moments[0] < -1e-6 * np.abs(moments).max())
-
-
-def _fault(moments: np.ndarray) -> str:
-    return "which are negative" if moments[0] < 0.0 else f"excess {100 * excess(moments):.2g} %"
+def _listed(moments: np.ndarray) -> str:
+    return ", ".join(f"{x:.4g}" for x in moments)
 
 
 def nearest_inertia(I: np.ndarray) -> np.ndarray:
