@@ -259,13 +259,14 @@ def _start(system: System, state: Any, row: Row, t: Component) -> State:
     state = as_state(system, state)
     groups = (system.coordinates, system.speeds, system.states)
     q, u, x = (row.of(names, but=read) for names in groups)
-    parts = []
+    parts: list[Any] = []
     for values, columns, names in zip((state.q, state.u, state.x), (q, u, x), groups, strict=True):
         for name, value in columns.items():
             values = values.at[names.index(name)].set(value)  # pyright: ignore[reportOptionalMemberAccess]
         parts.append(values)
     # The contact states belong to coordinates, speeds and parameters.
-    state = State(*parts, None if q or u or parameters else state.contacts)
+    contacts = None if q or u or parameters else state.contacts
+    state = State(parts[0], parts[1], parts[2], contacts)
     if system.dependent_coordinates and (q or parameters):  # they depend on the others
         state = assemble(system, state.q, state.u, state.x, t=t)
     return state
