@@ -286,13 +286,13 @@ def test_invalid_process_noise_is_rejected():
     for noise, said in (
         ({"x_dot": -0.1}, "finite and not negative, got -0.1"),
         ({"x_dot": np.nan}, "not negative"),
-        ({"x_dot": [0.1, 0.2]}, "the spectral density of x_dot must be a real number"),
-        ({"x": 0.1}, "A coordinate follows"),
+        ({"x_dot": [0.1, 0.2]}, "`noise` of x_dot must be a real number"),
+        ({"x": 0.1}, "Noise in the rate of a coordinate"),
         ({"xdot": 0.1}, "x_dot"),
     ):
         with pytest.raises(ValueError, match=said):
             posed(noise=noise)
-    with pytest.raises(TypeError, match="dict of spectral densities"):
+    with pytest.raises(TypeError, match="dict of numbers by name"):
         posed(noise=0.1)
     for free, said in (
         (SpectralDensity("push"), "`noise` has"),

@@ -416,9 +416,13 @@ def test_progress_is_printed_on_request_only(capfd):
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ((PENDULUM, START, [0.0, 0.5, 0.4]), ValueError, r"`ts` must increase: ts\[1\] = 0.5 is followed by 0.4"),
-        ((PENDULUM, START, [0.0, 0.5, 0.5]), ValueError, "must increase"),
-        ((PENDULUM, START, [0.0, np.nan]), ValueError, "not finite"),
+        (
+            (PENDULUM, START, [0.0, 0.5, 0.4]),
+            ValueError,
+            r"`ts` must be finite and increase: ts\[1\] = 0.5 is followed by 0.4",
+        ),
+        ((PENDULUM, START, [0.0, 0.5, 0.5]), ValueError, "must be finite and increase"),
+        ((PENDULUM, START, [0.0, np.nan]), ValueError, "must be finite and increase"),
         ((PENDULUM, START, [0.0]), ValueError, "at least two times"),
         (
             (PENDULUM, START, TS, {"elbow": 1.0}),
@@ -428,7 +432,7 @@ def test_progress_is_printed_on_request_only(capfd):
         (
             (PENDULUM, START, TS, {"elbow_torque": np.ones(7)}),
             ValueError,
-            r"samples of 'elbow_torque' have the shape \(7,\)",
+            r"'elbow_torque' has samples of the shape \(7,\)",
         ),
         ((PENDULUM, START, TS, {"elbow_torque": np.full(11, np.nan)}), ValueError, "not finite"),
         ((PENDULUM, START, TS, 3.0), TypeError, "dict by name or a function"),

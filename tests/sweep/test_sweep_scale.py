@@ -166,7 +166,7 @@ def test_a_folder_of_another_sweep_is_refused(rides, folder, change, message):
 
 def test_a_folder_with_other_files_is_rejected(tmp_path):
     (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(ValueError, match=r"is not empty and does not contain sweep.json"):
+    with pytest.raises(ValueError, match=r"has no sweep.json, and its . files are not the chunks"):
         run(tmp_path)
 
 

@@ -15,7 +15,7 @@ from .._kane.constraint_residuals import configuration_residual, relative_condit
 from .._kane.contact import forces_in_contact, layout_of
 from .._kane.kanes_method import accelerations_and_mass_matrix
 from .._kane.reactions import Reactions
-from .._kane.right_hand_side import rates, vector_field
+from .._kane.right_hand_side import vector_field
 from .._kane.scaling import SMALLEST_SIZE, relative, term_sizes
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import ZERO3, Triple, add3, as_vector, cross, dot, matvec, stack
@@ -70,36 +70,24 @@ def _quantities(system, t, q, u, inputs, u_dot):
 
 
 @jit
-def _powers_along(system, t, q, u, values, input_rates):
-    """Powers of the loads and of prescribed motions (n_t, l + 1), and their time derivatives along the trajectory.
+def _powers_along(system, t, q, u, values, input_rates, contacts):
+    """Powers of the loads, of prescribed motions and of contacts (n_t, l + 1 or 2), and their time derivatives.
 
     **Arguments:**
 
     - `values`: inputs and states of the first order by name.
     - `input_rates`: time derivatives of the inputs by name.
+    - `contacts` (n_t, m): the contact states; None if the system has no contacts.
     """
 
-    def powers(t, q, u, values):
-        u_dot, _ = accelerations_and_mass_matrix(system, t, q, u, values)
-        quantities = _quantities(system, t, q, u, values, u_dot)
-        return jnp.concatenate([quantities["power"], quantities["prescribed"][None]])
-
-    def powers_and_rates(t, q, u, values, input_rates):
-        dot = rates(system, t, q, u, values)
-        of_states = dict(zip(system.states, () if dot.x is None else dot.x, strict=True))
-        return jax.jvp(powers, (t, q, u, values), (jnp.ones_like(t), dot.q, dot.u, {**input_rates, **of_states}))
-
-    return jax.vmap(powers_and_rates)(t, q, u, values, input_rates)
-
-
-@jit
-def _powers_in_contact_along(system, t, q, u, values, input_rates, contacts):
-    """As `_powers_along`, with the power of the contact forces. `contacts` (n_t, m): the contact states."""
-
     def powers(contacts, t, q, u, values):
-        u_dot, of_contacts = _contact_power(system, t, q, u, values, contacts)
+        if contacts is None:
+            u_dot, of_contacts = accelerations_and_mass_matrix(system, t, q, u, values)[0], []
+        else:
+            u_dot, power = _contact_power(system, t, q, u, values, contacts)
+            of_contacts = [power[None]]
         quantities = _quantities(system, t, q, u, values, u_dot)
-        return jnp.concatenate([quantities["power"], jnp.stack([quantities["prescribed"], of_contacts])])
+        return jnp.concatenate([quantities["power"], quantities["prescribed"][None], *of_contacts])
 
     def powers_and_rates(t, q, u, values, input_rates, contacts):
         x = jnp.stack([values[name] for name in system.states]) if system.states else None
@@ -163,36 +151,42 @@ def _momenta(motion: Motion, places: _Places) -> tuple[Triple, Triple]:
 
 
 def _work(
-    t: np.ndarray,
+    system: System,
+    trajectory: Trajectory,
+    reached: np.ndarray,
     quantities: dict[str, Any],
-    pieces: Pieces,
     between: Callable[[np.ndarray], dict[str, Any]],
-    eps: float,
-) -> tuple[np.ndarray, float]:
-    """Work (n_t,) of all loads and prescribed motions, and an estimate of its error.
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Work (n_t,) of all loads and prescribed motions, an estimate of its error, and the losses (n_t,) in jumps.
 
-    **Arguments:**
-
-    - `between`: a function of times (n_t - 1,) between those of the trajectory that returns the quantities there.
-    - `eps`: the relative precision of coordinates.
+    `between`: a function of times (n_t - 1,) between those of the trajectory that returns the quantities there.
     """
-    work, integrated, rounding = np.zeros_like(t), np.ones(len(quantities["force"]) + 1), 0.0
+    t = np.asarray(trajectory.t, float)[reached]
+    jumps, known = trajectory.jumps, trajectory.discontinuities
+    has_jumps = jumps is not None and bool(int(jumps.count) or trajectory.contact_names)
+    eps = float(np.finfo(np.asarray(trajectory.q).dtype).eps)
+    work, rounding = np.zeros_like(t), 0.0
+    integrated = np.ones(len(quantities["force"]) + 1 + bool(trajectory.contact_names and has_jumps))
+    # The work of weights is exact. A jump may move a mass centre, and no load does work on that.
     for i, (F, r) in enumerate(zip(quantities["force"], quantities["place"], strict=True)):
-        if F is not None and np.ptp(F, axis=0).max() <= 1e-14 * np.abs(F).max():
+        if not has_jumps and F is not None and np.ptp(F, axis=0).max() <= 1e-14 * np.abs(F).max():
             work += (r - r[0]) @ F[0]
             rounding += eps * np.abs(r).max() * np.linalg.norm(F[0])  # in float32, 1 km from the origin: 0.1 mm
             integrated[i] = 0.0
-    if pieces.powers is not None:
-        power, rate = (x @ integrated for x in pieces.powers)
-        fine, coarse = (pieces.integral(t, power, 4, rate, spared) for spared in (0, 1))
-        return work + fine, float(np.abs(fine - coarse).max() + rounding)
+    breaks = np.zeros(0) if known is None else np.unique(np.asarray(known.times, float))
+    near, gaps = 64 * eps * (t[-1] - t[0]), np.diff(breaks[np.isfinite(breaks)])
+    if gaps.size:  # float32 at 1000 s: 64 roundings are 8 ms, and samples of 1 kHz would all be one discontinuity
+        near = min(near, 0.1 * float(np.median(gaps)))
+    if has_jumps or Pieces(t - t[0], breaks, near).inner.size:
+        piecewise, error, lost = _work_of_pieces(system, trajectory, reached, integrated, breaks, near)
+        return work + piecewise, error + rounding, lost
 
     def power_of(at: dict[str, Any]) -> np.ndarray:
         return np.column_stack([at["power"], at["prescribed"]]) @ integrated
 
-    power = power_of(quantities)
+    power, pieces, lost = power_of(quantities), Pieces(t), np.zeros_like(t)
     if not power.any():
-        return work, float(rounding)
+        return work, float(rounding), lost
     fine, coarse = (pieces.integral(t, power, points) for points in (8, min(6, len(t) - 1)))
     # Two orders agree if both interpolate across the same discontinuity. Half of the times then gives another result.
     sparse = Pieces(t[::2]).integral(t[::2], power[::2], 8) - fine[::2]
@@ -204,7 +198,62 @@ def _work(
     for place in (-1, 1):
         s = 0.5 * (t[1:] + t[:-1]) + place * half / 3**0.5  # Gauss points: the error may vanish in the middle
         missed += np.sum(half * np.abs(power_of(between(s)) - pieces.interpolated(s, power[:, None], 8)[:, 0]))
-    return work + fine, float(np.nan_to_num(max(error, missed) + rounding, nan=np.inf))
+    return work + fine, float(np.nan_to_num(max(error, missed) + rounding, nan=np.inf)), lost
+
+
+def _work_of_pieces(
+    system: System, trajectory: Trajectory, reached: np.ndarray, integrated: np.ndarray, breaks: np.ndarray, near: float
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """As `_work`, between jumps and `breaks` of the inputs, for the loads that are `integrated`.
+
+    The states before and after each jump are two more samples. `near`: the largest rounding error of a time [s].
+    """
+    jumps: Any = jax.tree.map(np.asarray, trajectory.jumps)
+    t = np.asarray(trajectory.t, float)[reached]
+    times, losses = np.zeros((2, 0)) if jumps is None else (np.asarray(x, float) for x in (jumps.t, jumps.energy))
+    m = int(np.sum(times <= t[-1] + near))  # the trajectory of an orbit ends before its last jump
+    until = times[:m]
+    # Jumps within a rounding error are one: no polynomial can pass between them.
+    first = np.flatnonzero(np.append(True, np.diff(until) > near)[:m])
+    places, times = (first, np.append(first[1:], m)[: len(first)] - 1), times[first]
+    is_own = np.abs(t[:, None] - times).min(axis=1, initial=np.inf) > near  # a sample at a jump is that after it
+    known = trajectory.discontinuities
+    sides = known.inputs if known is not None and known.inputs else (trajectory.inputs, trajectory.inputs)
+
+    def rows(side: int) -> dict[str, Any]:
+        """Samples of their own, then jumps, on one side of each time."""
+        rows = {"q": trajectory.q, "u": trajectory.u, **trajectory.values, **sides[side]}
+        if trajectory.contact_memory is not None:
+            rows[CONTACTS] = trajectory.contact_memory
+        rows = {name: np.asarray(x)[reached][is_own] for name, x in rows.items()}
+        if jumps is None:
+            return rows
+        state = (jumps.before, jumps.after)[side]
+        at_jumps = {"q": state.q, "u": state.u, CONTACTS: state.contacts, **jumps.inputs[side]}
+        at_jumps |= {name: state.x[:, i] for i, name in enumerate(system.states)}
+        return {name: np.concatenate([x, at_jumps[name][places[side]]]) for name, x in rows.items()}
+
+    clock = np.concatenate([t[is_own], times]) - t[0]
+    order = np.argsort(clock, kind="stable")
+    clock, (before, after) = clock[order], ({name: x[order] for name, x in rows(side).items()} for side in (0, 1))
+    breaks = np.concatenate([times - t[0], breaks])
+    pieces = Pieces(clock, breaks[np.isfinite(breaks)], near)
+    values = {}
+    for name, x in before.items():
+        is_after = pieces.is_after if x.ndim == 1 else pieces.is_after[:, None]
+        values[name] = np.where(is_after, after[name][pieces.places], x[pieces.places])
+    q, u, contacts = values.pop("q"), values.pop("u"), values.pop(CONTACTS, None)
+    input_rates = {name: pieces.rate(values[name]) for name in trajectory.inputs}
+    origin = np.asarray(trajectory.t)[reached][0]
+    powers = _powers_along(system, (origin + pieces.t).astype(q.dtype), q, u, values, input_rates, contacts)
+    power, rate = (np.asarray(x, float) @ integrated for x in powers)
+    fine, coarse = (pieces.integral(clock, power, 4, rate, spared) for spared in (0, 1))
+    lost = np.append(0.0, np.cumsum(losses[:m]))
+    return (
+        fine[np.searchsorted(clock, t - t[0] - near)],
+        float(np.abs(fine - coarse).max()),
+        lost[np.searchsorted(until, t + near)],
+    )
 
 
 _NONE = np.zeros(0)
@@ -214,7 +263,7 @@ class Pieces:
     """A trajectory, split into pieces between the discontinuities of its inputs.
 
     A time (n_t,) at a discontinuity belongs to two pieces, with the inputs on its two sides. Arrays of the pieces are
-    (n,), in their order. `powers`: those of `_powers_along` at the times of the pieces, if there are discontinuities.
+    (n,), in their order.
     """
 
     def __init__(self, t: np.ndarray, breaks: np.ndarray = _NONE, near: float = 0.0):
@@ -226,22 +275,11 @@ class Pieces:
         self.is_after = again | (before == after)[self.places]
         self.is_after[-1] = False  # a discontinuity at the last time has no effect on the trajectory
         self.t, self.piece = t[self.places], np.where(self.is_after, after[self.places], before[self.places])
-        self.powers: Any = None
-
-    def of(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Combine values (n_t,) before and after the times into those (n,) of the pieces."""
-        return np.where(self.is_after, after[self.places], before[self.places])
 
     def rate(self, x: np.ndarray) -> np.ndarray:
         """Time derivatives (n,) of values (n,), by polynomials through eight times of a piece."""
-        rate = np.zeros_like(x)
-        for some, nearest in self._nearest(self.t, self.piece, 8):
-            apart = self.t[nearest] - self.t[some, None]
-            scale = np.abs(apart).max(axis=1)
-            if nearest.shape[1] > 1:
-                weights = _weights(apart / scale[:, None], np.eye(nearest.shape[1])[1])
-                rate[some] = np.sum(weights * x[nearest], axis=1) / scale
-        return rate
+        derivative = lambda n, half, scale: np.eye(2, n)[1] / scale[:, None]  # noqa: E731
+        return self._of_polynomials(self.t, self.piece, x[:, None], 8, derivative)[:, 0]
 
     def interpolated(self, t: np.ndarray, x: np.ndarray, points: int, rate: np.ndarray | None = None) -> np.ndarray:
         """Values (n_t, c) at the times t, by polynomial interpolation of the values x (n, c) at `self.t`.
@@ -252,16 +290,8 @@ class Pieces:
         - `points`: the number of nearest points of each polynomial.
         - `rate` (n, c): time derivatives, which the polynomials also match.
         """
-        values = np.zeros((len(t), x.shape[1]))
-        for some, nearest in self._nearest(t, np.searchsorted(self.inner, t), points):
-            apart, m = self.t[nearest] - t[some, None], nearest.shape[1]
-            n_rates = 0 if rate is None else m
-            scale = np.abs(apart).max(axis=1)
-            weights = _weights(apart / scale[:, None], np.eye(m + n_rates)[0], n_rates)[..., None]
-            values[some] = np.sum(weights[:, :m] * x[nearest], axis=1)
-            if rate is not None:
-                values[some] += np.sum(weights[:, m:] * scale[:, None, None] * rate[nearest], axis=1)
-        return values
+        value = lambda n, half, scale: np.eye(n)[0]  # noqa: E731
+        return self._of_polynomials(t, np.searchsorted(self.inner, t), x, points, value, rate)
 
     def integral(
         self, t: np.ndarray, x: np.ndarray, points: int, rate: np.ndarray | None = None, spared: int = 0
@@ -277,19 +307,49 @@ class Pieces:
         """
         ends = np.unique(np.concatenate([t, self.inner]))
         middle, half = 0.5 * (ends[1:] + ends[:-1]), 0.5 * np.diff(ends)
+        piece = np.searchsorted(self.inner, middle)
+
+        def moments(n: int, half: np.ndarray, scale: np.ndarray) -> np.ndarray:
+            """The integrals (k, n) of the powers of s = t / scale from -half to half (k,)."""
+            j, x = np.arange(n), half / scale
+            return scale[:, None] * np.where(j % 2 == 0, 2 * x[:, None] ** (j + 1) / (j + 1), 0.0)
+
+        rates = None if rate is None else rate[:, None]
+        gained = self._of_polynomials(middle, piece, x[:, None], points, moments, rates, spared, half)[:, 0]
         # A piece that contains none of the times uses interpolated neighbours. Their whole range is then a possible
         # error.
-        gained = 2 * half * (np.interp(middle, self.t, x) + spared * np.ptp(x))
-        for some, nearest in self._nearest(middle, np.searchsorted(self.inner, middle), points):
-            apart, m = self.t[nearest] - middle[some, None], nearest.shape[1]
+        guess = 2 * half * (np.interp(middle, self.t, x) + spared * np.ptp(x))
+        gained = np.where(np.isin(piece, self.piece), gained, guess)
+        return np.append(0.0, np.cumsum(gained))[np.searchsorted(ends, t)]
+
+    def _of_polynomials(
+        self,
+        t: np.ndarray,
+        piece: np.ndarray,
+        x: np.ndarray,
+        points: int,
+        moments: Callable[[int, np.ndarray, np.ndarray], np.ndarray],
+        rate: np.ndarray | None = None,
+        spared: int = 0,
+        half: np.ndarray | float = 0.0,
+    ) -> np.ndarray:
+        """A linear functional (n_t, c) of polynomials about the times t; zero for a piece without points.
+
+        `moments`: the functional of the powers of (time / scale), of (number of powers, `half`, scale). Otherwise as
+        `integral`.
+        """
+        result, half = np.zeros((len(t), x.shape[1])), np.broadcast_to(half, t.shape)
+        for some, nearest in self._nearest(t, piece, points):
+            apart, m = self.t[nearest] - t[some, None], nearest.shape[1]
             n_rates = 0 if rate is None else m - spared
             scale = np.maximum(np.abs(apart).max(axis=1), half[some])
-            weights = _weights(apart / scale[:, None], _moments(m + n_rates, half[some] / scale), n_rates)
-            values = x[nearest]
+            scale = np.where(scale > 0, scale, 1.0)
+            weights = _weights(apart / scale[:, None], moments(m + n_rates, half[some], scale), n_rates)[..., None]
+            result[some] = np.sum(weights[:, :m] * x[nearest], axis=1)
             if rate is not None:
-                values = np.concatenate([values, scale[:, None] * rate[nearest[:, :n_rates]]], axis=1)
-            gained[some] = scale * np.sum(weights * values, axis=1)
-        return np.append(0.0, np.cumsum(gained))[np.searchsorted(ends, t)]
+                rates = scale[:, None, None] * rate[nearest[:, :n_rates]]
+                result[some] += np.sum(weights[:, m:] * rates, axis=1)
+        return result
 
     def _nearest(self, t: np.ndarray, piece: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """The nearest times of the same piece.
@@ -325,12 +385,6 @@ def _weights(s: np.ndarray, moments: np.ndarray, rates: int = 0) -> np.ndarray:
     powers = [s[:, None, :] ** j, j * s[:, None, :rates] ** np.maximum(j - 1, 0)]  # (k, m + rates, m), (.., rates)
     moments = np.broadcast_to(moments, (len(s), len(j)))
     return np.linalg.solve(np.concatenate(powers, axis=2), moments[..., None])[..., 0]
-
-
-def _moments(n: int, x: np.ndarray) -> np.ndarray:
-    """The integrals (k, n) of the powers of s from -x to x (k,)."""
-    j = np.arange(n)
-    return np.where(j % 2 == 0, 2 * x[:, None] ** (j + 1) / (j + 1), 0.0)
 
 
 def _condition_of_masses(M: np.ndarray) -> np.ndarray:
@@ -396,7 +450,7 @@ class Audit(eqx.Module):
     @property
     def energy_balance(self) -> float:
         """The largest energy error, relative to the largest kinetic energy or work."""
-        return _relative(self.energy_error, self.kinetic_energy, self.work)
+        return _largest(self.energy_error) / max(_largest(self.kinetic_energy), _largest(self.work), 1e-300)
 
     @property
     def drift(self) -> float:
@@ -483,13 +537,7 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
         args = jax.tree.map(lambda x: np.append(x, x[-1:], axis=0).astype(q.dtype), args)
         return jax.tree.map(lambda x: np.asarray(x, float)[:-1], _quantities_along(system, *args))
 
-    lost = np.zeros_like(ts)
-    if trajectory.jumps is not None and (int(trajectory.jumps.count) or trajectory.contact_names):
-        work, work_error, lost = _work_with_jumps(system, trajectory, reached)
-    else:
-        work, work_error = _work(
-            ts, quantities, _pieces(system, trajectory, reached), between, float(np.finfo(q.dtype).eps)
-        )
+    work, work_error, lost = _work(system, trajectory, reached, quantities, between)
     # Only the terms of C u: if C u + c0 = 0, c0 is not larger. Otherwise c0 would add the violation to the size.
     all_u = np.concatenate([u, np.asarray(trajectory.u_dep)[reached]], axis=1).astype(float)
     velocity_sizes = (np.abs(C) * np.abs(all_u).max(axis=0)).max(axis=(0, 2)) if C.size else np.zeros(0)
@@ -512,92 +560,8 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
     )
 
 
-def _work_with_jumps(
-    system: System, trajectory: Trajectory, reached: np.ndarray
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """Work (n_t,) of all loads and prescribed motions between the jumps, its error, and the losses (n_t,) in jumps.
-
-    The states before and after each jump are two more samples. All power is integrated by quadrature: a jump may move
-    a mass centre, and no load does work on that.
-    """
-    jumps: Any = jax.tree.map(np.asarray, trajectory.jumps)
-    t = np.asarray(trajectory.t, float)[reached]
-    near = 64 * float(np.finfo(jumps.t.dtype).eps) * (t[-1] - t[0])
-    m = int(np.sum(np.asarray(jumps.t, float) <= t[-1] + near))  # the ride of an orbit ends before its last jump
-    times = np.asarray(jumps.t, float)[:m]
-    # Jumps within a rounding error are one: no polynomial can pass between them.
-    first = np.flatnonzero(np.append(True, np.diff(times) > near)[:m])
-    last = np.append(first[1:], m)[: len(first)] - 1
-    places, lost_until, times = (first, last), times, times[first]
-    is_own = np.abs(t[:, None] - times).min(axis=1, initial=np.inf) > near  # a sample at a jump is that after it
-    known = trajectory.discontinuities
-    sides = known.inputs if known is not None and known.inputs else (trajectory.inputs, trajectory.inputs)
-
-    def rows(side: int) -> dict[str, Any]:
-        """Samples of their own, then jumps, on one side of each time."""
-        state, inputs = (jumps.before, jumps.after)[side], jumps.inputs[side]
-        of_states = {name: state.x[:, i] for i, name in enumerate(system.states)}
-        samples = {"q": trajectory.q, "u": trajectory.u, **trajectory.values, **sides[side]}
-        at_jumps = {"q": state.q, "u": state.u, **inputs, **of_states}
-        if trajectory.contact_memory is not None:
-            samples[CONTACTS], at_jumps[CONTACTS] = trajectory.contact_memory, state.contacts
-        parts = {name: (np.asarray(x)[reached][is_own], at_jumps[name][places[side]]) for name, x in samples.items()}
-        return {name: np.concatenate(pair) for name, pair in parts.items()}
-
-    clock = np.concatenate([t[is_own], times]) - t[0]
-    order = np.argsort(clock, kind="stable")
-    clock, (before, after) = clock[order], ({name: x[order] for name, x in rows(side).items()} for side in (0, 1))
-    breaks = times - t[0] if known is None else np.concatenate([times - t[0], np.asarray(known.times, float)])
-    pieces = Pieces(clock, breaks[np.isfinite(breaks)], near)
-    values = {}
-    for name, x in before.items():
-        is_after = pieces.is_after if x.ndim == 1 else pieces.is_after[:, None]
-        values[name] = np.where(is_after, after[name][pieces.places], x[pieces.places])
-    q, u = values.pop("q"), values.pop("u")
-    input_rates = {name: pieces.rate(values[name]) for name in trajectory.inputs}
-    origin = np.asarray(trajectory.t)[reached][0]
-    arguments = system, (origin + pieces.t).astype(q.dtype), q, u
-    if trajectory.contact_names:
-        contacts = values.pop(CONTACTS)
-        powers = _powers_in_contact_along(*arguments, values, input_rates, contacts)
-    else:
-        powers = _powers_along(*arguments, values, input_rates)
-    power, rate = (np.asarray(x, float).sum(axis=1) for x in powers)
-    fine, coarse = (pieces.integral(clock, power, 4, rate, spared) for spared in (0, 1))
-    at_samples = np.searchsorted(clock, t - t[0] - near)
-    lost = np.append(0.0, np.cumsum(np.asarray(jumps.energy, float)[:m]))[np.searchsorted(lost_until, t + near)]
-    return fine[at_samples], float(np.abs(fine - coarse).max()), lost
-
-
-def _pieces(system: System, trajectory: Trajectory, reached: np.ndarray) -> Pieces:
-    """The trajectory, split at the discontinuities of its inputs."""
-    breaks = trajectory.discontinuities
-    t, q, u = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u))
-    if breaks is None:
-        return Pieces(np.asarray(t, float))
-    elapsed, times = np.asarray(t, float) - float(t[0]), np.unique(np.asarray(breaks.times, float))
-    near, gaps = 64 * np.finfo(q.dtype).eps * elapsed.max(), np.diff(times[np.isfinite(times)])
-    if gaps.size:  # float32 at 1000 s: 64 roundings are 8 ms, and samples of 1 kHz would all be one discontinuity
-        near = min(near, 0.1 * float(np.median(gaps)))
-    pieces = Pieces(elapsed, times, near)
-    if not pieces.inner.size:
-        return pieces
-    values = {name: np.asarray(x)[reached][pieces.places] for name, x in trajectory.values.items()}
-    if breaks.inputs:
-        before, after = ({name: np.asarray(x)[reached] for name, x in inputs.items()} for inputs in breaks.inputs)
-        values |= {name: pieces.of(before[name], after[name]) for name in before}
-    input_rates = {name: pieces.rate(values[name]) for name in trajectory.inputs}
-    powers = _powers_along(system, *(x[pieces.places] for x in (t, q, u)), values, input_rates)
-    pieces.powers = tuple(np.asarray(x, float) for x in powers)
-    return pieces
-
-
 def _largest(x: np.ndarray) -> float:
     return float(np.abs(x).max(initial=0.0))
-
-
-def _relative(error: np.ndarray, *scales: np.ndarray) -> float:
-    return _largest(error) / max(*map(_largest, scales), 1e-300)
 
 
 def _verdict(x: float, look: float, bad: float) -> str:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from .._scalarjit.compat import Tracer, evaluated, interpret, operation_of, programs_in, types_of
 from .._scalarjit.nan import nan_if_not_zero
 from .._system.system import State, System
-from .inputs import CONTROLLER, INTERVAL_OF, InputState, Samples, called, count_until, is_samples, label_of, samples_of
+from .inputs import CONTROLLER, INTERVAL_OF, InputState, Samples, called, count_until, is_samples, samples_of
 
 
 class Discontinuities(NamedTuple):
@@ -80,7 +80,7 @@ def discontinuities_of(
 
     **Raises:** `ValueError` if a function calls samples at a time other than t or t - delay.
     """
-    named = {CONTROLLER: signals} if callable(signals) else {label_of(name): f for name, f in signals.items()}
+    named = {CONTROLLER: signals} if callable(signals) else {f"The input {name!r}": f for name, f in signals.items()}
     samples: list[Any] = [x for x in named.values() if is_samples(x)]
     functions = {label: f for label, f in named.items() if callable(f) and not is_samples(f)} | {**functions}
     calls = [each for label, f in functions.items() for each in _called_samples(label, f, system, origin, state, fixed)]

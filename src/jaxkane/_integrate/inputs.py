@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -71,8 +70,8 @@ class Samples(eqx.Module):
             raise ValueError(f"Samples: `ts` and `values` must have the same length of at least two; got {n} and {m}.")
         if not isinstance(self.ts, Tracer) and not np.all(np.diff(np.asarray(self.ts)) > 0):
             raise ValueError("Samples: `ts` must increase and be finite.")
-        for label, x in (("ts", self.ts), ("values", self.values)):
-            _check_finite(f"Samples: `{label}`", x)
+        _check_finite("Samples: `ts`", self.ts)
+        _check_finite("Samples: `values`", self.values)
 
     def __repr__(self) -> str:
         ts, values = concrete_numbers(self.ts), concrete_numbers(self.values)
@@ -104,7 +103,7 @@ class Samples(eqx.Module):
 
 def _check_finite(label: str, values: Array) -> None:
     if not isinstance(values, Tracer) and not np.all(np.isfinite(np.asarray(values))):
-        raise ValueError(f"{label} contains values that are not finite. Fill the gaps, or cut the record there.")
+        raise ValueError(f"{label} contains values that are not finite: fill the gaps, or cut the record there.")
 
 
 _FEW = 8192  # up to here, comparing with all samples (one vector operation) is faster than bisection (a loop)
@@ -220,17 +219,18 @@ def inputs_at(
         if not isinstance(values, Mapping):
             raise TypeError(f"{CONTROLLER} must return a dict by name, got {values!r}.")
     else:
-        values = {name: _value(name, f, t, at, now, context) for name, f in signals.items()}
+        values = {
+            name: f.piece(t, at)
+            if is_samples(f)
+            else called(f"The input {name!r}", f, now, context)
+            if callable(f)
+            else f
+            for name, f in signals.items()
+        }
     names = checked_inputs(system, values)
     return {
         name: jnp.asarray(values.get(name, 0.0), dtype=state.q.dtype) for name in (names if all_of_them else values)
     }
-
-
-def _value(name: str, signal: Any, t: Component, at: Component, now: Component, context: InputState) -> Any:
-    if is_samples(signal):
-        return signal.piece(t, at)
-    return called(label_of(name), signal, now, context) if callable(signal) else signal
 
 
 def inside(
@@ -297,10 +297,10 @@ class RateArguments(eqx.Module):
         signals = {} if callable(self.signals) else self.signals
         at = self._piece_at(times)
         along = jax.vmap(lambda x, t, at: x.piece(t, at), in_axes=(None, 0, 0 if at.ndim else None))
-        every = {name: x for name, x in signals.items() if is_samples(x)}
         return {
-            name: (x.piece if x.ts.size >= _LONG else functools.partial(along, x))(times, at)
-            for name, x in every.items()
+            name: x.piece(times, at) if x.ts.size >= _LONG else along(x, times, at)
+            for name, x in signals.items()
+            if is_samples(x)
         }
 
     def _piece_at(self, t: Array) -> Array:
@@ -312,16 +312,8 @@ class RateArguments(eqx.Module):
     def _place(self, t: Array, origin: Component = 0.0) -> Array:
         return t if self.within is None else inside(t, self.within, origin, self.share, self.past_end)
 
-    def with_numbers(self, inputs: dict[str, Array]) -> RateArguments:
-        """Replace some of the signals by numbers."""
-        return dataclasses.replace(self, signals=self.signals | inputs)
-
 
 CONTROLLER = "The function of the inputs"
-
-
-def label_of(name: str) -> str:
-    return f"The input {name!r}"
 
 
 def called(label: str, f: Any, t: Component, state: InputState) -> Any:
@@ -344,39 +336,33 @@ def as_signals(inputs: Inputs, names: Sequence[str], ts: Array, system_name: str
             f"`inputs` must be a dict by name or a function (t, state) -> dict, got {type(inputs).__name__}."
         )
     refuse_unknown(inputs, names, f"{system_name} has no input named", "it has")
-    return {name: _as_signal(name, value, ts) for name, value in inputs.items()}
+    return {name: _as_signal(f"The input {name!r}", value, ts) for name, value in inputs.items()}
 
 
-def _as_signal(name: str, value: Any, ts: Array) -> Any:
-    if callable(value):
-        if not is_samples(value):
-            _check_takes(value, f"The input {name!r}")
-        elif value.ts.ndim + value.values.ndim > 2:
-            raise ValueError(f"The input {name!r} is a batch of samples: use jaxkane.sweep or jax.vmap.")
+def _as_signal(label: str, value: Any, ts: Array) -> Any:
+    if is_samples(value):
+        if value.ts.ndim + value.values.ndim > 2:
+            raise ValueError(f"{label} is a batch of samples: use jaxkane.sweep or jax.vmap.")
         return value
-    array = real_array(value, label_of(name), jnp.result_type(ts.dtype))  # without 64 bits, float32
-    if array.ndim == 0:
-        if not isinstance(array, Tracer) and not np.isfinite(float(array)):
-            raise ValueError(f"The input {name!r} = {float(array)} is not finite.")
-        return array
-    if array.shape != ts.shape:
+    if callable(value):
+        try:
+            inspect.signature(value).bind(None, None)
+        except TypeError:
+            raise TypeError(
+                f"{label} must be a function of (t, state), the time and the state; got {value!r}."
+            ) from None
+        except ValueError:  # the signature of a function in C is unknown
+            pass
+        return value
+    array = real_array(value, label, jnp.result_type(ts.dtype))  # without 64 bits, float32
+    if array.shape not in ((), ts.shape):
         raise ValueError(
-            f"The samples of {name!r} have the shape {array.shape}, the times `ts` {ts.shape}. An array must contain "
-            "one value for each of the times `ts`, with linear interpolation between them. For other times pass "
+            f"{label} has samples of the shape {array.shape}, the times `ts` {ts.shape}. An array must contain one "
+            "value for each of the times `ts`, with linear interpolation between them. For other times pass "
             "jaxkane.Samples(times, values)."
         )
-    _check_finite(f"The samples of {name!r}", array)
-    return Samples(ts, array)
-
-
-def _check_takes(f: Callable[..., Any], label: str) -> None:
-    """**Raises:** `TypeError` for a function that does not take a time and a state."""
-    try:
-        inspect.signature(f).bind(None, None)
-    except TypeError:
-        raise TypeError(f"{label} must be a function of (t, state), the time and the state; got {f!r}.") from None
-    except ValueError:  # the signature of a function in C is unknown
-        pass
+    _check_finite(label, array)
+    return Samples(ts, array) if array.ndim else array
 
 
 def samples_of(signals: Any) -> list[Samples]:
@@ -386,6 +372,11 @@ def samples_of(signals: Any) -> list[Samples]:
 
 def is_samples(x: Any) -> bool:
     return isinstance(x, Samples)
+
+
+def map_samples(f: Callable[[Any], Any], signals: Any) -> Any:
+    """The signals, with `f` applied to those that are samples."""
+    return jax.tree.map(lambda x: f(x) if is_samples(x) else x, signals, is_leaf=is_samples)
 
 
 class SharedTimes(eqx.Module):
@@ -404,13 +395,11 @@ def share_times(signals: Any) -> SharedTimes:
     """Replace times by indices; call `restore_times` at the beginning of the program."""
     times: dict[int, Array] = {}
 
-    def indexed(x: Any) -> Any:
-        if not is_samples(x):
-            return x
+    def indexed(x: Samples) -> Samples:
         times.setdefault(id(x.ts), x.ts)
         return eqx.tree_at(lambda s: s.ts, x, list(times).index(id(x.ts)))
 
-    signals = jax.tree.map(indexed, signals, is_leaf=is_samples)
+    signals = map_samples(indexed, signals)
     return SharedTimes(tuple(times.values()), signals)
 
 
@@ -419,10 +408,7 @@ def restore_times(signals: Any) -> Any:
     if not isinstance(signals, SharedTimes):
         return signals
 
-    def restored(x: Any) -> Any:
-        return eqx.tree_at(lambda s: s.ts, x, signals.times[x.ts]) if is_samples(x) else x
-
-    return jax.tree.map(restored, signals.signals, is_leaf=is_samples)
+    return map_samples(lambda x: eqx.tree_at(lambda s: s.ts, x, signals.times[x.ts]), signals.signals)
 
 
 def for_fixed_steps(signals: Any) -> Any:
@@ -432,28 +418,26 @@ def for_fixed_steps(signals: Any) -> Any:
     the derivative that JAX would compute is 0, which is wrong.
     """
 
-    def checked(x: Any) -> Any:
-        if not is_samples(x) or not x.zero_order_hold:
+    def checked(x: Samples) -> Samples:
+        if not x.zero_order_hold:
             return x
         by_time = nan_derivative_where(jnp.array(True), jnp.zeros((), x.values.dtype), x.ts)
         return Samples(x.ts, x.values + by_time, True)
 
-    return jax.tree.map(checked, signals, is_leaf=is_samples)
+    return map_samples(checked, signals)
 
 
 def since(origin: Any, signals: Any, dtype: DTypeLike) -> Any:
     """The same signals with times since `origin` [s]. Samples that share their times still do."""
     times: dict[int, Array] = {}
 
-    def relative(x: Any) -> Any:
-        if not is_samples(x):
-            return x
+    def relative(x: Samples) -> Samples:
         if id(x.ts) not in times:
             times[id(x.ts)] = times_since(origin, x.ts, dtype)
         values = x.values if x.values.dtype == dtype else x.values.astype(dtype)
         return eqx.tree_at(lambda s: (s.ts, s.values), x, (times[id(x.ts)], values))
 
-    return jax.tree.map(relative, signals, is_leaf=is_samples)
+    return map_samples(relative, signals)
 
 
 def times_since(origin: Any, ts: Any, dtype: DTypeLike) -> Array:

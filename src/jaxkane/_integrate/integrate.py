@@ -101,13 +101,9 @@ def solve(
         return _solved(*given, closures=closures, settings=settings, moved=moved)
 
     arguments = system, state, origin, taus, signals, discontinuities
-    how = (
-        "controlled"
-        if settings.controls_tangents
-        else "steps of the motion"
-        if settings.step is None
-        else "fixed steps"
-    )
+    # The errors of tangents are not controlled with fixed steps, nor in the loop of diffrax.
+    by_error = settings.controller is None and settings.solver.term_structure is diffrax.AbstractTerm
+    how = "fixed steps" if settings.step is not None else "controlled" if by_error else "steps of the motion"
     return dataclasses.replace(with_own_tangents(run, arguments, (settings, closures)), adjoint=how)
 
 

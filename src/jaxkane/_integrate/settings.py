@@ -20,8 +20,6 @@ from .._scalarjit.compat import Tracer
 ADJOINTS = "auto", "reverse", "forward", "both"
 """All mean the same: every simulation supports both modes. The last three were necessary in earlier versions."""
 
-_ADJOINT = f"`adjoint` must be one of {', '.join(ADJOINTS)}, or an adjoint of diffrax; got {{!r}}."
-
 
 class Settings(eqx.Module):
     """The options of `simulate`, with their defaults filled in.
@@ -52,12 +50,6 @@ class Settings(eqx.Module):
     check_bodies: bool = eqx.field(static=True, default=False)
 
     @property
-    def controls_tangents(self) -> bool:
-        """Whether the errors of tangents are controlled: not with fixed steps, nor in the loop of diffrax."""
-        has_one_term = self.solver.term_structure is diffrax.AbstractTerm
-        return self.adjoint is None and self.step is None and self.controller is None and has_one_term
-
-    @property
     def is_forward(self) -> bool:
         """Whether only forward mode is supported."""
         return isinstance(self.adjoint, diffrax.ForwardMode)
@@ -85,43 +77,74 @@ def settings_for(
 
     **Raises:** `ValueError` or `TypeError` for invalid or contradictory options.
     """
-    _check_types(solver, adjoint, controller, project=project, progress=progress)
+    for label, flag in (("project", project), ("progress", progress)):
+        if not isinstance(flag, (bool, np.bool_)):
+            raise TypeError(f"`{label}` must be True or False, got {flag!r}.")
+    _check_kind("solver", solver, diffrax.AbstractSolver, "a solver of diffrax, e.g. diffrax.Tsit5()")
+    controllers = "a controller of diffrax, e.g. diffrax.PIDController(rtol=1e-6, atol=1e-6)"
+    _check_kind("controller", controller, diffrax.AbstractStepSizeController, controllers)
+    adjoints = f"one of {', '.join(ADJOINTS)}, or an adjoint of diffrax"
+    if isinstance(adjoint, str) and adjoint not in ADJOINTS:
+        raise ValueError(f"`adjoint` must be {adjoints}; got {adjoint!r}.")
+    _check_kind("adjoint", adjoint, (str, diffrax.AbstractAdjoint), adjoints, may_be_omitted=False)
     method: Any = diffrax.Tsit5() if solver is None else solver
-    if step is not None and not (rtol is None and atol is None and max_step is None and controller is None):
-        raise ValueError(
-            "Pass either `step` (fixed step size) or `rtol`, `atol`, `max_step`, `controller` (adaptive), not both."
+    name, is_adaptive = type(method).__name__, isinstance(method, diffrax.AbstractAdaptiveSolver)
+    if method.term_structure is not diffrax.AbstractTerm and not isinstance(method, diffrax.AbstractImplicitSolver):
+        raise TypeError(
+            f"{name} needs several terms, but Kane's equations are one term. Use a solver of one term, e.g. "
+            "diffrax.Tsit5(), or diffrax.Kvaerno5() for stiff equations."
         )
-    if step is None and controller is None and not isinstance(method, diffrax.AbstractAdaptiveSolver):
-        raise ValueError(
-            f"{type(method).__name__} has no error estimate, so the step size cannot be adapted. Pass a fixed step, "
-            "e.g. step=1e-3."
-        )
+    for is_contradictory, message in (
+        (
+            step is not None and not (rtol is None and atol is None and max_step is None and controller is None),
+            "Pass either `step` (fixed step size) or `rtol`, `atol`, `max_step`, `controller` (adaptive), not both.",
+        ),
+        (
+            step is None and controller is None and not is_adaptive,
+            f"{name} has no error estimate, so the step size cannot be adapted. Pass a fixed step, e.g. step=1e-3.",
+        ),
+        (
+            controller is not None and not (rtol is None and atol is None),
+            "Pass either `controller` or `rtol` and `atol`: the controller has its own tolerances.",
+        ),
+        (
+            isinstance(controller, diffrax.ConstantStepSize | diffrax.StepTo),
+            f"controller={type(controller).__name__}(...) has fixed steps. Pass `step`, e.g. step=1e-3.",
+        ),
+        (
+            isinstance(adjoint, diffrax.ImplicitAdjoint),
+            "adjoint=ImplicitAdjoint() differentiates a steady state, not a simulation. Omit it.",
+        ),
+    ):
+        if is_contradictory:
+            raise ValueError(message)
     default = 1e-8 if getattr(dtype, "dtype", dtype) == jnp.float64 else 1e-5
     if step is not None:
-        method = _for_one_length(method, default)
-    if controller is not None and not (rtol is None and atol is None):
-        raise ValueError("Pass either `controller` or `rtol` and `atol`: the controller has its own tolerances.")
-    if isinstance(controller, diffrax.ConstantStepSize | diffrax.StepTo):
-        raise ValueError(f"controller={type(controller).__name__}(...) has fixed steps. Pass `step`, e.g. step=1e-3.")
-    if isinstance(adjoint, diffrax.ImplicitAdjoint):
-        raise ValueError("adjoint=ImplicitAdjoint() differentiates a steady state, not a simulation. Omit it.")
+        # The default method of diffrax for implicit equations stops if it converges slowly, and relies on a shorter
+        # step. Fixed steps need Newton's method.
+        newton = {"root_finder": optx.Newton(rtol=default, atol=default), "root_find_max_steps": 50}
+        method = _changed(
+            method, lambda x: {k: v for k, v in newton.items() if hasattr(x, k)} if _takes_tolerances(x) else {}
+        )
     for label, number in (("rtol", rtol), ("atol", atol), ("step", step), ("max_step", max_step)):
         if number is not None and not isinstance(number, Tracer):
             _check_number(label, number, lambda x: x > 0, "positive and finite")
     _check_number("stabilize", stabilize, lambda x: x >= 0, "a finite, nonnegative rate [1/s]")
-    if max_steps is not None:
-        _check_number("max_steps", max_steps, lambda x: x >= 1 and x == int(x), "a positive whole number")
-    _check_number("max_jumps", max_jumps, lambda x: x >= 1 and x == int(x), "a positive whole number")
-    tolerances = {"rtol": rtol, "atol": atol}
-    given = {name: getattr(controller, name, default) if x is None else x for name, x in tolerances.items()}
+    for label, number in (("max_steps", 1 if max_steps is None else max_steps), ("max_jumps", max_jumps)):
+        _check_number(label, number, lambda x: x >= 1 and x == int(x), "a positive whole number")
+    given: dict[str, Any] = {"rtol": rtol, "atol": atol}
+    given = {label: float(getattr(controller, label, default) if x is None else x) for label, x in given.items()}
+    if isinstance(adjoint, diffrax.BacksolveAdjoint) and not adjoint.kwargs:
+        # It needs a solver and a controller for its backward pass.
+        control = diffrax.PIDController(**given)
+        adjoint = diffrax.BacksolveAdjoint(solver=diffrax.Tsit5(), stepsize_controller=control)
     return Settings(
-        rtol=float(given["rtol"]),
-        atol=float(given["atol"]),
+        **given,
         solver=method,
         step=step,
         max_step=max_step,
         controller=controller,
-        adjoint=None if isinstance(adjoint, str) else _whole_adjoint(adjoint, **given),
+        adjoint=None if isinstance(adjoint, str) else adjoint,
         max_steps=None if max_steps is None else int(max_steps),
         max_jumps=int(max_jumps),
         progress=progress,
@@ -132,35 +155,13 @@ def settings_for(
     )
 
 
-def _whole_adjoint(adjoint: Any, rtol: Any, atol: Any) -> Any:
-    """The adjoint. `BacksolveAdjoint` without options gets a solver and a controller for its backward pass."""
-    if not isinstance(adjoint, diffrax.BacksolveAdjoint) or adjoint.kwargs:
-        return adjoint
-    control = diffrax.PIDController(rtol=rtol, atol=atol)
-    return diffrax.BacksolveAdjoint(solver=diffrax.Tsit5(), stepsize_controller=control)
-
-
-def _for_one_length(solver: Any, tolerance: float) -> Any:
-    """An implicit solver for fixed steps, whose equations are solved by Newton's method. The default method of diffrax
-    stops if it converges slowly, and relies on a shorter step."""
-    newton = {"root_finder": optx.Newton(rtol=tolerance, atol=tolerance), "root_find_max_steps": 50}
-
-    def changes(method: Any) -> dict[str, Any]:
-        return {name: x for name, x in newton.items() if hasattr(method, name)} if _takes_tolerances(method) else {}
-
-    return _changed(solver, changes)
-
-
 def with_tolerances(solver: Any, rtol: Any, atol: Any) -> Any:
     """An implicit solver whose equations are solved with the tolerances of the steps. Other solvers do not change."""
-    of_steps = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
 
     def changes(method: Any) -> dict[str, Any]:
-        if not _takes_tolerances(method):
-            return {}
-        return {"root_finder": dataclasses.replace(method.root_finder, **of_steps)}
+        return {"root_finder": dataclasses.replace(method.root_finder, rtol=rtol, atol=atol, norm=optx.rms_norm)}
 
-    return _changed(solver, changes)
+    return _changed(solver, lambda method: changes(method) if _takes_tolerances(method) else {})
 
 
 def with_scan_kind(solver: Any, kind: str) -> Any:
@@ -184,32 +185,12 @@ def _changed(solver: Any, changes: Callable[[Any], dict[str, Any]]) -> Any:
     return dataclasses.replace(solver, **fields) if fields else solver
 
 
-def _check_types(solver: Any, adjoint: Any, controller: Any, **flags: Any) -> None:
-    if isinstance(adjoint, str):
-        if adjoint not in ADJOINTS:
-            raise ValueError(_ADJOINT.format(adjoint))
-        adjoint = None
-    elif adjoint is None:
-        raise TypeError(_ADJOINT.format(adjoint))
-    for label, value, kind, example in (
-        ("solver", solver, diffrax.AbstractSolver, "diffrax.Tsit5()"),
-        ("adjoint", adjoint, diffrax.AbstractAdjoint, ""),
-        ("controller", controller, diffrax.AbstractStepSizeController, "diffrax.PIDController(rtol=1e-6, atol=1e-6)"),
-    ):
-        if isinstance(value, type) and issubclass(value, kind):
-            raise TypeError(f"`{label}` must be an instance, not a class: {label}=diffrax.{value.__name__}().")
-        if value is not None and not isinstance(value, kind):
-            expected = f"`{label}` must be a {label} of diffrax, e.g. {example}; got {value!r}."
-            raise TypeError(expected if example else _ADJOINT.format(value))
-    terms = diffrax.AbstractTerm if solver is None else solver.term_structure
-    if terms is not diffrax.AbstractTerm and not isinstance(solver, diffrax.AbstractImplicitSolver):
-        raise TypeError(
-            f"{type(solver).__name__} needs several terms, but Kane's equations are one term. Use a solver of one "
-            "term, e.g. diffrax.Tsit5(), or diffrax.Kvaerno5() for stiff equations."
-        )
-    for label, value in flags.items():
-        if not isinstance(value, (bool, np.bool_)):
-            raise TypeError(f"`{label}` must be True or False, got {value!r}.")
+def _check_kind(label: str, value: Any, kind: Any, expected: str, may_be_omitted: bool = True) -> None:
+    """**Raises:** `TypeError` if a value is not of this kind."""
+    if isinstance(value, type) and issubclass(value, kind):
+        raise TypeError(f"`{label}` must be an instance, not a class: {label}=diffrax.{value.__name__}().")
+    if not isinstance(value, kind) and not (value is None and may_be_omitted):
+        raise TypeError(f"`{label}` must be {expected}; got {value!r}.")
 
 
 def _check_number(label: str, value: Any, is_allowed: Callable[[float], bool], allowed: str) -> None:

@@ -151,11 +151,11 @@ def checked_times(ts: Any, dtype: DTypeLike) -> Any:
         raise ValueError(f"`ts` must be an array (n_t,) of at least two times; got the shape {ts.shape}.")
     if not isinstance(ts, Tracer):
         steps: Any = np.diff(np.asarray(ts))
-        if not np.all(np.isfinite(steps)):
-            raise ValueError("`ts` contains times that are not finite. Remove or correct them.")
-        if not np.all(steps > 0):
-            i = int(np.argmax(steps <= 0))
-            raise ValueError(f"`ts` must increase: ts[{i}] = {float(ts[i]):.6g} is followed by {float(ts[i + 1]):.6g}.")
+        is_wrong = ~((steps > 0) & np.isfinite(steps))
+        if is_wrong.any():
+            i = int(np.argmax(is_wrong))
+            text = f"ts[{i}] = {float(ts[i]):.6g} is followed by {float(ts[i + 1]):.6g}"
+            raise ValueError(f"`ts` must be finite and increase: {text}.")
     return ts
 
 
@@ -270,19 +270,11 @@ def as_state(system: System, state: State) -> State:
         arrays.append(values)
     if state.contacts is not None:
         arrays.append(state.contacts)
-    arrays = _of_one_type(arrays)
+    types = {x.dtype for x in arrays if jnp.issubdtype(getattr(x, "dtype", int), jnp.floating)}
+    if len(types) > 1:  # a loop cannot carry float32 coordinates and float64 speeds
+        arrays = [x.astype(functools.reduce(np.promote_types, types)) for x in arrays]
     contacts = None if state.contacts is None else arrays.pop()
     return State(arrays[0], arrays[1], arrays[2] if system.states else None, contacts)
-
-
-def _of_one_type(arrays: list[Any]) -> list[Any]:
-    """Float arrays in the widest of their dtypes, because a loop cannot carry float32 coordinates and float64
-    speeds."""
-    types = {x.dtype for x in arrays if hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jnp.floating)}
-    if len(types) < 2:
-        return arrays
-    widest = functools.reduce(np.promote_types, types)
-    return [x.astype(widest) for x in arrays]
 
 
 def refuse_not_finite(system: System, state: State) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import operator
 from typing import Any, ClassVar
@@ -119,7 +120,10 @@ class UnrolledERK(diffrax.AbstractAdaptiveSolver[Any]):
         args = _in_step(args, t0, t1)
         h, times = terms.contr(t0, t1), [t0, *(t1 if c == 1 else t0 + float(c) * (t1 - t0) for c in tableau.c)]
         sampled = args.sampled(jnp.stack(times)) if isinstance(args, RateArguments) else {}
-        rates_at = jax.jit(lambda t, y, numbers: terms.vf(t, y, args.with_numbers(numbers) if numbers else args))
+
+        @jax.jit
+        def rates_at(t: Array, y: Array, numbers: dict[str, Array]) -> Array:
+            return terms.vf(t, y, dataclasses.replace(args, signals=args.signals | numbers) if numbers else args)
 
         def rates(i: int, y: Array) -> Array:
             return rates_at(times[i], y, {name: x[i] for name, x in sampled.items()})

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._common.lookup import hint, real_number
+from .._common.lookup import refuse_unknown
 from .._integrate.jumps import refuse_jumps
-from .._integrate.simulate import checked_state
+from .._integrate.simulate import checked_state, refuse_not_finite
 from .._kane.api import dependent_speeds
 from .._kane.arguments import (
     check_is_system,
@@ -44,7 +44,7 @@ from .._scalarjit.cache_key import jit
 from .._system.parameters import parameters_in, with_parameters
 from .._system.prints import concrete_numbers, module_text, text_of, wrapped
 from .._system.system import State, System, named_numbers, packed, units_of, unpacked
-from ._process_noise import MODES, Disturbance, checked_noise
+from ._process_noise import MODES, Disturbance, checked_noise, checked_numbers
 from ._square_root import moments, root
 from ._square_root import update as update_root
 
@@ -90,7 +90,10 @@ def _check_age(function: str, belief: Belief, age: int) -> None:
     """
     lag = belief.t.shape[-1] - 1
     if not isinstance(age, (int, np.integer)) or not 0 <= age <= lag:
-        raise ValueError(f"{function}: `age` must be an integer from 0 to the filter's lag {lag}, got {age!r}.")
+        raise ValueError(
+            f"{function}: `age` must be an integer from 0 to the filter's lag {lag}, got {age!r}. A Filter with a "
+            "larger `lag` keeps more states."
+        )
 
 
 class Innovation(eqx.Module):
@@ -168,23 +171,10 @@ class Filter(eqx.Module):
         refuse_jumps(system, "Filter", "A Kalman filter cannot represent jumps. Estimate between the jumps only.")
         noise, drift = {} if noise is None else noise, {} if drift is None else drift
         measurable = (*system.coordinates, *system.speeds, *system.states, *system.dependent_speeds)
-        known = {
-            "sensors": (sensors, (*measurable, *output_names(system))),
-            "drift": (drift, tuple(name for name, value, _ in parameters_in(system) if np.ndim(value) == 0)),
-        }
-        for label, (given, names) in known.items():
-            if not isinstance(given, Mapping):
-                raise TypeError(f"Filter: `{label}` must be a dict of numbers by name, got {given!r}.")
-            for name, value in given.items():
-                if name not in names:
-                    raise ValueError(
-                        f"Filter: `{label}` contains the unknown name {name!r}; "
-                        f"{hint(name, names, 'possible names are')}"
-                    )
-                number = real_number(value, f"Filter: `{label}` of {name}")
-                if not (0 <= number < np.inf) or (label == "sensors" and number == 0):
-                    raise ValueError(f"Filter: `{label}` of {name} must be positive and finite, got {number}.")
-        if not sensors:
+        scalars = tuple(name for name, value, _ in parameters_in(system) if np.ndim(value) == 0)
+        measured = checked_numbers(sensors, (*measurable, *output_names(system)), "Filter: `sensors`", positive=True)
+        drifts = checked_numbers(drift, scalars, "Filter: `drift`")
+        if not measured:
             raise ValueError(
                 "Filter: `sensors` is empty. Pass at least one measured quantity with its standard deviation."
             )
@@ -194,12 +184,9 @@ class Filter(eqx.Module):
             if not isinstance(number, int) or isinstance(number, bool) or number < least:
                 raise ValueError(f"Filter: `{label}` must be an integer of at least {least}, got {number!r}.")
 
-        def array(given):
-            return jnp.asarray(np.array([*given.values()], float), jnp.result_type(float))
-
         self.system, self.method, self.lag, self.substeps = system, method, lag, substeps
-        self.sensors, self.parameters = tuple(sensors), tuple(drift)
-        self.sigma, self.drift = array(sensors), array(drift)
+        self.sensors, self.parameters = tuple(measured), tuple(drifts)
+        self.sigma, self.drift = (jnp.asarray([*x.values()], jnp.result_type(float)) for x in (measured, drifts))
         self.noise, self.density = checked_noise(system, noise, "Filter: `noise`")
 
     def __repr__(self) -> str:
@@ -248,15 +235,7 @@ def begin(filter: Filter, state: State, deviation: Mapping[str, float], t: float
     """
     names, state = filter.names, checked_state(filter.system, state)
     check_time("begin", t)
-    if is_concrete(state):
-        wrong = [
-            f"{name} = {x}" for name, x in zip(names, np.asarray(packed(state)), strict=False) if not np.isfinite(x)
-        ]
-        if wrong:
-            raise ValueError(
-                f"begin: the state is not finite: {', '.join(wrong)}. Pass finite numbers. For an unknown state, pass "
-                "a guess and a large `deviation`."
-            )
+    refuse_not_finite(filter.system, state)
     check_state(filter.system, t, state.q)
     if is_concrete(t) and (step := float(np.spacing(np.abs(np.asarray(t, state.q.dtype))))) > 1e-3:
         raise ValueError(
@@ -264,23 +243,18 @@ def begin(filter: Filter, state: State, deviation: Mapping[str, float], t: float
             "later origin, or enable float64: jaxkane.configure()."
         )
     check_system(filter.system, t, state.q)
-    for name, value in deviation.items():
-        if name not in names:
-            raise ValueError(
-                f"begin: `deviation` contains the unknown name {name!r}; {hint(name, names, 'the filter estimates')}"
-            )
-        if not 0 <= real_number(value, f"begin: the deviation of {name}") < np.inf:
-            raise ValueError(f"begin: `deviation` of {name} must be finite and not negative, got {value}.")
+    deviations = checked_numbers(deviation, names, "begin: `deviation`")
     by_name = {name: value for name, value, _ in parameters_in(filter.system)}
     v = jnp.concatenate([packed(state), *(jnp.reshape(by_name[name], 1) for name in filter.parameters)])
-    S = jnp.asarray(np.diag([float(deviation.get(name, 0.0)) for name in names]), v.dtype)
-    given = {name: 0.0 for name in filter.system.coordinates if deviation.get(name)}
+    S = jnp.asarray(np.diag([deviations.get(name, 0.0) for name in names]), v.dtype)
+    given = {name: 0.0 for name in filter.system.coordinates if deviations.get(name)}
     moved = {*AssemblyProblem.of(filter.system, given).moved} - {*given}
     moved |= {filter.system.coordinates[i] for four in euler_parameters(filter.system) for i in four}
     v = nearest(filter.system_at, jnp.asarray(t, v.dtype), v)
     S = begun(filter.system_at, jnp.asarray(t, v.dtype), v, S, np.isin(filter.system.coordinates, [*moved]))
     m, n = filter.lag + 1, len(names)
-    return Belief(jnp.full(m, t, v.dtype), jnp.tile(v, (m, 1)), jnp.tile(_widened(S, n * m), (m, 1, 1)))
+    wide = jnp.concatenate([S, jnp.zeros((n, n * m - S.shape[1]), S.dtype)], axis=1)
+    return Belief(jnp.full(m, t, v.dtype), jnp.tile(v, (m, 1)), jnp.tile(wide, (m, 1, 1)))
 
 
 def _check_belief(function: str, filter: Filter, belief: Any) -> None:
@@ -360,11 +334,7 @@ def update(
     measurements are traced, an infinite one makes the belief infinite or NaN instead.
     """
     _check_belief("update", filter, belief)
-    if not 0 <= age <= filter.lag:
-        raise ValueError(
-            f"update: `age` is {age}, but the filter keeps {filter.lag} earlier states. Pass a smaller `age`, or "
-            "create the Filter with a larger `lag`."
-        )
+    _check_age("update", belief, age)
     y = _as_measured(filter, measured, belief.mean.dtype)
     if is_concrete(y) and np.isinf(y).any():
         wrong = ", ".join(f"{name} = {x}" for name, x in zip(filter.sensors, np.asarray(y), strict=True) if np.isinf(x))
@@ -464,12 +434,7 @@ def sensed(system: System, sensors: tuple[str, ...], t: Any, q: Array, u: Array,
 
 def _as_measured(filter: Filter, measured: Any, dtype: Any) -> Array:
     if isinstance(measured, Mapping):
-        for name in measured:
-            if name not in filter.sensors:
-                raise ValueError(
-                    f"update: `measured` contains the unknown name {name!r}; "
-                    f"{hint(name, filter.sensors, 'the filter has')}"
-                )
+        refuse_unknown(measured, filter.sensors, "update: `measured` contains unknown names:", "the filter has")
         for name, value in measured.items():
             if not is_one_number(value):
                 raise TypeError(f"update: the measurement of {name!r} must be one number, got {value!r}.")
@@ -484,10 +449,6 @@ def _as_measured(filter: Filter, measured: Any, dtype: Any) -> Array:
     if measured.shape != (len(filter.sensors),):
         raise ValueError(f"update: `measured` must have the shape ({len(filter.sensors)},), got {measured.shape}.")
     return measured
-
-
-def _widened(S: Array, k: int) -> Array:
-    return jnp.concatenate([S, jnp.zeros((S.shape[0], k - S.shape[1]), S.dtype)], axis=1)
 
 
 SystemAt = Callable[[Array], System]

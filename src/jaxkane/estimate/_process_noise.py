@@ -16,7 +16,7 @@ the first terms of the Karhunen-Loeve expansion.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._common.lookup import hint, real_number
+from .._common.lookup import real_number, refuse_unknown
 from .._system.system import State, System
 
 MODES = 3
@@ -96,25 +96,30 @@ def checked_noise(system: System, noise: Any, label: str) -> tuple[tuple[str, ..
 
     **Raises:** `TypeError` and `ValueError` for invalid process noise. The messages begin with `label`.
     """
-    if not isinstance(noise, Mapping):
-        example = f"{{{system.speeds[0]!r}: 0.1}}"
-        raise TypeError(f"{label} must be a dict of spectral densities by name, such as {example}, got {noise!r}.")
+    if isinstance(noise, Mapping) and (impossible := {*noise} & {*system.dependent_speeds, *system.coordinates}):
+        raise ValueError(
+            f"{label} contains {', '.join(sorted(impossible))}. Noise in the rate of a coordinate would break q_dot = "
+            "q_dot(q, u), and dependent speeds are disturbed by noise in the independent speeds. Name these, "
+            "first-order states or inputs."
+        )
     known = (*system.speeds, *system.states, *system.inputs)
-    for name, density in noise.items():
-        if name not in known:
-            advice = (
-                " Noise in the independent speeds also disturbs a dependent speed."
-                if name in system.dependent_speeds
-                else " A coordinate follows from the speeds: noise in its rate would break q_dot = q_dot(q, u)."
-                if name in system.coordinates
-                else ""
-            )
-            raise ValueError(
-                f"{label} contains the unknown name {name}; {hint(name, known, 'possible names are')}{advice}"
-            )
-        if not 0 <= real_number(density, f"{label}: the spectral density of {name}") < math.inf:
-            raise ValueError(
-                f"{label}: the spectral density of {name} must be finite and not negative, got {density!r}. To "
-                f"estimate it, add SpectralDensity({name!r}) to `free`, and pass its initial guess here."
-            )
-    return tuple(noise), jnp.asarray([float(x) for x in noise.values()], jnp.result_type(float))
+    density = checked_numbers(noise, known, label, f"To estimate one, add SpectralDensity({known[0]!r}) to `free`.")
+    return tuple(density), jnp.asarray([*density.values()], jnp.result_type(float))
+
+
+def checked_numbers(
+    given: Any, known: Iterable[str], label: str, advice: str = "", positive: bool = False
+) -> dict[str, float]:
+    """Finite numbers by name, not negative.
+
+    **Raises:** `TypeError` and `ValueError` for unknown names and other numbers. The messages begin with `label`.
+    """
+    if not isinstance(given, Mapping):
+        raise TypeError(f"{label} must be a dict of numbers by name, got {given!r}. {advice}".rstrip())
+    refuse_unknown(given, known, f"{label} contains unknown names:", "possible names are")
+    numbers = {name: real_number(value, f"{label} of {name}") for name, value in given.items()}
+    wrong = [name for name, x in numbers.items() if not 0 <= x < math.inf or (positive and x == 0)]
+    if wrong:
+        allowed = "positive and finite" if positive else "finite and not negative"
+        raise ValueError(f"{label} of {wrong[0]} must be {allowed}, got {numbers[wrong[0]]}. {advice}".rstrip())
+    return numbers

@@ -58,12 +58,9 @@ class Task(eqx.Module):
     mesh: Mesh | None = eqx.field(static=True)
     closures: tuple[Any, ...] = ()  # traced values that these functions read by closures
 
-    def simulate(self, own: PyTree) -> ChunkResult:
-        """The trajectory of one member."""
-        return self.simulate_from(own, start_of(own, self.shared, self.origin))
-
-    def simulate_from(self, own: PyTree, start: State) -> ChunkResult:
-        """The trajectory of one member from its initial state."""
+    def simulate(self, own: PyTree, start: State | None = None) -> ChunkResult:
+        """The trajectory of one member. `start`: its initial state, if it was computed before."""
+        start = start_of(own, self.shared, self.origin) if start is None else start
         system, signals = system_and_signals(own, self.shared)
         motion = solve(system, start, self.origin, self.taus, signals, self.settings, closures=self.closures)
         if self.reduce is None:
@@ -123,7 +120,7 @@ def _solve(members: PyTree, starts: State, task: Task) -> ChunkResult:
     arrays, static = eqx.partition(task, eqx.is_array)
 
     def on_one_device(members, starts, arrays):
-        one = eqx.combine(arrays, static).simulate_from
+        one = eqx.combine(arrays, static).simulate
         n = starts.q.shape[0]
         if jax.default_backend() != "cpu":
             return jax.vmap(one)(members, starts)
@@ -152,12 +149,8 @@ def trace(task: Task, own: PyTree) -> tuple[str, ChunkResult]:
         return eqx.combine(numbers, rest).simulate(own)
 
     program, like = jax.make_jaxpr(simulate, return_shape=True)(own, numbers)
-    return digest_of(program), like
-
-
-def digest_of(program: Any) -> str:
-    """The digest of a JAX program; callback functions are included, with all that their code reads."""
-    return digest(program, lambda f: CapturedValues(f, lasting=True).version)
+    # With all that the code of callback functions reads
+    return digest(program, lambda f: CapturedValues(f, lasting=True).version), like
 
 
 def versions() -> dict[str, str]:

@@ -7,7 +7,6 @@ import dataclasses
 import inspect
 import json
 import os
-import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -87,57 +86,53 @@ _RESUME = "Finished chunks are kept: call sweep again with this folder to resume
 class Folder:
     """The chunks of one sweep: `chunk-00000000.npz`, named by the first member of each.
 
-    **Raises:** `ValueError` if the folder contains another sweep, an unreadable manifest, or other files.
+    **Raises:** `ValueError` if the folder contains another sweep, an unreadable manifest, or other files; `OSError` if
+    it cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], manifest: Mapping[str, Any]):
         self.path = Path(path).expanduser()
         self.sweep = digest(json.dumps(manifest, sort_keys=True))  # the order of columns does not matter
         self.damaged: list[str] = []
-        if self.path.exists() and not self.path.is_dir():
-            raise ValueError(f"sweep: {self.path} is a file. Pass the name of a folder as `folder`.")
         path = self.path / MANIFEST
-        if self.path.exists():
+        if self.path.is_dir():
             remove_abandoned(self.path)
         if not path.exists():
-            self._refuse_foreign_files()
+            # Chunks of this sweep are used, and damaged ones are computed again.
+            files = [file for file in self.path.glob("*") if file.name != MANIFEST and file.suffix != SCRATCH]
+            owners = {_owner(file) for file in files}
+            if files and (self.sweep not in owners or owners - {self.sweep, None}):
+                raise ValueError(
+                    f"{self.path} has no {MANIFEST}, and its {len(files)} files are not the chunks of this sweep (e.g. "
+                    f"{files[0].name}). Choose an empty folder, or one that does not exist."
+                )
             text = json.dumps(manifest, indent=1).encode()
             if atomic_write(path, lambda file: file.write(text), replace=False):
                 return
-        _refuse_other(path, manifest)
-
-    def _refuse_foreign_files(self) -> None:
-        """A folder without a manifest must be empty, or contain chunks of this sweep whose manifest was lost.
-
-        **Raises:** `ValueError` for any other folder.
-        """
-        names = sorted(file.name for file in self.path.glob("*") if not file.name.endswith(SCRATCH))
-        others = [name for name in names if name != MANIFEST and not re.fullmatch(r"chunk-\d{8}\.npz", name)]
-        if others:
+        try:
+            stored = json.loads(path.read_bytes())
+        except (ValueError, IsADirectoryError) as error:  # of the JSON parser, or of the decoder
+            stored = error
+        if not isinstance(stored, dict) or not {"system", "times", "layout"} <= stored.keys():
             raise ValueError(
-                f"{self.path} is not empty and does not contain {MANIFEST} (it contains {others[0]}). Choose an "
-                "empty folder, or one that does not exist."
+                f"{path} is damaged, or not the manifest of a sweep: {stored!r:.200}. Choose another folder, or delete "
+                "this file: chunks that belong to this sweep are then used."
             )
-        chunks = [name for name in names if name != MANIFEST]
-        owners = {_owner(self.path / name) for name in chunks}
-        if chunks and (self.sweep not in owners or owners - {self.sweep, None}):
+        if different := differences(stored, manifest):
             raise ValueError(
-                f"{self.path} has no {MANIFEST}, and its {len(chunks)} chunks belong to another sweep or cannot be "
-                "read. Choose another folder, or delete this one."
+                f"{path} belongs to another sweep. It differs in {different}. Choose another folder, or delete this "
+                "one. (The program contains the system, the inputs and the functions, with the numbers that they use.)"
             )
 
     def file(self, start: int) -> Path:
         return self.path / f"chunk-{start:08d}.npz"
 
-    def mark(self, start: int) -> dict[str, str]:
-        """The mark by which a chunk is recognized: it detects a renamed file, or a file from another folder."""
-        return {_MARK: f"{self.sweep} from {start}"}
-
     def write(self, start: int, result: Any) -> None:
         """Save the chunk whose first member is `start`."""
 
         def save(file: Any) -> None:
-            np.savez(file, **self.mark(start), **_by_path(result))
+            # The mark detects a renamed file, and a file from another folder.
+            np.savez(file, **{_MARK: f"{self.sweep} from {start}"}, **_by_path(result))
 
         try:
             atomic_write(self.file(start), save, remedy=_RESUME)
@@ -161,21 +156,21 @@ class Folder:
         if not path.exists():
             return None
         try:
-            with zipfile.ZipFile(path) as archive:
-                damaged = archive.testzip()
-            if damaged is not None:
-                raise ValueError(f"{damaged} is damaged")
-            with np.load(path, allow_pickle=False) as arrays:
-                for name, mark in self.mark(start).items():
-                    if name not in arrays or str(arrays[name]) != mark:
-                        raise ValueError("the file was renamed, or belongs to another sweep")
-                leaves = [_checked(name, arrays[name], leaf, size) for name, leaf in _by_path(like).items()]
+            with zipfile.ZipFile(path) as archive, np.load(path, allow_pickle=False) as arrays:
+                if (part := archive.testzip()) is not None:
+                    raise ValueError(f"{part} is damaged")
+                if str(arrays[_MARK]) != f"{self.sweep} from {start}":
+                    raise ValueError("the file was renamed, or belongs to another sweep")
+                leaves = {name: arrays[name] for name in _by_path(like)}
+            for name, leaf in _by_path(like).items():
+                if leaves[name].shape != (size, *leaf.shape) or leaves[name].dtype != leaf.dtype:
+                    raise ValueError(f"{name} has another shape or type")
         except (MemoryError, PermissionError):
             raise
         except Exception as error:  # decoders raise various exceptions for damaged files
             self.damaged.append(f"{path.name} ({type(error).__name__}: {error})")
             return None
-        return jax.tree.unflatten(jax.tree.structure(like), leaves)
+        return jax.tree.unflatten(jax.tree.structure(like), leaves.values())
 
     def tidy(self) -> None:
         """Remove the temporary files of interrupted writers. Call when every chunk exists."""
@@ -197,35 +192,3 @@ def _owner(path: Path) -> str | None:
 def _by_path(tree: Any) -> dict[str, Any]:
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
-
-
-def _checked(name: str, array: np.ndarray, like: PyTree, size: int) -> np.ndarray:
-    if array.shape != (size, *like.shape) or array.dtype != like.dtype:
-        raise ValueError(f"{name} is {array.dtype}{list(array.shape)}, not {like.dtype}{[size, *like.shape]}")
-    return array
-
-
-def _refuse_other(path: Path, manifest: Mapping[str, Any]) -> None:
-    """**Raises:** `ValueError` if the file contains another manifest, or none."""
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder, not the manifest of a sweep. Choose another folder for the sweep.")
-    try:
-        stored = json.loads(path.read_bytes())
-    except ValueError as error:  # of the JSON parser, or of the decoder
-        raise ValueError(
-            f"{path} cannot be read ({error}): it is damaged, or not the manifest of a sweep, so it is unknown to "
-            "which sweep the chunks belong. Choose another folder, or delete this file: its chunks are then used."
-        ) from None
-    if not isinstance(stored, dict) or not {"system", "times", "layout"} <= stored.keys():
-        raise ValueError(f"{path} is not the manifest of a sweep. Choose another folder: a sweep needs its own folder.")
-    if "program" not in stored:
-        raise ValueError(
-            f"{path} belongs to a sweep of an earlier version of jaxkane, which did not record the program. It is "
-            "unknown whether that was the same sweep. Choose another folder, or delete this one."
-        )
-    different = differences(stored, manifest)
-    if different:
-        raise ValueError(
-            f"{path} belongs to another sweep. It differs in {different}. Choose another folder, or delete this one. "
-            "(The program contains the system, the inputs and the functions, with the numbers that they use.)"
-        )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections import UserDict
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -83,10 +84,9 @@ def grid(**axes: Any) -> Table:
         raise ValueError("grid: no values. Pass values by name, such as grid(speed=[4.0, 5.0], lam=[0.3, 0.4]).")
     rows = {name: _column(name, values) for name, values in axes.items()}
     for name, row in rows.items():
-        if row.dtype.kind != "f":
-            raise ValueError(f"grid: {name} is text. For labels, pass `table` as a dict or a DataFrame.")
-        if row.ndim != 1:
-            raise ValueError(f"grid: {name} must be a row of numbers (k,), got the shape {row.shape}.")
+        if row.dtype.kind != "f" or row.ndim != 1:
+            got = f"the shape {row.shape}" if row.dtype.kind == "f" else "text: pass labels in a dict or a DataFrame"
+            raise ValueError(f"grid: {name} must be a row of numbers (k,), got {got}.")
     full = np.meshgrid(*rows.values(), indexing="ij")
     columns = {name: x.reshape(-1) for name, x in zip(rows, full, strict=True)}
     return Table(columns, tuple(rows), tuple(len(row) for row in rows.values()))
@@ -105,96 +105,73 @@ def as_table(table: Any) -> Table | None:
     if twice:
         raise ValueError(f"`table` has more than one column named {', '.join(twice)}. Rename or remove the duplicates.")
     columns = {str(name): _column(str(name), values) for name, values in table.items()}
-    lengths = {name: len(column) for name, column in columns.items()}
-    if not lengths:
+    if not columns:
         raise ValueError("`table` has no columns.")
+    n = _common_length({name: len(column) for name, column in columns.items()}, "The columns of `table`")
+    return Table(columns, ("member",), (n,))
+
+
+def _common_length(lengths: dict[str, int], what: str) -> int:
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{name} ({n})" for name, n in lengths.items())
-        raise ValueError(f"The columns of `table` differ in length: {listed}. Pass columns of equal length.")
-    return Table(columns, ("member",), (next(iter(lengths.values())),))
+        raise ValueError(f"{what} differ in length: {listed}. Make their lengths equal.")
+    return next(iter(lengths.values()))
 
 
 def _column(name: str, values: Numbers) -> np.ndarray:
-    if np.ma.is_masked(values):
-        raise ValueError(f"{name!r} has masked entries: remove these members, or fill the entries.")
-    try:
-        column = np.asarray(values)
-        if column.ndim and not len(column):
-            return column.astype(float)  # no members
-        if column.dtype.kind in "OUST":
-            is_text = column.ndim == 1 and all(isinstance(x, str) for x in column)
-            return column.astype(str) if is_text else _refuse(name, values)
-        if column.dtype.kind not in "uif" or _has_truth_values(values):
-            # complex numbers would lose a part, and dates would become counts of nanoseconds
-            return _refuse(name, values)
-        column = column.astype(float)
-    except (TypeError, ValueError):
-        return _refuse(name, values)
-    return column if column.ndim else _refuse(name, column)
-
-
-def _has_truth_values(values: Numbers) -> bool:
-    if isinstance(values, (list, tuple)):  # in a list with numbers, NumPy converts booleans to 0 and 1
-        return any(isinstance(x, (bool, np.bool_)) for x in values)
-    return np.asarray(values).dtype.kind == "b"
-
-
-def _refuse(name: str, values: Numbers) -> Any:
+    """A column as floats, or as strings if all entries are labels."""
     if isinstance(values, Tracer):
         raise TypeError(
             f"The column {name!r} of a table is traced (by jax.jit, jax.grad or jax.vmap), but a table needs concrete "
             "numbers. Omit this column, and add a leading axis of members to the parameter, the state or the input."
         )
-    hint = " Write booleans as numbers, 0.0 and 1.0." if _has_truth_values(values) else ""
+    if np.ma.is_masked(values):
+        raise ValueError(f"{name!r} has masked entries: remove these members, or fill the entries.")
+    try:
+        column = np.asarray(values)
+    except (TypeError, ValueError):  # of traced numbers, or of rows of different lengths
+        column = np.array(None)
+    if column.ndim and not len(column):
+        return column.astype(float)  # no members
+    if column.dtype.kind in "OUST" and column.ndim == 1 and all(isinstance(x, str) for x in column):
+        return column.astype(str)
+    # In a list with numbers, NumPy converts booleans to 0 and 1. Complex numbers would lose a part, and dates would
+    # become numbers of nanoseconds.
+    listed = values if isinstance(values, (list, tuple)) else ()
+    has_booleans = column.dtype.kind == "b" or any(isinstance(x, (bool, np.bool_)) for x in listed)
+    if column.ndim and column.dtype.kind in "uif" and not has_booleans:
+        return column.astype(float)
     raise ValueError(
-        f"{name!r} must be a row of numbers (or of labels), got {type(values).__name__} {values!r:.60}.{hint}"
+        f"{name!r} must be a row of numbers (or of labels), got {type(values).__name__} {values!r:.60}."
+        + " Write booleans as numbers, 0.0 and 1.0." * has_booleans
     )
 
 
-class Row(Mapping[str, Any]):
-    """One member's values by name, for functions of the user. It records which names were read."""
+class Row(UserDict[str, Any]):
+    """One member's values by name, for functions of the user. It records which names were `read`."""
 
-    def __init__(self, columns: dict[str, Any]):
-        self.columns = columns
+    def __init__(self, columns: Mapping[str, Any]):
+        super().__init__(columns)
         self.read: set[str] = set()
 
     def __getitem__(self, name: str) -> Numbers:
-        if name not in self.columns:
-            raise not_there(name, self.columns, "the columns of the sweep's table")
+        if name not in self.data:
+            raise not_there(name, self.data, "the columns of the sweep's table")
         self.read.add(name)
-        return self.columns[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.columns
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.columns)
-
-    def __len__(self) -> int:
-        return len(self.columns)
-
-    def __repr__(self) -> str:
-        return f"Row({', '.join(self.columns)})"
+        return self.data[name]
 
     def of(self, names: Iterable[str], but: Collection[str] = ()) -> dict[str, Any]:
         """The values that are set by name, except those that a function has read (`but`)."""
-        return {name: self.columns[name] for name in names if name in self.columns and name not in but}
+        return {name: self.data[name] for name in names if name in self.data and name not in but}
 
     def given_to(self, function: Callable[..., Any], *arguments: Any) -> tuple[Any, set[str]]:
         """The return value of `function(*arguments, row)`, and the names that it read. Names that were read are not
         set."""
-        row = Row(self.columns)
+        row = Row(self.data)
         with explain_value_of_traced(f"sweep: the function {getattr(function, '__name__', repr(function))}"):
             made = function(*arguments, row)
         self.read |= row.read
         return made, row.read
-
-
-class _Leaf:
-    """A leaf with its own identity, because one array may occur twice in a tree."""
-
-    def __init__(self, x: Numbers):
-        self.x = x
 
 
 def members_of(
@@ -207,15 +184,22 @@ def members_of(
     **Raises:** `ValueError` if nothing is batched, if the batches differ in length, or if nothing reads a column.
     """
     columns = {name: np.asarray(x, dtype=dtype) for name, x in table.numbers.items()} if table is not None else {}
-    _refuse_twice(columns, system, inputs)
+    # A column may replace a value that all members share, but not a batch.
+    twice = {name: "`inputs`" for name in columns if isinstance(inputs, Mapping) and name in inputs}
+    if isinstance(system, System):
+        twice |= {name: f"a batch of {type(system).__name__}" for name in in_batches(system) if name in columns}
+    if twice:
+        listed = ", ".join(f"{name} (a column of the table, and in {where})" for name, where in twice.items())
+        raise ValueError(f"sweep: passed twice: {listed}. Remove one of them.")
     signals = inputs if callable(inputs) else since(first_of(ts), _signals(inputs, system, columns, ts), dtype)
     if isinstance(system, System):
         refuse_coarse_times(system, ts, dtype, signals)
     tree = (system, state, signals, columns)
-    places = jax.tree.map(_Leaf, tree)
-    batches = _batches(places)
-    members, shared = eqx.partition(tree, jax.tree.map(lambda leaf: leaf in batches, places))
-    lengths = {name: leaf.x.shape[0] for leaf, name in batches.items()}
+    leaves, structure = jax.tree.flatten(tree)
+    places = jax.tree.unflatten(structure, range(len(leaves)))
+    batches = _batches(places, [np.ndim(x) for x in leaves])
+    members, shared = eqx.partition(tree, jax.tree.map(lambda i: i in batches, places))
+    lengths = {name: leaves[i].shape[0] for i, name in batches.items()}
     if table is not None and not columns:
         lengths["table"] = len(table)
     if not jax.tree.leaves(members):
@@ -229,13 +213,11 @@ def members_of(
             "sweep: no argument is a batch. Pass a `table`, or add a leading axis to a parameter, state.q, state.u or "
             "an input. For one trajectory, call jaxkane.simulate."
         )
-    if len(set(lengths.values())) > 1:
-        listed = ", ".join(f"{name} ({n})" for name, n in lengths.items())
-        raise ValueError(f"sweep: the batches differ in length: {listed}. Pass batches of equal length.")
+    n = _common_length(lengths, "sweep: the batches")
     origin, _ = clock_of(ts, dtype)
     _check(members, shared, origin, table)
     _check_description(members, shared, origin)
-    return members, shared, next(iter(lengths.values()))
+    return members, shared, n
 
 
 def system_and_signals(own: PyTree, shared: PyTree) -> tuple[System, Any]:
@@ -258,14 +240,10 @@ def _system(system: System, row: Row) -> tuple[System, dict[str, Any]]:
     read: set[str] = set()
     if not isinstance(system, System):
         system, read = row.given_to(system)
-        _refuse_no_system(system)
+        if not isinstance(system, System):
+            raise TypeError("sweep: the function `system` must return a System for each row.")
     parameters = row.of((name for name, _, _ in parameters_in(system)), but=read)
     return with_parameters(system, parameters), parameters
-
-
-def _refuse_no_system(given: Any) -> None:
-    if not isinstance(given, System):
-        raise TypeError("sweep: the function `system` must return a System for each row.")
 
 
 def _start(system: System, state: Any, row: Row, t: Component) -> State:
@@ -281,20 +259,17 @@ def _start(system: System, state: Any, row: Row, t: Component) -> State:
     state = as_state(system, state)
     groups = (system.coordinates, system.speeds, system.states)
     q, u, x = (row.of(names, but=read) for names in groups)
-    parts = zip((state.q, state.u, state.x), (q, u, x), groups, strict=True)
+    parts: list[Any] = []
+    for values, columns, names in zip((state.q, state.u, state.x), (q, u, x), groups, strict=True):
+        for name, value in columns.items():
+            values = values.at[names.index(name)].set(value)  # pyright: ignore[reportOptionalMemberAccess]
+        parts.append(values)
     # The contact states belong to coordinates, speeds and parameters.
     contacts = None if q or u or parameters else state.contacts
-    q0, u0, x0 = (_with_columns(values, columns, names) for values, columns, names in parts)
-    state = State(q0, u0, x0, contacts)
+    state = State(parts[0], parts[1], parts[2], contacts)
     if system.dependent_coordinates and (q or parameters):  # they depend on the others
         state = assemble(system, state.q, state.u, state.x, t=t)
     return state
-
-
-def _with_columns(values: Numbers, columns: dict[str, Any], names: tuple[str, ...]) -> Any:
-    for name, value in columns.items():
-        values = values.at[names.index(name)].set(value)
-    return values
 
 
 def _check(members: PyTree, shared: PyTree, t: Component, table: Table | None) -> None:
@@ -319,35 +294,40 @@ def _check(members: PyTree, shared: PyTree, t: Component, table: Table | None) -
         "input": system.inputs,
         "state": system.states,
     }
-    for column in table.columns if table is not None else ():
-        kinds = [kind for kind, names in known.items() if column in names]
-        if len(kinds) > 1:
-            raise ValueError(
-                f"sweep: the column {column!r} is ambiguous: {name} has more than one number of that "
-                f"name ({', '.join(kinds)}). Rename the column, and read it in `state` as a function of (system, row), "
-                "or in `system` as a function of (row)."
-            )
-        if kinds and column not in row:
-            raise ValueError(
-                f"sweep: the column {column!r} is text, but {name} has a number of that name ({kinds[0]}). "
-                "Convert numbers that were read as text by numpy.asarray(column, float), or rename a column of labels."
-            )
+    columns = [] if table is None else [*table.columns]
+    kinds = {column: [kind for kind, names in known.items() if column in names] for column in columns}
     applied = row.of(itertools.chain(*known.values())).keys()
-    applied -= {*system.dependent_coordinates, *system.dependent_speeds}
-    if callable(signals) and applied & set(system.inputs):
-        listed = ", ".join(sorted(applied & set(system.inputs)))
-        raise ValueError(f"sweep: {listed} is a column of the table and is also returned by `inputs`. Remove one.")
-    follow = {*system.dependent_coordinates, *system.dependent_speeds} & set(row) - row.read
-    if follow:
-        listed = ", ".join(sorted(follow))
-        raise ValueError(f"sweep: {name}: {listed} is computed from the others. Remove this column.")
-    unused = [column for column in row if column not in applied | row.read]
-    if unused:
-        raise ValueError(
-            f"sweep: the columns {', '.join(unused)} have no effect: {name} has no parameter, independent coordinate, "
-            "independent speed, state or input of that name. Pass `state` as a function of (system, row), or `system` "
-            f"as a function of (row), which reads row[{unused[0]!r}]."
-        )
+    dependent = {*system.dependent_coordinates, *system.dependent_speeds}
+    applied -= dependent
+    unused = [column for column in row if column not in applied | dependent | row.read]
+    problems = (
+        (
+            [f"{column!r} ({', '.join(kind)})" for column, kind in kinds.items() if len(kind) > 1],
+            "is ambiguous: the system has more than one number of that name. Rename the column, and read it in `state` "
+            "as a function of (system, row), or in `system` as a function of (row).",
+        ),
+        (
+            [f"{column!r} ({kind[0]})" for column, kind in kinds.items() if kind and column not in row],
+            "is text, but the system has a number of that name. Convert numbers that were read as text by "
+            "numpy.asarray(column, float), or rename a column of labels.",
+        ),
+        (
+            sorted(applied & set(system.inputs)) if callable(signals) else [],
+            "is a column of the table and is also returned by `inputs`. Remove one.",
+        ),
+        (sorted(dependent & set(row) - row.read), "is computed from the others. Remove this column."),
+        (
+            unused,
+            "has no effect: the system has no parameter, independent coordinate, independent speed, state or input of "
+            "that name. Pass `state` as a function of (system, row), or `system` as a function of (row), which reads "
+            f"row[{unused[0]!r}]."
+            if unused
+            else "",
+        ),
+    )
+    for wrong, message in problems:
+        if wrong:
+            raise ValueError(f"sweep: {name}: {', '.join(wrong)} {message}")
 
 
 def _check_description(members: PyTree, shared: PyTree, t: Component) -> None:
@@ -357,7 +337,8 @@ def _check_description(members: PyTree, shared: PyTree, t: Component) -> None:
         return
     for i in (0, -1):
         own = jax.tree.map(lambda x, i=i: x[i], members)
-        if i == -1 and not all(map(_is_finite, jax.tree.leaves(own))):
+        numbers = [x for x in jax.tree.leaves(own) if is_concrete(x) and eqx.is_inexact_array_like(x)]
+        if i == -1 and not all(np.all(np.isfinite(x)) for x in numbers):
             return
         system, state, _, columns = eqx.combine(own, shared)
         system, _ = _system(system, Row(columns))
@@ -369,15 +350,11 @@ def _check_description(members: PyTree, shared: PyTree, t: Component) -> None:
         check_contacts(system, t, q, may_penetrate=True)
 
 
-def _is_finite(x: Any) -> bool:
-    return not is_concrete(x) or not eqx.is_inexact_array_like(x) or bool(np.all(np.isfinite(x)))
-
-
 def _signals(inputs: Inputs, system: System, columns: dict[str, Any], ts: Numbers) -> Any:
     """Signals as in `simulate`; samples may have a leading axis of members."""
     if not isinstance(system, System):  # a function of the row: only its names are needed
-        system = jax.eval_shape(lambda row: system(Row(row)), {k: jnp.zeros(x.shape[1:]) for k, x in columns.items()})
-        _refuse_no_system(system)
+        row = {name: jnp.zeros(x.shape[1:]) for name, x in columns.items()}
+        system = jax.eval_shape(lambda row: _system(system, Row(row))[0], row)
     assert not callable(inputs)
     single, batches, samples = {}, {}, {}
     for name, value in (inputs or {}).items():
@@ -396,47 +373,29 @@ def _signals(inputs: Inputs, system: System, columns: dict[str, Any], ts: Number
             )
     known = as_signals(single | dict.fromkeys([*batches, *samples], 0.0), system.inputs, ts, type(system).__name__)
     for name, array in batches.items():
-        # Check with ones: samples that are not finite make only their member invalid, and raise nothing.
-        known[name] = array[:, 0] if array.shape[1] == 1 else _samples_of_members(ts, array)
+        if array.shape[1] > 1:
+            # Check with ones: samples that are not finite make only their member invalid, and raise nothing.
+            known[name] = eqx.tree_at(lambda x: x.values, Samples(ts, jnp.ones_like(array)), array)
+        else:
+            known[name] = array[:, 0]
     return known | samples
 
 
-def _samples_of_members(ts: Numbers, values: Numbers) -> Samples:
-    return eqx.tree_at(lambda samples: samples.values, Samples(ts, jnp.ones_like(values)), values)
+def _batches(places: Any, dims: Sequence[int]) -> dict[int, str]:
+    """The leaves that have a leading axis of members, by number, with their names.
 
-
-def _refuse_twice(columns: dict[str, Any], system: System, inputs: Inputs) -> None:
-    """A column may replace a value that all members share, but not a batch.
-
-    **Raises:** `ValueError` if a column is also a batch or an input.
+    `places`: system, state, signals and columns with numbers of leaves; `dims`: the numbers of axes of these leaves.
     """
-    twice = {name: "`inputs`" for name in columns if isinstance(inputs, Mapping) and name in inputs}
-    if isinstance(system, System):
-        for name in in_batches(system):
-            if name in columns:
-                twice[name] = f"a batch of {type(system).__name__}"
-    if twice:
-        listed = ", ".join(f"{name} (a column of the table, and in {where})" for name, where in twice.items())
-        raise ValueError(f"sweep: passed twice: {listed}. Remove one of them.")
-
-
-def _batches(places: Any) -> dict[_Leaf, str]:
-    """The leaves that have a leading axis of members, with their names."""
     system, state, signals, columns = places
-    batches = {column: name for name, column in columns.items()}
+    candidates: list[tuple[str, Any, int]] = []  # name, leaf, axes of one member
     if isinstance(system, System):
-        for name, leaf, info in parameters_in(system):
-            if isinstance(leaf, _Leaf) and np.ndim(leaf.x) == len(info.shape) + 1:
-                batches[leaf] = name
+        candidates += [(name, leaf, len(info.shape)) for name, leaf, info in parameters_in(system)]
     if isinstance(state, State):
-        for name, leaf in vars(state).items():
-            if isinstance(leaf, _Leaf) and np.ndim(leaf.x) == 2:
-                batches[leaf] = f"state.{name}"
-    if isinstance(signals, dict):
-        for name, signal in signals.items():
-            is_samples = isinstance(signal, Samples)
-            leaves = {name: signal.values, f"times of {name}": signal.ts} if is_samples else {name: signal}
-            for label, leaf in leaves.items():
-                if isinstance(leaf, _Leaf) and isinstance(leaf.x, jax.Array) and leaf.x.ndim == 1 + is_samples:
-                    batches[leaf] = label
-    return batches
+        candidates += [(f"state.{name}", leaf, 1) for name, leaf in vars(state).items()]
+    for name, signal in signals.items() if isinstance(signals, dict) else ():
+        if isinstance(signal, Samples):
+            candidates += [(name, signal.values, 1), (f"times of {name}", signal.ts, 1)]
+        else:
+            candidates.append((name, signal, 0))
+    batches = {leaf: name for name, leaf, ndim in candidates if isinstance(leaf, int) and dims[leaf] == ndim + 1}
+    return {leaf: name for name, leaf in columns.items()} | batches

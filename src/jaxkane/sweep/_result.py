@@ -56,16 +56,9 @@ class Sweep(eqx.Module):
     table: Table
     events: tuple[str, ...] = eqx.field(static=True)
 
-    t = _of_trajectory("t")
-    q = _of_trajectory("q")
-    u = _of_trajectory("u")
-    u_dep = _of_trajectory("u_dep")
-    x = _of_trajectory("x")
-    inputs = _of_trajectory("inputs")
-    outputs = _of_trajectory("outputs")
-    names = _of_trajectory("names")
-    jumps = _of_trajectory("jumps")
-    contacts = _of_trajectory("contacts")
+    t, q, u, u_dep, x, inputs, outputs, names, jumps, contacts = map(
+        _of_trajectory, ("t", "q", "u", "u_dep", "x", "inputs", "outputs", "names", "jumps", "contacts")
+    )
 
     @classmethod
     def of(cls, result: ChunkResult, table: Table, ts: Numbers, reduced: bool) -> Sweep:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -163,13 +163,32 @@ def _in_chunks(
     def members_at(start: int) -> Any:
         return jax.tree.map(lambda x: x[start : start + size], members)
 
-    results = _Results(n)
+    reached: Any = np.zeros(n, bool)
+    arrays: Any = None
+    remaining = list(range(0, n, size))
+
+    def put(start: int, result: ChunkResult) -> None:
+        nonlocal arrays
+        if arrays is None:
+            arrays = jax.tree.map(lambda x: np.empty((n, *x.shape[1:]), x.dtype), result)
+        chunk = slice(start, start + result.status.shape[0])
+        reached[chunk] = True
+        jax.tree.map(lambda array, values: array.__setitem__(chunk, values), arrays, result)
+        bar.update(result.status.shape[0])
+
     with tqdm(total=n, disable=not progress, unit="member", file=sys.stderr) as bar:
         try:
-            remaining = list(range(0, n, size))
-            for start, result in _finished(files, remaining, like, n, size):
-                remaining.remove(start)
-                bar.update(results.put(start, result))
+            for start in tuple(remaining):
+                result = None if files is None else files.read(start, like, min(size, n - start))
+                if result is not None:
+                    remaining.remove(start)
+                    put(start, result)
+            if files is not None and files.damaged:
+                warnings.warn(
+                    f"{files.path}: {len(files.damaged)} chunks cannot be read and are computed again: "
+                    f"{files.damaged[0]}" + (", ..." if len(files.damaged) > 1 else "."),
+                    stacklevel=3,
+                )
             bar.initial = bar.n  # chunks that were read from files would falsify the speed
             if client is None:
                 chunks = ((start, task.solve(members_at(start), size)) for start in remaining)
@@ -179,68 +198,26 @@ def _in_chunks(
                 result = jax.tree.map(np.asarray, result)
                 if files is not None:
                     files.write(start, result)
-                bar.update(results.put(start, result))
-        except KeyboardInterrupt:
-            if results.arrays is None:
+                put(start, result)
+        except (KeyboardInterrupt, Exception) as error:
+            if arrays is None:
                 raise
-        except Exception as error:
-            finished = f"{int(results.reached.sum())} of {n} members are finished"
-            if results.arrays is None:
-                raise
-            if files is not None:
+            finished = f"{int(reached.sum())} of {n} members are finished"
+            if files is not None and not isinstance(error, KeyboardInterrupt):
                 error.add_note(
                     f"sweep: {finished} and saved in {files.path}. Call sweep again with this folder to resume."
                 )
                 raise
-            warnings.warn(
-                f"sweep: {finished} and returned; the others have the status INTERRUPTED, because of "
-                f"{type(error).__name__}: {str(error).rstrip(chr(46))}. Pass `folder` to make a sweep resumable.",
-                RuntimeWarning,
-                stacklevel=3,
-            )
-    if files is not None and results.reached.all():
+            if not isinstance(error, KeyboardInterrupt):
+                warnings.warn(
+                    f"sweep: {finished} and returned; the others have the status INTERRUPTED, because of "
+                    f"{type(error).__name__}: {str(error).rstrip(chr(46))}. Pass `folder` to make a sweep resumable.",
+                    RuntimeWarning,
+                    stacklevel=3,
+                )
+    if files is not None and reached.all():
         files.tidy()
-    return results.filled()
-
-
-def _finished(
-    files: Folder | None, starts: list[int], like: ChunkResult | None, n: int, size: int
-) -> Iterator[tuple[int, ChunkResult]]:
-    """(start, result) of the chunks in the folder; each member has the shapes of `like`."""
-    if files is None:
-        return
-    for start in tuple(starts):
-        result = files.read(start, like, min(size, n - start))
-        if result is not None:
-            yield start, result
-    if files.damaged:
-        warnings.warn(
-            f"{files.path}: {len(files.damaged)} chunks cannot be read and are computed again: {files.damaged[0]}"
-            + (", ..." if len(files.damaged) > 1 else "."),
-            stacklevel=3,
-        )
-
-
-class _Results:
-    """The results of all members, filled in chunk by chunk."""
-
-    def __init__(self, n: int):
-        self.n, self.reached, self.arrays = n, np.zeros(n, bool), None
-
-    def put(self, start: int, result: ChunkResult) -> int:
-        """Insert the chunk whose first member is `start`. **Returns:** its size."""
-        if self.arrays is None:
-            self.arrays = jax.tree.map(lambda x: np.empty((self.n, *x.shape[1:]), x.dtype), result)
-        size = result.status.shape[0]
-        chunk = slice(start, start + size)
-        self.reached[chunk] = True
-        jax.tree.map(lambda array, values: array.__setitem__(chunk, values), self.arrays, result)
-        return size
-
-    def filled(self) -> ChunkResult:
-        """The results, with NaN and the status `INTERRUPTED` for members that were not reached."""
-        assert self.arrays is not None
-        for x in jax.tree.leaves(self.arrays):
-            x[~self.reached] = np.nan if jnp.issubdtype(x.dtype, jnp.inexact) else 0
-        self.arrays.status[~self.reached] = Status.INTERRUPTED
-        return self.arrays
+    for x in jax.tree.leaves(arrays):
+        x[~reached] = np.nan if jnp.issubdtype(x.dtype, jnp.inexact) else 0
+    arrays.status[~reached] = Status.INTERRUPTED
+    return arrays
