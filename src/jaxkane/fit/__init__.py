@@ -25,8 +25,8 @@ from .problem.errors import Huber as Huber
 from .problem.errors import StudentT as StudentT
 from .problem.model import Simulation as Simulation
 from .problem.problem import Problem as Problem
-from .problem.records import check_records as check_records
 from .problem.trial import Trial as Trial
+from .problem.trial import check_records as check_records
 from .result.comparison import compare as compare
 from .result.comparison import compare_estimates as compare_estimates
 from .result.design import design as design
