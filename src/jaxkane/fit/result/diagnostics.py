@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array
 
-from ..problem.bijections import PossibleBody
+from ..problem.bodies import PossibleBody
 from ..problem.model import Unknowns
 from ..problem.parameters import Parameters
 from ..problem.problem import Problem
