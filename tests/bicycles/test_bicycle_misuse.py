@@ -34,7 +34,7 @@ from jaxkane.bicycles import (
     schwalbe_energizer,
     separate_rider,
 )
-from jaxkane.fit.problem.from_declarations import find_leaves, leaf_names
+from jaxkane.fit.problem.declarations import find_leaves, leaf_names
 from jaxkane.stability import canonical, linearize, straight_ahead
 from jaxkane.sweep import sweep
 

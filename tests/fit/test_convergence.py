@@ -11,7 +11,7 @@ from systems import POSED, PUSH, SEEN, SETS, TRIAL, Cart, T, Track, coverage_ban
 
 import jaxkane.fit.solve.fit as search
 from jaxkane.fit import Free, GradientDescent, LeastSquares, Problem, Simulation, Trial, fit, minimize
-from jaxkane.fit.problem.bijections import Interval
+from jaxkane.fit.problem.parameters import Interval
 from jaxkane.fit.solve.blocks import Blocks, eliminate
 from jaxkane.fit.solve.local_unknowns import Unsimulated
 from jaxkane.fit.solve.optimizers import Optimizer, negligible_gain, proposed, variance_of
@@ -267,9 +267,9 @@ def test_the_search_continues_from_the_better_of_two_iterates(monkeypatch, bette
 def test_the_longest_step_towards_a_bound_leaves_a_twentieth_of_the_distance(lower, upper, nearest):
     start, bounded = 2.0, (bool(np.isfinite(lower)), bool(np.isfinite(upper)))
     interval = Interval(*map(jnp.asarray, (start, lower, upper, 0.3)), bounded)
-    x = interval.longest_step * np.sign(nearest - start)
+    x = interval.longest_steps[0] * np.sign(nearest - start)
     value = float(interval(jnp.asarray([x]))[0])
     # Of the distances to both bounds, the ratio; of one bound, the distance.
     odds = lambda v: abs(v - nearest) / (abs(v - (lower + upper - nearest)) if all(bounded) else 1.0)  # noqa: E731
     assert odds(value) == pytest.approx(np.exp(-3.0) * odds(start))
-    assert Interval(*map(jnp.asarray, (start, -np.inf, np.inf, 0.3)), (False, False)).longest_step == np.inf
+    assert Interval(*map(jnp.asarray, (start, -np.inf, np.inf, 0.3)), (False, False)).longest_steps == np.inf

@@ -22,6 +22,7 @@ from jaxkane.fit import (
     Simulation,
     Trial,
     bootstrap,
+    check_records,
     check_signs,
     cross_validate,
     fit,
@@ -33,7 +34,6 @@ from jaxkane.fit import (
     save_report,
     validate,
 )
-from jaxkane.fit.problem.records import check_records
 from jaxkane.fit.result.statistics import residual_test
 from jaxkane.fit.result.studies import MultiStart
 from jaxkane.fit.result.tables import html_table, html_text

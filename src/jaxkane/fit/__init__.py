@@ -10,12 +10,10 @@ from .extend.selection import forward_selection as forward_selection
 from .inverse.base_parameters import base_parameters as base_parameters
 from .inverse.first_estimate import first_estimate as first_estimate
 from .inverse.regressor import regressor as regressor
+from .problem.bodies import Inertia as Inertia
 from .problem.declarations import Delay as Delay
 from .problem.declarations import Free as Free
 from .problem.declarations import Gain as Gain
-from .problem.declarations import Inertia as Inertia
-from .problem.declarations import JointPrior as JointPrior
-from .problem.declarations import Linear as Linear
 from .problem.declarations import LowPass as LowPass
 from .problem.declarations import NoiseScale as NoiseScale
 from .problem.declarations import Offset as Offset
@@ -23,10 +21,12 @@ from .problem.declarations import SpectralDensity as SpectralDensity
 from .problem.errors import AutoRegressive as AutoRegressive
 from .problem.errors import Huber as Huber
 from .problem.errors import StudentT as StudentT
+from .problem.from_declarations import JointPrior as JointPrior
+from .problem.from_declarations import Linear as Linear
 from .problem.model import Simulation as Simulation
 from .problem.problem import Problem as Problem
-from .problem.records import check_records as check_records
 from .problem.trial import Trial as Trial
+from .problem.trial import check_records as check_records
 from .result.comparison import compare as compare
 from .result.comparison import compare_estimates as compare_estimates
 from .result.design import design as design

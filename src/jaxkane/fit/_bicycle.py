@@ -10,9 +10,11 @@ import numpy as np
 
 from ..catalog import WhippleBicycle
 from ..catalog._entry import read_bicycle_file
-from .problem.declarations import Inertia, Items, Prior
+from .problem.bodies import Inertia
+from .problem.declarations import Items
 from .problem.from_declarations import parameters_of
 from .problem.model import Unknowns
+from .problem.parameters import Prior
 from .problem.problem import Problem
 from .problem.specification import with_options
 from .problem.trial import Trial, as_trials

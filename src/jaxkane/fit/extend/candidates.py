@@ -12,11 +12,10 @@ import numpy as np
 from ..._common.lookup import as_names, refuse_unknown
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
-from ..problem.bijections import Interval
-from ..problem.declarations import CalibrationTerm, Delay, Free, Item, Items
-from ..problem.from_declarations import as_items, is_eliminated, parameters_of
+from ..problem.declarations import CalibrationTerm, Declaration, Delay, Free, Item, Items
+from ..problem.from_declarations import as_items, parameters_of
 from ..problem.model import Simulation, Unknowns
-from ..problem.parameters import with_entries
+from ..problem.parameters import Interval, with_entries
 from ..problem.problem import Problem
 from ..problem.specification import Names, ProblemSpec, deviations_by_name
 from ..result.fit_result import Fit
@@ -50,7 +49,7 @@ class Candidate:
     plausible: Mapping[str, Bounds] = dataclasses.field(default_factory=dict, hash=False)
 
     @property
-    def items(self) -> tuple[Item, ...]:
+    def items(self) -> tuple[Declaration, ...]:
         return tuple(as_items(self.free))
 
     @property
@@ -90,11 +89,10 @@ def checked_terms(fit: Fit, candidates: Candidates, remove: str | Sequence[str] 
     free, for repeated names, for two candidates that free the same parameter differently, and for names in `remove`
     that are not free.
     """
-    items, system = (candidates,) if isinstance(candidates, Candidate) else as_items(candidates), fit.problem.system
-    candidates = tuple(_candidate(fit, item) for item in items)
+    candidates = tuple(_candidate(fit, item) for item in as_items(candidates, (Declaration, Candidate)))
     remove = as_names(remove, "remove")
     refuse_unknown(remove, fit.names, "`remove` contains unknown names:", "the fit has")
-    base, removable = [], []
+    base, removable, system = [], [], fit.problem.system
     for item in fit.problem.specification.free:
         names = () if getattr(item, "each", None) else _names_of(system, item)
         if not set(names) & set(remove):
@@ -124,7 +122,7 @@ def checked_terms(fit: Fit, candidates: Candidates, remove: str | Sequence[str] 
     return Terms(specification, tuple(removable), candidates)
 
 
-def _candidate(fit: Fit, item: Item | Candidate) -> Candidate:
+def _candidate(fit: Fit, item: Declaration | Candidate) -> Candidate:
     """The checked candidate. The bounds of a parameter that starts on one of them become its plausible range, as for
     friction at zero.
     """
@@ -152,22 +150,21 @@ def _candidate(fit: Fit, item: Item | Candidate) -> Candidate:
     return dataclasses.replace(item, free=free, plausible={**bounds, **item.plausible})
 
 
-def _unbounded(system: System, item: Item, always: bool = False) -> tuple[Item, Mapping[str, Bounds]]:
+def _unbounded(system: System, item: Declaration, always: bool = False) -> tuple[Declaration, Mapping[str, Bounds]]:
     """The item without bounds, and the bounds, if it starts on one of them (or `always`). Otherwise the same item."""
-    named = Free(item) if isinstance(item, str) or callable(item) else item
-    if not isinstance(named, (Free, CalibrationTerm)):
+    if not isinstance(item, (Free, CalibrationTerm)):
         return item, {}
-    free = parameters_of(system, named)
+    free = parameters_of(system, item)
     ends = [(float(one.lower), float(one.upper)) for one in free.bijections if isinstance(one, Interval)]
     if not always and not any(start in pair for start, pair in zip(np.asarray(free.start), ends, strict=True)):
         return item, {}
     finite = {name: pair for name, pair in zip(free.names, ends, strict=True) if np.isfinite(pair).any()}
-    return dataclasses.replace(named, bounds=(None, None)), finite
+    return dataclasses.replace(item, bounds=(None, None)), finite
 
 
-def _names_of(system: System, *items: Item) -> tuple[str, ...]:
+def _names_of(system: System, *items: Declaration) -> tuple[str, ...]:
     """Names of the parameters that the items free."""
-    return parameters_of(system, [item for item in items if not is_eliminated(item)]).names
+    return parameters_of(system, [item for item in items if not item.is_eliminated]).names
 
 
 def _refuse_nothing_new(fit: Fit, candidate: Candidate) -> None:
@@ -280,8 +277,7 @@ def with_scales(candidate: Candidate, problem: Problem, norms: np.ndarray, size:
     """
     names, starts = problem.parameters.names, np.asarray(problem.parameters.start)
 
-    def scaled(item: Item) -> Item:
-        item = Free(item) if isinstance(item, str) or callable(item) else item
+    def scaled(item: Declaration) -> Declaration:
         places = [names.index(name) for name in _names_of(problem.system, item)]
         norm = np.linalg.norm(norms[places])
         if not isinstance(item, (Free, CalibrationTerm)) or item.scale is not None or starts[places].any() or not norm:

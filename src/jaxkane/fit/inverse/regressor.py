@@ -32,7 +32,7 @@ from ..._scalarjit.cache_key import jit
 from ..._scalarjit.compat import Tracer, concretely
 from ..._system.parameters import declared, leaf_name
 from ..._system.system import System
-from ..problem.from_declarations import find_leaves
+from ..problem.declarations import find_leaves
 
 Names = str | Callable[[Any], Any] | Sequence[str | Callable[[Any], Any]]
 

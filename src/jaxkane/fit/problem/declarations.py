@@ -1,33 +1,62 @@
-"""Declarations of free parameters, gains, offsets, delays, noise and inertias, with bounds and priors."""
+"""Declarations of parameters to estimate. Each makes its entries, with their bijection, initial guesses and priors."""
 
 from __future__ import annotations
 
+import abc
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, Union
+from typing import Any, ClassVar, Literal, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._common.lookup import as_names, not_there, real_number
-from ..._kane.description import DescriptionEvaluator
-from ..._kane.regressor import origin_of
-from ..._scalarjit.cache_key import jit
-from ..._system.parameters import leaf_name
-from ..._system.system import System
+from ..._common.lookup import as_names, hint, positive_number, real_number
+from ..._kane.right_hand_side import output_names
+from ..._system.parameters import ANY, ParameterInfo, declared, leaf_name, learned_part, names_of_leaf
+from ..._system.system import System, unit_of, units_of
+from .parameters import LOW_PASSES, Bijection, Entry, Interval, Prior, checked_prior
 
-Prior = tuple[float, float] | tuple[str, float, float] | Literal["normal", "lognormal"]
+Bounds = tuple[float | None, float | None]
 Where = Literal["input", "sensor", "start"]
-Item = Union[str, Callable[[System], object], "Free", "Named", "Inertia"]
-"""One element of the argument `free` of a fit."""
 
+
+class Part(NamedTuple):
+    """The parameters of a declaration with one bijection, and by entry, initial guesses, scales and priors."""
+
+    entries: list[Entry]
+    bijection: Bijection
+    start: list[float]
+    scale: list[float]
+    priors: list[tuple[float, float] | None]
+
+
+class Declaration(abc.ABC):
+    """An element of the argument `free` of a fit. Subclasses are frozen dataclasses."""
+
+    @abc.abstractmethod
+    def parts(self, system: System, noise: Mapping[str, float] | None, channels: Sequence[str]) -> list[Part]:
+        """The declared parameters. `noise`, `channels`: those of the fit.
+
+        **Raises:** `ValueError` if the system, the noise or the channels do not contain them.
+        """
+
+    @property
+    def is_eliminated(self) -> bool:
+        """Whether each trial or window has its own value, which is eliminated in every step and reported in
+        `Fit.nuisance`."""
+        return False
+
+
+Item = str | Callable[[System], object] | Declaration
 Items = Item | Sequence[Item]
 """The argument `free` of a fit."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Free:
+class Free(Declaration):
     """A parameter to estimate, with its bounds, scale and prior.
 
         Free("IBxx", bounds=(0.5, 20.0)), Free(lambda system: system.body.mass, prior=(12.0, 0.5))
@@ -55,9 +84,9 @@ class Free:
         (`Trial.labels`) for one value per group: `Free("friction", each="rider")`.
     """
 
-    where: str | Callable[[Any], Any]
+    where: str | Callable[[System], object]
     start: float | None = None
-    bounds: tuple[float | None, float | None] | None = None
+    bounds: Bounds | None = None
     scale: float | None = None
     prior: Prior | None = None
     # A frozen dataclass hashes all its fields, and a dict has no hash.
@@ -66,14 +95,50 @@ class Free:
     unit: str = ""
     each: str | None = None
 
+    def parts(self, system: System, noise: Any = None, channels: Sequence[str] = ()) -> list[Part]:
+        """One part per entry of the selected leaves."""
+        if not isinstance(self.tied, Mapping):
+            raise TypeError(f"`tied` must be a dict from names to factors, such as {{'rF': 1.0}}, got {self.tied!r}.")
+        chosen, leaves = find_leaves(system, self.where)
+        followers: list[tuple[int, int, float]] = []
+        limits = []
+        for name, factor in self.tied.items():
+            factor = real_number(factor, f"`tied`: the factor of {name}")
+            for i in find_leaves(system, name)[0]:
+                path, leaf = leaves[i]
+                info = declared(system, path)
+                if not math.isfinite(factor) or (factor <= 0 and info.positive):
+                    must = "positive, as the parameter is declared" if math.isfinite(factor) else "a finite number"
+                    raise ValueError(f"`tied`: the factor of {leaf_name(path)} must be {must}; got {factor}.")
+                followers += [(i, place, factor) for place in range(leaf.size)]
+                limits.append(_limits(info, factor))
+        parts = []
+        for i in chosen:
+            path, leaf = leaves[i]
+            many, info = leaf.size > 1 or len(chosen) > 1, declared(system, path)
+            if followers and many:
+                raise ValueError(
+                    f"{leaf_name(path)} has several entries, and other parameters can be tied to a single number only. "
+                    "Omit `tied`."
+                )
+            for place, index in enumerate(np.ndindex(leaf.shape)):
+                label = self.name if self.name and not many else leaf_name(path)
+                label += str(list(index)) if leaf.ndim else ""
+                targets = ((i, place, 1.0), *followers)
+                entry = Entry(label, self.unit or info.unit, targets, part=learned_part(system, path))
+                parts.append(
+                    scalar(entry, self, float(leaf[index]) if self.start is None else self.start, info, limits)
+                )
+        return parts
+
 
 @dataclasses.dataclass(frozen=True)
-class Named:
+class Named(Declaration):
     """A parameter of the sensors, inputs or noise, not of the system. The options are as in `Free`."""
 
     what: str
     start: float | None = None
-    bounds: tuple[float | None, float | None] | None = None
+    bounds: Bounds | None = None
     scale: float | None = None
     prior: Prior | None = None
     name: str | None = None
@@ -88,6 +153,11 @@ class CalibrationTerm(Named):
     start: float = 0.0
     of: Where | None = None
     each: str | None = None
+    wheres: ClassVar[tuple[Where, ...]] = ("input", "sensor", "start")
+
+    @property
+    def kind(self) -> str:
+        return type(self).__name__.lower()
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -102,14 +172,47 @@ class CalibrationTerm(Named):
 
     @property
     def is_eliminated(self) -> bool:
-        """Whether each trial or window has its own value, which is eliminated in every step and reported in
-        `Fit.nuisance`.
-
-        A term with bounds, with a distribution as its prior or with `of="start"` is a parameter with an interval
+        """A term with bounds, with a distribution as its prior or with `of="start"` is a parameter with an interval
         instead.
         """
         simple = self.bounds in (None, (None, None)) and not isinstance(self.prior, str) and self.of != "start"
         return simple and (self.each == "trial" or (self.each == "window" and isinstance(self, (Gain, Offset))))
+
+    def parts(
+        self, system: System, noise: Mapping[str, float] | None = None, channels: Sequence[str] = ()
+    ) -> list[Part]:
+        """One value, with a role for each name."""
+        kind, wheres = self.kind, [self._where(system, name) for name in self.channels]
+        if noise is not None and "sensor" in wheres and isinstance(self, (Delay, LowPass)):
+            state = "delayed" if isinstance(self, Delay) else "low_pass"
+            raise ValueError(
+                f"{type(self).__name__}({self.what!r}): a fit with `noise` does not support delays or filters of "
+                f"sensors. Add a state to the system instead: `jaxkane.sensors.{state}`."
+            )
+        label = f"{kind} of {'start of ' if self.of == 'start' else ''}{', '.join(self.channels)}"
+        unit = self.unit or (units_of(system).get(self.channels[0], "") if isinstance(self, Offset) else "")
+        roles = tuple((f"{kind} of {where}", name) for where, name in zip(wheres, self.channels, strict=True))
+        return [scalar(Entry(self.name or label, unit, roles=roles), self, self.start)]
+
+    def _where(self, system: System, what: str) -> Where:
+        """Whether a name is an input, a sensor or an initial value."""
+        title, kind, of = type(system).__name__, type(self).__name__, self.of
+        if of not in (None, *self.wheres):
+            raise ValueError(f"{kind}({what!r}): `of` must be {', '.join(map(repr, self.wheres))} or None, got {of!r}.")
+        of = self.wheres[0] if len(self.wheres) == 1 else of
+        if of in (None, "input") and what in system.inputs:
+            return "input"
+        starts = (*system.coordinates, *system.speeds, *system.states)
+        sensors = (*starts, *system.dependent_speeds, *output_names(system)) if of in (None, "sensor") else ()
+        among, named = {
+            None: ((*system.inputs, *sensors), "input or channel"),
+            "input": (system.inputs, "input"),
+            "sensor": (sensors, "channel"),
+            "start": (starts, "coordinate, independent speed or state"),
+        }[of]
+        if what not in among:
+            raise ValueError(f"{title} has no {named} {what!r}; {hint(what, among, 'it has')}")
+        return of or "sensor"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,6 +279,7 @@ class Delay(CalibrationTerm):
 
     unit: str = "s"
     before: float | None = None
+    wheres: ClassVar[tuple[Where, ...]] = ("input", "sensor")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,25 +300,49 @@ class LowPass(CalibrationTerm):
     - `scale`: by default two sample intervals [s].
     """
 
-    bounds: tuple[float | None, float | None] | None = (0.0, None)
+    bounds: Bounds | None = (0.0, None)
     unit: str = "s"
     order: Literal[1, 2] = 1
+    wheres: ClassVar[tuple[Where, ...]] = ("sensor",)
 
-
-def with_time_scales(items: Sequence[Item], interval: float) -> list[Item]:
-    """Set missing scales of delays and time constants to two sample intervals [s], because the time scales of data
-    range from microseconds to hours."""
-
-    def scaled(item: Item) -> Item:
-        if isinstance(item, (Delay, LowPass)) and item.scale is None:
-            return dataclasses.replace(item, scale=2.0 * interval)
-        return item
-
-    return [scaled(item) for item in items]
+    @property
+    def kind(self) -> str:
+        if self.order not in (1, 2):
+            raise ValueError(f"LowPass({self.what!r}): `order` must be 1 or 2, got {self.order!r}.")
+        return LOW_PASSES[int(self.order) - 1]
 
 
 @dataclasses.dataclass(frozen=True)
-class SpectralDensity(Named):
+class NoiseTerm(Named):
+    """A parameter of the process noise or of the measurement noise. It is always positive."""
+
+    def parts(
+        self, system: System, noise: Mapping[str, float] | None = None, channels: Sequence[str] = ()
+    ) -> list[Part]:
+        """One positive value."""
+        title, is_density = f"{type(self).__name__}({self.what!r})", isinstance(self, SpectralDensity)
+        if noise is None:
+            raise ValueError(
+                f"{title} needs a fit with a likelihood, and `noise` is not given. Pass `noise`, the spectral "
+                "densities of the disturbances by name, or {} without disturbances."
+            )
+        known, where = (noise, "`noise` has") if is_density else (channels, "the measured channels are")
+        if self.what not in known:
+            raise ValueError(f"{title}: unknown name; {hint(self.what, known, where)}")
+        kind, unit = ("spectral density" if is_density else "noise scale"), ""
+        label = f"{kind} of {self.what}"
+        start = positive_number(noise[self.what] if self.start is None else self.start, f"{label}: `start`")
+        lower, upper = _checked_bounds(label, self.bounds)
+        stated = self if self.bounds is None else dataclasses.replace(self, bounds=(max(lower, 0.0), upper))
+        if is_density and (own := unit_of(self.what, units_of(system))):
+            own = f"({own})" if set(own) & set(" /^") else own
+            unit = f"{own}^2 s" if self.what in system.inputs else f"{own}^2/s"
+        entry = Entry(self.name or label, self.unit or unit, roles=((kind, self.what),))
+        return [scalar(entry, stated, start, ParameterInfo(True, ()))]
+
+
+@dataclasses.dataclass(frozen=True)
+class SpectralDensity(NoiseTerm):
     """The spectral density of the process noise of a speed, a state or an input: see `noise` in `fit`.
 
     The spectral density is always positive.
@@ -227,7 +355,7 @@ class SpectralDensity(Named):
 
 
 @dataclasses.dataclass(frozen=True)
-class NoiseScale(Named):
+class NoiseScale(NoiseTerm):
     """A factor of `Trial.sigma` of a channel, the same in all trials, in a fit with `noise`.
 
     The factor is always positive. If `sigma` is 1, the factor is the standard deviation in the channel's unit.
@@ -240,209 +368,116 @@ class NoiseScale(Named):
     start: float = 1.0
 
 
-@dataclasses.dataclass(frozen=True)
-class Inertia:
-    """The inertia of a rigid body, with its mass and mass centre, kept physically consistent.
+START_INSIDE = 0.1
+"""The distance from the bound at which the search starts if the initial guess is at a bound. It is a fraction of the
+scale, or of the distance between the bounds if that is less."""
 
-        Inertia(mass="mB", center=("xB", None, "zB"), moments=("IBxx", "IByy", "IBzz"), products=(None, "IBxz", None))
 
-    The pseudo-inertia remains positive definite, because the search uses its log-Cholesky factors (see `PossibleBody`).
+def scalar(
+    entry: Entry,
+    item: Free | Named,
+    start: Any,
+    info: ParameterInfo = ANY,
+    tied_limits: Sequence[tuple[float, float]] = (),
+) -> Part:
+    """A single value, bounded by its own declaration and by those of the parameters tied to it."""
+    name = entry.name
+    start = real_number(start, f"{name}: `start`")
+    if not math.isfinite(start):
+        raise ValueError(f"{name}: the initial guess must be finite, got {start}. Pass another `start`.")
+    stated = lower, upper = _checked_bounds(name, item.bounds)
+    if item.bounds is None or stated != (-math.inf, math.inf):  # (None, None): a search without bounds
+        limits = [stated, _limits(info, 1.0), *tied_limits]
+        lower, upper = max(low for low, _ in limits), min(high for _, high in limits)
+    if isinstance(item.prior, str) and item.prior not in ("normal", "lognormal"):
+        raise ValueError(
+            f"{name}: `prior` must be (mean, standard deviation), 'normal' or 'lognormal', got {item.prior!r}."
+        )
+    alone = item.prior is not None and not isinstance(item.prior, str) and not is_lognormal(item.prior)
+    prior = checked_prior(name, item.prior) if alone else None
+    scale = abs(start) or (prior[1] if prior is not None and math.isfinite(prior[1]) else 1.0)
+    if item.scale is not None:
+        scale = positive_number(item.scale, f"{name}: `scale`")
+    begin = start
+    if start in (lower, upper) and info.allows(start):  # the slope of the bijection is zero at a bound
+        begin += (1 if start == lower else -1) * START_INSIDE * min(scale, upper - lower)
+    if not lower < begin < upper:
+        raise ValueError(
+            f"{name}: the initial guess {start:.6g} is not inside its bounds ({lower:g}, {upper:g}). These combine "
+            "`bounds` with the declared limits of the parameter and of the parameters tied to it. Pass another `start`."
+        )
+    numbers = (jnp.asarray(float(x), jnp.result_type(float)) for x in (begin, lower, upper, scale))
+    bounded = (lower > -math.inf, upper < math.inf)
+    bijection = Interval(*numbers, bounded=bounded, uniform=bool(np.all(np.isfinite(stated))))
+    return Part([entry], bijection, [start], [scale], [prior])
 
-    **Arguments:** names or paths of the system's parameters, as in `Free`.
 
-    - `moments`: names of Ixx, Iyy, Izz about the mass centre. Two equal names describe a wheel.
-    - `products`: names of the matrix entries Ixy, Ixz, Iyz; None for those that are zero by symmetry. A body with a
-        plane of symmetry has one product of inertia. A body with principal axes has none.
-    - `mass`: the name of the mass; None if it is not a parameter to be estimated.
-    - `center`: names of the coordinates of the mass centre; None for those that are not parameters to be estimated.
-    - `matrix`: the name of an inertia matrix (3, 3), instead of `moments` and `products`.
-    - `fixed`: names from `mass` and `center` that keep their values.
-    - `prior`: by name, (mean, standard deviation).
-    - `unit`: the unit of the moments of inertia in tables.
-    """
+def is_lognormal(prior: Any) -> bool:
+    """Whether the prior is ("lognormal", median, standard deviation of the logarithm)."""
+    return isinstance(prior, (tuple, list)) and len(prior) == 3 and prior[0] == "lognormal"
 
-    moments: tuple[str, str, str] | None = None
-    products: tuple[str | None, str | None, str | None] = (None, None, None)
-    mass: str | None = None
-    center: tuple[str | None, str | None, str | None] = (None, None, None)
-    matrix: str | None = None
-    fixed: Sequence[str] = ()
-    prior: Mapping[str, Prior] = dataclasses.field(default_factory=dict, hash=False)
-    unit: str = "kg m^2"
 
-    @classmethod
-    def of(cls, system: System, body: str, **more: Any) -> Inertia:
-        """The `Inertia` of a body by its name, for `free` of a fit: the parameters that the system uses for it.
+def _limits(info: ParameterInfo, factor: float) -> tuple[float, float]:
+    """The bounds of x for which the tied parameter factor * x is within its declared bounds."""
+    low, high = info.within
+    low = max(low, 0.0) if info.positive else low
+    if not factor:
+        return -math.inf, math.inf
+    ends = low / factor, high / factor
+    return min(ends), max(ends)
 
-            fit(arm, trials, free=(Inertia.of(arm, "forearm"), "damping.elbow"))
 
-        The mass and the mass centre are included if they are separate parameters.
+def _checked_bounds(name: str, bounds: Any) -> tuple[float, float]:
+    """The bounds (lower, upper), infinite for None."""
+    if bounds is None:
+        return -math.inf, math.inf
+    if isinstance(bounds, str) or not hasattr(bounds, "__len__") or len(bounds) != 2:
+        raise ValueError(f"{name}: `bounds` must be (lower, upper), each a number or None, got {bounds!r}.")
+    ends = zip(bounds, (-math.inf, math.inf), strict=True)
+    lower, upper = (end if b is None else real_number(b, f"{name}: a bound") for b, end in ends)
+    if not lower < upper:
+        raise ValueError(
+            f"{name}: the lower bound must be less than the upper bound, got bounds={bounds}. Pass None for no bound."
+        )
+    return lower, upper
 
-        **Arguments:**
 
-        - `system`: the `System`.
-        - `body`: the name of the body, as in `motion["forearm"]`.
-        - `more`: the arguments `fixed` and `prior` of `Inertia`.
-
-        **Returns:** an `Inertia`.
-
-        **Raises:** `KeyError` for an unknown name; `ValueError` if a moment of inertia is not a separate parameter. An
-        example is a rod, whose moment of inertia depends on its mass and length. Pass such parameters by name.
-        """
-        bodies = _bodies(system)
-        if body not in bodies:
-            raise not_there(body, bodies, f"the bodies of {type(system).__name__} that have a mass and a frame")
-        with_path, _ = jax.tree_util.tree_flatten_with_path(system)
-        values, slopes = _values_and_slopes(system, bodies.index(body))
-        owners = [_owner(values[i], slopes, i, with_path) for i in range(10)]
-        parameters = [None if owner is None or owner[1] else owner[0] for owner in owners]
-        kept: dict[str, Any] = {"mass": parameters[0], "center": tuple(parameters[1:4])}
-        matrices = {owner[0] if owner and owner[1] == (3, 3) else "" for owner in owners[4:]}
-        if len(matrices) == 1 and "" not in matrices:
-            return cls(matrix=matrices.pop(), **kept, **more)
-        missing = [name for name, owner in zip(_NAMES[4:7], parameters[4:7], strict=True) if owner is None]
-        lost = [name for i, name in enumerate(_NAMES) if i > 6 and parameters[i] is None and values[i] != 0.0]
-        if missing or lost:
+def find_leaves(system: System, where: str | Callable[[System], object]) -> tuple[list[int], list[Any]]:
+    """The indices of the leaves that `where` selects, and all pairs (path, leaf)."""
+    title = type(system).__name__
+    leaves, structure = jax.tree_util.tree_flatten_with_path(system)
+    if isinstance(where, str):
+        chosen = [i for i, (path, _) in enumerate(leaves) if where in names_of_leaf(path)]
+    else:
+        numbered = jax.tree.unflatten(structure, range(len(leaves)))  # each leaf is its index
+        try:
+            chosen = jax.tree.leaves(where(numbered))
+        except (AttributeError, IndexError, KeyError, TypeError):
+            chosen = []
+    if not chosen or not all(isinstance(i, int) and 0 <= i < len(leaves) for i in chosen):
+        known = [leaf_name(path) for path, _ in leaves]
+        raise ValueError(f"{title} has no parameter {where!r}; {hint(str(where), known, 'it has')}")
+    for i in chosen:
+        path, leaf = leaves[i]
+        if not (eqx.is_inexact_array(leaf) and not jnp.issubdtype(leaf.dtype, jnp.complexfloating)):
             raise ValueError(
-                f"{type(system).__name__}: {', '.join(missing + lost)} of {body!r} are not separate parameters of the "
-                "system. Free the parameters on which they depend by name."
+                f"{title}.{leaf_name(path)} is not a real floating-point number and cannot be fitted. Omit it from "
+                "`free`, or use a value such as 1.0."
             )
-        moments, products = tuple(parameters[4:7]), tuple(parameters[7:])
-        return cls(moments, products, **kept, **more)  # type: ignore[arg-type]
+    return chosen, leaves
 
 
-@dataclasses.dataclass(frozen=True)
-class Linear:
-    """A constraint on a sum of free parameters: sum of factor * parameter.
-
-        Linear({"mass of frame": 1.0, "mass of rider": 1.0}, equals=92.0)             # exactly
-        Linear({"mass of frame": 1.0, "mass of rider": 1.0}, equals=92.0, std=0.5)    # weighed on a scale
-        Linear({"mass of frame": -0.2, "mass of rider": 1.0}, at_least=0.0)
-
-    **Arguments:**
-
-    - `factors`: by name of a free parameter, its factor in the sum.
-    - `equals`: the value of the sum, in its unit. Without `std`, the value is exact, and one parameter follows from the
-        others: `Fit.dependent` reports this parameter.
-    - `std`: the standard deviation of `equals`, if the sum was measured.
-    - `at_least`: the lower bound of the sum, in its unit.
-    - `at_most`: the upper bound of the sum, in its unit. If the optimum is at a bound, the result is that of an exact
-        sum with this value.
-    """
-
-    factors: Mapping[str, float] = dataclasses.field(hash=False)
-    equals: float | None = None
-    std: float | None = None
-    at_least: float | None = None
-    at_most: float | None = None
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.factors, Mapping) or not self.factors:
-            raise TypeError(
-                f"Linear: `factors` must be a dict from names of parameters to factors, got {self.factors!r}."
-            )
-        numbers = {f"the factor of {name}": factor for name, factor in self.factors.items()}
-        numbers |= {f"`{name}`": getattr(self, name) for name in ("equals", "std", "at_least", "at_most")}
-        for name, value in numbers.items():
-            number = 1.0 if value is None else real_number(value, f"Linear: {name}")
-            if not np.isfinite(number) or (name == "`std`" and number <= 0) or (name.startswith("the") and not number):
-                raise ValueError(
-                    f"Linear: {name} must be "
-                    f"finite{', and not zero' * name.startswith('the')}{' and positive' * (name == '`std`')}, got "
-                    f"{value}."
-                )
-        bounded = self.at_least is not None or self.at_most is not None
-        if (self.equals is None) != bounded or (self.std is not None and bounded):
-            raise ValueError(
-                f"Linear({self.text}): pass either `equals` (with or without `std`), or `at_least` or `at_most` or "
-                "both."
-            )
-
-    @property
-    def text(self) -> str:
-        """The sum as text."""
-        parts = [name if c == 1 else f"{c:g} {name}" for name, c in self.factors.items()]
-        return " + ".join(parts)
+def one_leaf(system: System, name: str, shape: tuple[int, ...] = ()) -> int:
+    """The index of the leaf with this name. **Raises:** `ValueError` if there is no unique leaf with this shape."""
+    (chosen, leaves) = find_leaves(system, name)
+    if len(chosen) != 1 or leaves[chosen[0]][1].shape != shape:
+        raise ValueError(
+            f"Inertia: {type(system).__name__}.{name} must be one parameter with the shape {shape}, got "
+            f"{[leaves[i][1].shape for i in chosen]}."
+        )
+    return chosen[0]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class JointPrior:
-    """A Gaussian prior of several free parameters whose errors are correlated.
-
-        JointPrior({"IBxx": 11.3, "zB": -1.0}, [[0.04, -0.002], [-0.002, 0.0004]])
-
-    **Arguments:**
-
-    - `mean`: by name of a free parameter, its mean.
-    - `covariance`: the covariance matrix (n, n), in the order of `mean`. An example is
-        `uncertainties.covariance_matrix` for bicycle parameters from BicycleParameters.
-
-    **Raises:** `ValueError` if `covariance` is not symmetric and positive definite.
-    """
-
-    mean: Mapping[str, float]
-    covariance: Any
-
-    def __post_init__(self) -> None:
-        C = np.asarray(self.covariance, float)
-        n = len(self.mean)
-        if C.shape != (n, n) or not np.allclose(C, C.T) or not np.all(np.linalg.eigvalsh(C) > 0):
-            raise ValueError(
-                f"JointPrior of {', '.join(self.mean)}: `covariance` must be a symmetric matrix ({n}, {n}) with "
-                f"positive eigenvalues, got {self.covariance!r}."
-            )
-
-
-_NAMES = ("m", "cx", "cy", "cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
-
-
-def _numbers(system: System) -> list[tuple[str, Any]]:
-    """By body, ten numbers: mass, components of the last offset to the mass centre, and central inertia."""
-    zero = jnp.zeros((), jnp.result_type(float))
-    n_u = len(system.speeds) + len(system.dependent_speeds)
-    q = tuple(zero + 0.3 for _ in system.coordinates)
-    motion = DescriptionEvaluator(system).motion(zero + 0.2, q, (zero,) * n_u)
-    rows = []
-    for body in motion.bodies:
-        if body.is_particle:
-            continue
-        step = body.center._offset if origin_of(body)[1] else None
-        r = (0.0, 0.0, 0.0) if step is None else step.components_in(body.frame)
-        I = body.inertia
-        row = [body.mass, *r, I[0][0], I[1][1], I[2][2], I[0][1], I[0][2], I[1][2]]
-        rows.append((body.name, jnp.stack([jnp.asarray(x, zero.dtype) for x in row])))
-    return rows
-
-
-def _bodies(system: System) -> list[str]:
-    names: list[str] = []
-    jax.eval_shape(lambda s: names.extend(name for name, _ in _numbers(s)), system)
-    return names
-
-
-@jit
-def _all_slopes(system):
-
-    def read(s):
-        return jnp.stack([row for _, row in _numbers(s)])
-
-    return read(system), jax.jacfwd(read)(system)
-
-
-def _values_and_slopes(system: System, i: int) -> tuple[np.ndarray, list[np.ndarray]]:
-    values, slopes = jax.device_get(_all_slopes(system))
-    return np.asarray(values[i]), [np.asarray(x)[i] for x in jax.tree.leaves(slopes)]
-
-
-def _owner(value: float, slopes: list[np.ndarray], i: int, with_path: Any) -> tuple[str, tuple[int, ...]] | None:
-    """The parameter that equals this number or has it as an entry, and its shape; None if it is not unique."""
-    moved = [(k, place) for k, slope in enumerate(slopes) for place in np.flatnonzero(slope[i])]
-    if len(moved) != 1:
-        return None
-    k, place = moved[0]
-    path, leaf = with_path[k]
-    also = [row for row in range(10) if row != i and slopes[k][row].ravel()[place]]
-    is_wheel = all(row in (4, 5, 6) for row in (i, *also))
-    if slopes[k][i].ravel()[place] != 1.0 or float(np.ravel(leaf)[place]) != value or (also and not is_wheel):
-        return None
-    return leaf_name(path), np.shape(leaf)
+def leaf_names(system: System) -> tuple[str, ...]:
+    """The names of all parameters of a system, as they are used in `free`."""
+    return tuple(leaf_name(path) for path, _ in jax.tree_util.tree_flatten_with_path(system)[0])

@@ -1,12 +1,13 @@
-"""The free parameters of a fit: maps between unconstrained variables and values, priors, and subsets."""
+"""The free parameters of a fit: bijections between unconstrained variables and values, priors, and subsets."""
 
 from __future__ import annotations
 
+import abc
+import contextlib
 import dataclasses
-import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,17 +17,141 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
+from scipy.special import log_ndtr
 
 from ..._common.lookup import real_number
 from ..._scalarjit.cache_key import jit
 from ..._scalarjit.compat import Tracer, on_device
 from ..._scalarjit.scalar_function import ScalarFunction
 from ..._system.system import System
-from .bijections import Interval, PossibleBody
-from .declarations import (
-    Prior,
-)
 from .trial import Trial, groups_of
+
+Prior = tuple[float, float] | tuple[str, float, float] | Literal["normal", "lognormal"]
+
+
+class Bijection(eqx.Module):
+    """Maps unconstrained variables x (n,) to n physically possible values. Independent of a system.
+
+    x is zero at the initial guess, and a change of x by one is typical.
+    """
+
+    @property
+    def size(self) -> int:
+        """The number of values."""
+        return 1
+
+    @property
+    def bounds(self) -> Float[np.ndarray, "n 2"]:
+        """The lower and upper bounds of the values, infinite without a bound."""
+        return np.tile([-np.inf, np.inf], (self.size, 1))
+
+    @property
+    def longest_steps(self) -> Float[np.ndarray, " n"]:
+        """The longest allowed steps of x."""
+        return np.full(self.size, np.inf)
+
+    @abc.abstractmethod
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]: ...
+
+    @abc.abstractmethod
+    def inverse(self, values: Float[Array, " n"]) -> Float[Array, " n"]: ...
+
+    @abc.abstractmethod
+    def log_prior_constants(self, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+        """log p(values) + (values - mean)^2 / (2 deviation^2), (n,); NaN for a value without a density p."""
+
+
+class Interval(Bijection):
+    """A single value on the real line, a half-line or an interval.
+
+        start + s x,   lower + (start - lower) exp(c x),   lower + (upper - lower) logistic(c x + d)
+
+    c is such that the slope at the initial guess is `scale`. A positive parameter is start * exp(x).
+
+    `uniform`: whether the user gave both bounds. Without a prior, the density is then uniform between them. The bounds
+    in the declaration of a parameter only limit the search. They are not a prior.
+    """
+
+    start: Float[Array, ""]
+    lower: Float[Array, ""]
+    upper: Float[Array, ""]
+    scale: Float[Array, ""]
+    bounded: tuple[bool, bool] = eqx.field(static=True)
+    uniform: bool = eqx.field(static=True, default=True)
+
+    @property
+    def far(self) -> float:
+        """An x at which the value equals the bound within rounding. The x of the bound itself is infinite."""
+        ends = [abs(float(self.start - end)) for end in (self.lower, self.upper) if np.isfinite(float(end))]
+        # exp(-50) = 2e-22 is below the rounding error of float64.
+        return 50.0 * max(ends) / float(self.scale)
+
+    def __call__(self, x: Float[Array, " 1"]) -> Float[Array, " 1"]:
+        start, scale = self.start, self.scale
+        if self.bounded == (False, False):
+            return start + scale * x
+        if self.bounded == (False, True):
+            return self.upper - (self.upper - start) * jnp.exp(-scale / (self.upper - start) * x)
+        if self.bounded == (True, False):
+            return self.lower + (start - self.lower) * jnp.exp(scale / (start - self.lower) * x)
+        width, share = self._share(start)
+        return self.lower + width * jax.nn.sigmoid(_logit(share) + scale / (width * share * (1 - share)) * x)
+
+    def inverse(self, value: Float[Array, " 1"]) -> Float[Array, " 1"]:
+        start, scale = self.start, self.scale
+        if self.bounded == (False, False):
+            return (value - start) / scale
+        if self.bounded == (False, True):
+            return -jnp.log((self.upper - value) / (self.upper - start)) * (self.upper - start) / scale
+        if self.bounded == (True, False):
+            return jnp.log((value - self.lower) / (start - self.lower)) * (start - self.lower) / scale
+        width, share = self._share(start)
+        return (_logit(self._share(value)[1]) - _logit(share)) * width * share * (1 - share) / scale
+
+    @property
+    def bounds(self) -> Float[np.ndarray, "1 2"]:
+        return np.array([[self.lower, self.upper]], float)
+
+    @property
+    def longest_steps(self) -> Float[np.ndarray, " 1"]:
+        """The longest allowed step of x: a factor of 20 in the distance to a bound.
+
+        A linear prediction beyond a bound is a long step along the exponential. Without this limit, a friction
+        coefficient became 1e-74. Its slope was then lost in rounding, and the search could not return.
+        """
+        near = np.sum(1.0 / np.abs(self.bounds - float(self.start)), axis=1)  # zero without bounds
+        with np.errstate(divide="ignore"):
+            return 3.0 / (near * float(self.scale))  # exp(3) = 20
+
+    def log_prior_constants(self, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+        """The Gaussian is truncated at the bounds. Without a prior (infinite standard deviation), the density is
+        uniform if the user gave both bounds."""
+        lower, upper = float(self.lower), float(self.upper)
+        if np.all(np.isfinite(deviation)):
+            return gaussian_constant(deviation) - log_gaussian_mass(
+                (lower - mean) / deviation, (upper - mean) / deviation
+            )
+        return np.array([-np.log(upper - lower) if all(self.bounded) and self.uniform else np.nan])
+
+    def _share(self, value: Array) -> tuple[Array, Array]:
+        width = self.upper - self.lower
+        return width, (value - self.lower) / width
+
+
+def gaussian_constant(deviation: np.ndarray) -> np.ndarray:
+    """The logarithm of the largest density of normal distributions."""
+    return -np.log(deviation) - 0.5 * np.log(2 * np.pi)
+
+
+def log_gaussian_mass(a: Any, b: Any) -> Any:
+    """log (Phi(b) - Phi(a)) for a < b, without cancellation in either tail."""
+    a, b = np.where(a > 0, -b, a), np.where(a > 0, -a, b)
+    return log_ndtr(b) + np.log1p(-np.exp(log_ndtr(a) - log_ndtr(b)))
+
+
+def _logit(share: Array) -> Array:
+    return jnp.log(share) - jnp.log1p(-share)
+
 
 LOW_PASSES = ("time constant", "time constant (twice)")
 """Kinds of `LowPass`, by their order."""
@@ -80,7 +205,7 @@ class Parameters(eqx.Module):
     """
 
     all_entries: tuple[Entry, ...] = eqx.field(static=True)
-    bijections: tuple[Interval | PossibleBody, ...]
+    bijections: tuple[Bijection, ...]
     start: Float[Array, " p"]
     scale: Float[Array, " p"]
     prior_mean: Float[Array, " p"]
@@ -178,7 +303,7 @@ class Parameters(eqx.Module):
     def all(self, x: Float[Array, " p"]) -> Float[Array, " all"]:
         """The unconstrained variables of all parameters, free or fixed."""
         every = with_entries(self.rest, self.places, x)
-        return every if _are_traced(every) else on_device(every)
+        return on_device(every) if isinstance(every, np.ndarray) else every
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -211,9 +336,7 @@ class Parameters(eqx.Module):
     def bounds(self) -> np.ndarray:
         """The lower and upper bound of each value (p, 2), infinite without a bound. Values of bodies are not
         bounded."""
-        none = [(-math.inf, math.inf)]
-        pairs = [[(f.lower, f.upper)] if isinstance(f, Interval) else none * f.size for f in self.bijections]
-        bounds = np.array([pair for of_one in pairs for pair in of_one], float)
+        bounds = np.concatenate([f.bounds for f in self.bijections])
         if self.mixing is not None:
             own = np.any(np.asarray(self.mixing) != np.eye(len(bounds)), axis=1)
             bounds = np.where(own[:, None], np.asarray(self.limits), bounds)
@@ -221,9 +344,7 @@ class Parameters(eqx.Module):
 
     @property
     def longest_steps(self) -> np.ndarray:
-        """The longest allowed step (p,) of every x: see `Interval.longest_step`."""
-        every = [[f.longest_step] if isinstance(f, Interval) else [math.inf] * f.size for f in self.bijections]
-        return np.concatenate(every)[np.asarray(self.places)]
+        return np.concatenate([f.longest_steps for f in self.bijections])[np.asarray(self.places)]
 
     def values(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """Parameters in their own units."""
@@ -249,11 +370,7 @@ class Parameters(eqx.Module):
     def all_slopes(self, x: Float[Array, " p"]) -> Any:
         """d all_values / d all x (all, all)."""
         slopes = self._each(_slope, with_entries(self.rest, self.places, x))
-        return (
-            slopes
-            if self.mixing is None
-            else (self.mixing if _are_traced(slopes) else np.asarray(self.mixing)) @ slopes
-        )
+        return slopes if self.mixing is None else _numpy_of(slopes).asarray(self.mixing) @ slopes
 
     def _each(self, evaluate: Any, numbers: Any) -> Any:
         """The results of all bijections: concatenated vectors, or a block-diagonal matrix.
@@ -261,42 +378,33 @@ class Parameters(eqx.Module):
         Concrete numbers are evaluated by one compiled program per kind of bijection, which all fits share. This also
         applies while another function is traced.
         """
-        if _are_traced(self, numbers):
-            parts = [evaluate.__wrapped__(*pair) for pair in zip(self.bijections, self._parts(numbers), strict=True)]
-            return jnp.concatenate(parts) if parts[0].ndim == 1 else jsl.block_diag(*parts)
-        with jax.ensure_compile_time_eval():
-            pairs = zip(self.bijections, self._parts(np.asarray(numbers)), strict=True)
-            parts = [np.asarray(evaluate(*pair)) for pair in pairs]
-        return np.concatenate(parts) if parts[0].ndim == 1 else scipy.linalg.block_diag(*parts)
+        xp, linalg = (jnp, jsl) if _numpy_of(self, numbers) is jnp else (np, scipy.linalg)
+        split = xp.split(xp.asarray(numbers), np.cumsum(self.sizes)[:-1])
+        with contextlib.nullcontext() if xp is jnp else jax.ensure_compile_time_eval():
+            evaluate = evaluate.__wrapped__ if xp is jnp else evaluate
+            parts = [xp.asarray(evaluate(*pair)) for pair in zip(self.bijections, split, strict=True)]
+        return xp.concatenate(parts) if parts[0].ndim == 1 else linalg.block_diag(*parts)
 
     def _of_free(self, of_all: Any) -> Array:
-        if _are_traced(self.places, of_all):
-            return of_all[jnp.ix_(*[self.places] * of_all.ndim)]
-        return on_device(of_all[np.ix_(*[np.asarray(self.places)] * of_all.ndim)])
+        xp = _numpy_of(self.places, of_all)
+        of_free = of_all[xp.ix_(*[xp.asarray(self.places)] * of_all.ndim)]
+        return of_free if xp is jnp else on_device(of_free)
 
     def log_determinant(self, x: Float[Array, " p"]) -> Array:
         """log |det d values / d x|. Added to a log density of the values, this gives a log density of x."""
-        if self.mixing is not None:
-            return jnp.linalg.slogdet(jnp.asarray(self.slopes(x)))[1]
-        pairs = zip(self.bijections, self._parts(self.all(x)), strict=True)
-        return sum((jnp.linalg.slogdet(jax.jacfwd(f)(part))[1] for f, part in pairs), jnp.zeros((), x.dtype))
+        return jnp.linalg.slogdet(jnp.asarray(self.slopes(x)))[1]
 
     def all_values(self, x: Float[Array, " p"]) -> Any:
         """The values of all parameters, free or fixed (all,)."""
         every = with_entries(self.rest, self.places, x)
-        traced = _are_traced(self, every)
-        values = jnp.stack(_values(self.bijections, every)) if traced else self._each(_value, every)
+        xp = _numpy_of(self, every)
+        values = xp.stack(_values(self.bijections, every)) if xp is jnp else self._each(_value, every)
         if self.mixing is None:
             return values
-        xp: Any = jnp if traced else np
         values, limits = xp.asarray(self.mixing) @ values, xp.asarray(self.limits)
         # A bijection does not keep a parameter that follows from a sum within its bounds. NaN makes the optimizer
         # reject such a step.
         return xp.where((values >= limits[:, 0]) & (values <= limits[:, 1]), values, xp.nan)
-
-    def _parts(self, x: Any) -> list[Any]:
-        split = np.split if isinstance(x, np.ndarray) else jnp.split
-        return split(x, np.cumsum(self.sizes)[:-1])
 
     @jit
     def apply(
@@ -318,7 +426,10 @@ class Parameters(eqx.Module):
         for i, (entry, value) in enumerate(zip(self.all_entries, values, strict=True)):
             if entry.group is not None and applies is None:
                 continue
-            own = functools.partial(_where, None if entry.group is None or applies is None else applies[i])
+
+            def own(new, old, i=i, entry=entry):
+                return new if entry.group is None else jnp.where(applies[i], new, old)  # type: ignore[index]
+
             calibration |= {role: own(value, calibration.get(role, value)) for role in entry.roles}
             for number, place, factor in entry.targets:
                 leaf, new = leaves[number], factor * value
@@ -360,24 +471,21 @@ class Parameters(eqx.Module):
         """All values (all,), in which each exact sum or inequality replaces one parameter."""
         return self._each(_value, self.all(x))
 
-    def is_near_bound(self, place: int, x: Float[Array, " p"]) -> bool:
-        """Whether the sum at this index is near its bound: its slope is below a tenth of the slope at the initial
-        guess. The sum has then covered nine tenths of the distance to the bound."""
-        slopes = [np.diagonal(self._each(_slope, at))[place] for at in (self.all(x), np.zeros(self.rest.size))]
-        return bool(abs(slopes[0]) < 0.1 * abs(slopes[1]))
+    def resting(self, place: int, x: Float[Array, " p"]) -> tuple[Parameters, np.ndarray] | None:
+        """The parameters with the sum at this index fixed at its nearer bound, and the x that remain free.
 
-    def resting(self, place: int, x: Float[Array, " p"]) -> tuple[Parameters, np.ndarray]:
-        """The parameters with the sum at this index fixed at its nearer bound, and the x that remain free."""
+        None if the sum is not near a bound: its slope is above a tenth of that at the initial guess. Below, the sum has
+        covered nine tenths of the distance to the bound.
+        """
         free = np.asarray(self.places)
-        bijection = self.bijections[self.owners[int(np.flatnonzero(free == place)[0])]]
-        assert isinstance(bijection, Interval)
-        lower, upper = bijection.bounded
-        value = float(self.sums(x)[place])
-        at_lower = lower and (not upper or value - float(bijection.lower) < float(bijection.upper) - value)
-        kept = np.flatnonzero(free != place)
+        now, first = (abs(np.diagonal(self._each(_slope, at))[place]) for at in (self.all(x), np.zeros(self.rest.size)))
+        if place not in free or not now < 0.1 * first:
+            return None
+        bijection: Any = self.bijections[self.owners[int(np.flatnonzero(free == place)[0])]]
+        kept, value = np.flatnonzero(free != place), float(self.sums(x)[place])
         fixed = self.subset(kept.tolist(), x)
         rest = np.array(fixed.rest)
-        rest[place] = (-1.0 if at_lower else 1.0) * bijection.far
+        rest[place] = bijection.far if value - bijection.lower >= bijection.upper - value else -bijection.far
         return dataclasses.replace(fixed, rest=on_device(rest)), np.asarray(x)[kept]
 
     @property
@@ -399,7 +507,7 @@ class Parameters(eqx.Module):
         The density is Gaussian and truncated at the bounds, or uniform between the bounds. The result is NaN for
         entries without such a density and for entries with a joint prior.
         """
-        parts = [self._parts(np.asarray(x, float)) for x in self._all_priors]
+        parts = [np.split(np.asarray(x, float), np.cumsum(self.sizes)[:-1]) for x in self._all_priors]
         constants = [f.log_prior_constants(*pair) for f, *pair in zip(self.bijections, *parts, strict=True)]
         alone = ~self._in_rows(slice(None)) & (self.mixing is None)
         return np.where(alone, np.concatenate(constants), np.nan)[np.asarray(self.places)]
@@ -415,7 +523,7 @@ class Parameters(eqx.Module):
 
 
 @ScalarFunction.compile_cheaply
-def _values(bijections: tuple[Interval | PossibleBody, ...], x: Array) -> list[Array]:
+def _values(bijections: tuple[Bijection, ...], x: Array) -> list[Array]:
     """The value of each bijection, as one scalar function. XLA would compile this to a dozen kernels."""
     places = np.cumsum([f.size for f in bijections])[:-1]
     return [y for f, part in zip(bijections, jnp.split(x, places), strict=True) for y in f(part)]
@@ -426,18 +534,15 @@ _inverse = jax.jit(lambda bijection, values: bijection.inverse(values))
 _slope = jax.jit(lambda bijection, x: jax.jacfwd(bijection)(x))
 
 
-def _are_traced(*numbers: Any) -> bool:
-    return any(isinstance(x, Tracer) for x in jax.tree.leaves(numbers))
-
-
 def _numpy_of(*numbers: Any) -> Any:
-    return jnp if _are_traced(numbers) else np
+    """jax.numpy if one of the numbers is traced, else numpy."""
+    return jnp if any(isinstance(x, Tracer) for x in jax.tree.leaves(numbers)) else np
 
 
 def with_entries(every: Any, places: Any, some: Any) -> Any:
     """A copy of `every` with `some` at the unique indices `places` of the first axis. The result is a NumPy array if
     no argument is traced."""
-    if _are_traced(every, places, some):
+    if _numpy_of(every, places, some) is jnp:
         # With `unique_indices`, JAX differentiates this as one assignment. Without it, the derivative is ten kernels.
         return jnp.asarray(every).at[places].set(some, unique_indices=True, mode="promise_in_bounds")
     every = np.array(every)
@@ -450,16 +555,13 @@ def floats(numbers: ArrayLike) -> Array:
     return on_device(numbers, jnp.result_type(float))
 
 
-def _where(applies: Array | None, new: Any, old: Any) -> Any:
-    return new if applies is None else jnp.where(applies, new, old)
-
-
 def places_of(entry: Entry) -> list[Any]:
     """The entries of the system and the roles that an entry sets."""
     return [*[target[:2] for target in entry.targets], *entry.roles]
 
 
 def checked_prior(name: str, prior: Any) -> tuple[float, float]:
+    """A mean and a positive standard deviation."""
     try:
         mean, deviation = (real_number(x, f"{name}: in a prior, what is given") for x in prior)
     except (TypeError, ValueError):

@@ -31,11 +31,11 @@ from ..solve.linearization import (
     trajectories_of,
 )
 from ..solve.step_refinement import finer
-from .declarations import Items, Prior, with_time_scales
+from .declarations import Delay, Items, LowPass
 from .errors import Errors, errors_of
-from .from_declarations import is_eliminated, parameters_of
+from .from_declarations import parameters_of
 from .model import Model, Simulation, Unknowns
-from .parameters import Parameters
+from .parameters import Parameters, Prior
 from .specification import (
     ProblemSpec,
     checked_names,
@@ -112,13 +112,16 @@ class Problem:
             deviations = jnp.concatenate([nuisance.start_deviation, nuisance.trial_deviation])
             noise = noise_of(system, spec.noise, deviations, spec.window)
         starts = start_assembly(system, trials, nuisance.start)
-        common = [item for item in spec.free if not is_eliminated(item)]
+        common = [item for item in spec.free if not item.is_eliminated]
         if not common:
             raise ValueError(
                 "`free` contains no parameter, or only terms with each='trial' or 'window'. Add the name of a "
                 "parameter, such as 'IBxx'."
             )
-        common = with_time_scales(common, min(float(np.median(np.diff(trial.t))) for trial in trials))
+        # Delays and time constants of data range from microseconds to hours, so their scale is two sample intervals.
+        scale = 2.0 * min(float(np.median(np.diff(trial.t))) for trial in trials)
+        unscaled = [isinstance(item, (Delay, LowPass)) and item.scale is None for item in common]
+        common = [dataclasses.replace(x, scale=scale) if n else x for x, n in zip(common, unscaled, strict=True)]
         if parameters is None:
             given = spec.noise is not None and [i for i in spec.free if isinstance(getattr(i, "prior", None), str)]
             if given:

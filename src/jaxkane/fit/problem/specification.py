@@ -17,10 +17,10 @@ from ..._kane.constraint_residuals import has_configuration_constraints
 from ..._kane.right_hand_side import output_names
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
-from .declarations import Delay, JointPrior, Linear, Prior
-from .from_declarations import as_items, is_eliminated, parameters_of
+from .declarations import Delay
+from .from_declarations import JointPrior, Linear, as_items, parameters_of
 from .model import Nuisance, Simulation
-from .parameters import Parameters, floats
+from .parameters import Parameters, Prior, floats
 from .trial import Trial
 from .windows import Reach, state_names
 
@@ -180,7 +180,7 @@ def start_assembly(system: System, trials: Sequence[Trial], unknown: Sequence[st
 def nuisance_of(spec: ProblemSpec, channels: Sequence[str], sampled: Sequence[str]) -> Nuisance:
     """The nuisance values. `sampled`: names of the inputs with samples."""
     system = spec.system
-    items = [item for item in spec.free if is_eliminated(item)]
+    items = [item for item in spec.free if item.is_eliminated]
     own = parameters_of(system, items, spec.noise, channels)
     of_window = np.array([item.each == "window" for item in items], bool)
     if of_window.any() and (spec.noise is not None or spec.defect_std is not None):

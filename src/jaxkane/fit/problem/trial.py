@@ -1,8 +1,8 @@
-"""Trials: measured motions, from arrays or a data frame. This module does not depend on a system."""
+"""Trials: measured motions, from arrays or a data frame, and checks of their records. Independent of a system."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,40 +60,40 @@ class Trial:
         labels: Mapping[str, str | float] | None = None,
     ):
         self.name = str(name)
-        self.labels = self._checked_labels(labels)
+        for group, given in (("measured", measured), ("inputs", inputs), ("initial", initial), ("labels", labels)):
+            what = f"a function. {_FEEDBACK}" if callable(given) else f"{type(given).__name__}."
+            must, example = group == "measured", "{'rider': 'anna'}" if group == "labels" else "{'roll': samples}"
+            self._require(
+                (isinstance(given, Mapping) and (given or not must)) or (given is None and not must),
+                f"`{group}` must be a {'nonempty ' * must}dict by name, such as {example}, got {what}",
+            )
+        self.labels = {
+            key: x if isinstance(x, str) else real_number(x, f"{self.name}: labels[{key!r}]")
+            for key, x in (labels or {}).items()
+        }
         self.t = self._times(t)
-        if not isinstance(measured, Mapping) or not measured:
-            raise ValueError(
-                f"{self.name}: `measured` must be a nonempty dict by channel, such as {{'roll': samples}}, got "
-                f"{type(measured).__name__}."
-            )
-        for group, given in (("inputs", inputs), ("initial", initial)):
-            if given is not None and not isinstance(given, Mapping):
-                what = f"a function. {_FEEDBACK}" if callable(given) else f"{type(given).__name__}."
-                raise ValueError(
-                    f"{self.name}: `{group}` must be a dict by name, such as {{'name': samples}}, got {what}"
-                )
         self.measured = {key: self._samples("measured", key, value) for key, value in measured.items()}
-        self.inputs = {
-            key: self._samples("inputs", key, value, number=True, gaps=False) for key, value in (inputs or {}).items()
-        }
-        self.initial = {
-            key: self._samples("initial", key, value, number=True, gaps=False) for key, value in (initial or {}).items()
-        }
-        self.sigma = self._sigmas(sigma)
-        if not any(np.isfinite(x).any() for x in self.measured.values()):
-            raise ValueError(f"{self.name}: all measurements are NaN ({', '.join(self.measured)}). Omit this trial.")
+        self.inputs, self.initial = (
+            {key: self._samples(group, key, value, number=True) for key, value in (given or {}).items()}
+            for group, given in (("inputs", inputs), ("initial", initial))
+        )
+        by_channel = sigma if isinstance(sigma, Mapping) else dict.fromkeys(measured, sigma)
+        missing = [key for key in measured if key not in by_channel]
+        self._require(
+            not missing,
+            f"`sigma` has no value for {', '.join(missing)}. Pass the standard deviation of each measured channel.",
+        )
+        self.sigma = {key: self._samples("sigma", key, by_channel[key], number=True) for key in measured}
+        for key, value in self.sigma.items():
+            self._require(np.all(value > 0), f"sigma[{key!r}] must be positive, got {value.min():g}.")
+        self._require(
+            any(np.isfinite(x).any() for x in self.measured.values()),
+            f"all measurements are NaN ({', '.join(measured)}). Omit this trial.",
+        )
 
-    def _checked_labels(self, labels: Any) -> dict[str, str | float]:
-        if labels is not None and not isinstance(labels, Mapping):
-            raise ValueError(
-                f"{self.name}: `labels` must be a dict by name, such as {{'rider': 'anna'}}, got {labels!r}."
-            )
-
-        def label(key, x):
-            return x if isinstance(x, str) else real_number(x, f"{self.name}: labels[{key!r}]")
-
-        return {key: label(key, value) for key, value in (labels or {}).items()}
+    def _require(self, is_right: Any, message: str) -> None:
+        if not is_right:
+            raise ValueError(f"{self.name}: {message}")
 
     @classmethod
     def from_dataframe(
@@ -153,23 +153,19 @@ class Trial:
 
     def _times(self, t: Any) -> np.ndarray:
         t = self._numbers("t", t)
-        if t.ndim != 1 or t.shape[0] < 2:
-            raise ValueError(f"{self.name}: `t` must be at least two times (n_t,), got the shape {t.shape}.")
-        if not np.all(np.isfinite(t)):
-            raise ValueError(f"{self.name}: t[{int(np.argmin(np.isfinite(t)))}] is not finite. Omit this sample.")
-        steps = np.diff(t)
-        if not np.all(steps > 0):
-            i = int(np.argmax(steps <= 0))
-            what = "repeated" if steps[i] == 0 else "unsorted"
-            raise ValueError(
-                f"{self.name}: the times are {what}: t[{i}] = {t[i]:.6g} is followed by {t[i + 1]:.6g}. Sort the "
-                "samples, and keep one sample per time."
-            )
+        self._require(t.ndim == 1 and t.size > 1, f"`t` must be at least two times (n_t,), got the shape {t.shape}.")
+        finite, steps = np.isfinite(t), np.diff(t)
+        self._require(finite.all(), f"t[{int(np.argmin(finite))}] is not finite. Omit this sample.")
+        i = int(np.argmin(steps > 0))
+        self._require(
+            np.all(steps > 0),
+            f"the times are {'repeated' if steps[i] == 0 else 'unsorted'}: t[{i}] = {t[i]:.6g} is followed by "
+            f"{t[i + 1]:.6g}. Sort the samples, and keep one sample per time.",
+        )
         return t
 
     def _numbers(self, label: str, value: Any) -> np.ndarray:
-        if callable(value):
-            raise ValueError(f"{self.name}: {label} must be samples (n_t,), got a function. {_FEEDBACK}")
+        self._require(not callable(value), f"{label} must be samples (n_t,), got a function. {_FEEDBACK}")
         try:
             if isinstance(value, np.ma.MaskedArray):  # masked samples are missing samples
                 value = np.ma.filled(value.astype(float), np.nan) if value.dtype.kind in "iuf" else value.data
@@ -181,41 +177,24 @@ class Trial:
         except (TypeError, ValueError) as error:
             raise ValueError(f"{self.name}: {label} must be real numbers: {error}.") from None
 
-    def _samples(self, group: str, key: str, value: Any, number: bool = False, gaps: bool = True) -> np.ndarray:
+    def _samples(self, group: str, key: str, value: Any, number: bool = False) -> np.ndarray:
+        """Samples (n_t,). `number`: whether a single number is allowed, and gaps are not."""
         label = f"{group}[{key!r}]"
         array = self._numbers(label, value)
         if array.ndim == 0 and number:
             array = np.full(self.t.shape, float(array))
-        if array.shape != self.t.shape:
-            raise ValueError(
-                f"{self.name}: {label} has the shape {array.shape}, but `t` has {self.t.shape}. Pass one sample per "
-                "time."
-            )
-        if np.isinf(array).any():
-            raise ValueError(
-                f"{self.name}: {label}[{int(np.argmax(np.isinf(array)))}] is infinite. Correct it, or write NaN if a "
-                "measurement is missing."
-            )
-        if not gaps and np.isnan(array).any():
-            raise ValueError(
-                f"{self.name}: {label}[{int(np.argmax(np.isnan(array)))}] is NaN. Only measured channels may have "
-                "gaps. Interpolate it, or cut the trial with `between`."
-            )
+        self._require(
+            array.shape == self.t.shape,
+            f"{label} has the shape {array.shape}, but `t` has {self.t.shape}. Pass one sample per time.",
+        )
+        wrong = ~np.isfinite(array) if number else np.isinf(array)
+        i = int(np.argmax(wrong))
+        self._require(
+            not wrong.any(),
+            f"{label}[{i}] is {'NaN' if np.isnan(array[i]) else 'infinite'}. Correct it, interpolate it, or cut the "
+            "trial with `between`. Only missing samples of measured channels may be NaN.",
+        )
         return array
-
-    def _sigmas(self, sigma: Any) -> dict[str, np.ndarray]:
-        by_channel = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.measured, sigma)
-        missing = [key for key in self.measured if key not in by_channel]
-        if missing:
-            raise ValueError(
-                f"{self.name}: `sigma` has no value for {', '.join(missing)}. Pass the standard deviation of each "
-                "measured channel."
-            )
-        sigmas = {key: self._samples("sigma", key, by_channel[key], number=True, gaps=False) for key in self.measured}
-        for key, value in sigmas.items():
-            if not np.all(value > 0):
-                raise ValueError(f"{self.name}: sigma[{key!r}] must be positive, got {value.min():g}.")
-        return sigmas
 
     def between(self, start: float, stop: float) -> Trial:
         """The part of the trial with start <= t <= stop.
@@ -231,11 +210,11 @@ class Trial:
         """
         start, stop = real_number(start, f"{self.name}: `start`"), real_number(stop, f"{self.name}: `stop`")
         inside = (self.t >= start) & (self.t <= stop)
-        if inside.sum() < 2:
-            raise ValueError(
-                f"{self.name}: fewer than two samples are between {start:g} and {stop:g} s. The trial lasts from "
-                f"{self.t[0]:g} to {self.t[-1]:g} s. Choose a longer part of it."
-            )
+        self._require(
+            inside.sum() > 1,
+            f"fewer than two samples are between {start:g} and {stop:g} s. The trial lasts from {self.t[0]:g} to "
+            f"{self.t[-1]:g} s. Choose a longer part of it.",
+        )
 
         def cut(group):
             return {key: value[inside] for key, value in group.items()}
@@ -299,3 +278,142 @@ def as_trials(trials: Sequence[Trial] | Trial) -> tuple[Trial, ...]:
     if not trials:
         raise ValueError("`trials` is empty. Pass at least one Trial.")
     return trials
+
+
+DEGREE = 180.0 / np.pi
+FEWEST = 20  # the minimum number of samples for a conclusion
+
+
+def check_records(trials: Sequence[Trial] | Trial) -> tuple[str, ...]:
+    """Check trials for suspicious records. A fit reports the results in its `notes`.
+
+    The function detects:
+
+    - gaps between samples of inputs,
+    - stale and limited samples,
+    - channels that are difference quotients of other channels,
+    - rates (`x_rate`, `x_dot`) with the wrong sign or in degrees,
+    - constant channels,
+    - inputs that are zero in a few trials,
+    - trials with the samples of another trial.
+
+    **Arguments:**
+
+    - `trials`: one `Trial` or several.
+
+    **Returns:** a tuple with one sentence per suspicion, which names the trials.
+    """
+    trials, by_note = as_trials(trials), {}
+    for trial in trials:
+        for note in (*_gaps(trial), *_stale_or_limited(trial), *_difference_quotients(trial), *_rates(trial)):
+            by_note.setdefault(note, []).append(trial.name)
+    for name in dict.fromkeys(name for trial in trials for name in trial.inputs):
+        zero = [trial.name for trial in trials if name in trial.inputs and not np.any(trial.inputs[name])]
+        # If many trials have a zero input, this is intended. In a few trials, it is a fault of the record.
+        if 0 < len(zero) <= len(trials) / 4:
+            by_note[f"the input {name} is always zero, but not in other trials. Check the record."] = zero
+    notes = [f"{', '.join(n[:3])}{f' and {len(n) - 3} more' if len(n) > 3 else ''}: {x}" for x, n in by_note.items()]
+    first: dict[bytes, str] = {}
+    for trial in trials:
+        key = b"".join([trial.t.tobytes(), *(c.encode() + y.tobytes() for c, y in sorted(trial.measured.items()))])
+        if key in first:
+            notes.append(f"{trial.name} has the same samples as {first[key]}, so these are counted twice. Omit one.")
+        first.setdefault(key, trial.name)
+    return tuple(notes)
+
+
+def _gaps(trial: Trial) -> Iterator[str]:
+    steps = np.diff(trial.t)
+    varying = [name for name, x in trial.inputs.items() if np.ptp(x) > 0]
+    if varying and len(steps) >= FEWEST and steps.max() > 5 * np.median(steps):
+        yield (
+            "the times have a gap that is several times longer than a sample interval. The inputs "
+            f"({', '.join(varying)}) are treated as linear there. Cut the trial in two with `between`."
+        )
+
+
+def _stale_or_limited(trial: Trial) -> Iterator[str]:
+    for kind, group in (("", trial.measured), ("the input ", trial.inputs)):
+        for name, y in group.items():
+            y = y[np.isfinite(y)]
+            if y.size > 1 and np.ptp(y) == 0 and not kind:
+                yield f"{name} has the constant value {y[0]:g}. Check whether it was recorded."
+            if y.size < FEWEST or np.ptp(y) == 0:
+                continue
+            if _is_stale(y):
+                yield (
+                    f"{kind}{name} repeats its last value many times while it changes: the instrument is slower than "
+                    "the times. Keep the samples at which it changes, and write NaN elsewhere."
+                )
+            elif limit := _limit(y):
+                yield (
+                    f"{kind}{name} has its {limit} value in many successive samples. Check whether the instrument "
+                    "limits its range: values beyond the limit are not recorded."
+                )
+
+
+def _is_stale(y: np.ndarray) -> bool:
+    """Whether samples are repeated and a coarse resolution does not explain it."""
+    moves = np.abs(np.diff(y))
+    changes = moves[moves > 0]
+    if changes.size > 0.75 * moves.size or changes.size < 10 or np.median(changes) <= 5 * changes.min():
+        return False
+    # Stale samples are repeated in many short runs. A system at rest gives one long run.
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (moves == 0).astype(int), [0]])))
+    runs = edges[1::2] - edges[::2]
+    return bool(len(runs) >= 10 and runs.max() < 0.2 * moves.size)
+
+
+def _limit(y: np.ndarray) -> str:
+    """The extreme value ("largest" or "smallest") that a record repeats in several runs; "" for none."""
+    levels = len(np.unique(y))
+    for word, extreme in (("largest", y.max()), ("smallest", y.min())):
+        rests = y == extreme
+        # Switched signals have few levels, so they are excluded. So is a single run, which is a system at rest.
+        inside = rests[1:-1] & rests[:-2] & rests[2:]
+        starts = np.count_nonzero(np.diff(rests.astype(int)) == 1)
+        if inside.sum() > 0.05 * y.size and starts >= 2 and levels > 0.2 * y.size and extreme != 0:
+            return word
+    return ""
+
+
+def _difference_quotients(trial: Trial) -> Iterator[str]:
+    """Detect channels that are difference quotients of other channels."""
+    names = list(trial.measured)
+    for a in names:
+        quotient = np.diff(trial.measured[a]) / np.diff(trial.t)
+        if np.isfinite(quotient).sum() < FEWEST or not np.nanmax(np.abs(quotient)) > 0:
+            continue
+        central = np.gradient(trial.measured[a], trial.t)
+        for b in (name for name in names if name != a):
+            y = trial.measured[b]
+            for difference in (y[1:] - quotient, y[:-1] - quotient, y[1:-1] - central[1:-1]):
+                size = np.abs(difference[np.isfinite(difference)])
+                if size.size >= FEWEST and np.max(size) < 1e-6 * np.nanmax(np.abs(quotient)):
+                    yield (
+                        f"{b} is the difference quotient of {a}: it was computed, not measured, and contains no new "
+                        "information. Omit it."
+                    )
+                    break
+
+
+def _rates(trial: Trial) -> Iterator[str]:
+    """Compare a measured rate with the change of its measured coordinate: sign and unit (degrees)."""
+    for coordinate in trial.measured:
+        rates = [c for c in (f"{coordinate}_rate", f"{coordinate}_dot") if c in trial.measured]
+        if not rates:
+            continue
+        change, rate = np.gradient(trial.measured[coordinate], trial.t), trial.measured[rates[0]]
+        finite = np.isfinite(change) & np.isfinite(rate)
+        change, rate = change[finite], rate[finite]
+        if change.size < 5 or np.ptp(change) == 0 or np.ptp(rate) == 0:
+            continue
+        correlation = float(np.corrcoef(change, rate)[0, 1])
+        if correlation < -0.5:
+            yield f"{rates[0]} and the change of {coordinate} have opposite signs: one of them has the wrong sign."
+        ratio = float(np.std(rate) / np.std(change))
+        if abs(correlation) > 0.8 and change.size >= FEWEST:
+            for factor, which in ((DEGREE, rates[0]), (1 / DEGREE, coordinate)):
+                if 0.7 < ratio / factor < 1.4:
+                    other = coordinate if which == rates[0] else rates[0]
+                    yield f"{which} seems to be in degrees: it is about 57 times larger than expected from {other}."

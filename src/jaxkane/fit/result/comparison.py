@@ -13,8 +13,7 @@ import numpy as np
 from ..._common.lookup import hint, refuse_unknown
 from ..._kane.api import generalized_active_forces
 from ..._scalarjit.compat import on_device
-from ..problem.bijections import Interval
-from ..problem.parameters import Parameters
+from ..problem.parameters import Interval, Parameters
 from ..problem.specification import refuse_other
 from ..problem.trial import Trial
 from .fit_result import Fit

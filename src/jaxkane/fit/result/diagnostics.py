@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array
 
-from ..problem.bijections import PossibleBody
+from ..problem.bodies import PossibleBody
 from ..problem.model import Unknowns
 from ..problem.parameters import Parameters
 from ..problem.problem import Problem
-from ..problem.records import DEGREE
 from ..problem.specification import delayed_inputs
+from ..problem.trial import DEGREE
 from ..problem.windows import first_after, state_names
 from .statistics import FEWEST_TRIALS, LARGEST_LEVERAGE, ByTrial, ResidualTest, trial_names
 

@@ -19,8 +19,8 @@ from ..problem.errors import whitened
 from ..problem.model import Unknowns
 from ..problem.parameters import Parameters, places_of
 from ..problem.problem import Problem
-from ..problem.records import check_records
 from ..problem.specification import refuse_other
+from ..problem.trial import check_records
 from ..solve.linearization import Linearization
 from ..solve.mixed_effects import degrees_of_freedom
 from ..solve.step_refinement import STEP_TOLERANCE, residual_deviation, step_errors

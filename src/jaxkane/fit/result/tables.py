@@ -19,7 +19,7 @@ import numpy as np
 
 from ..._common.lookup import refuse_unknown
 from ..._system.system import System
-from ..problem.from_declarations import leaf_names
+from ..problem.declarations import leaf_names
 
 if TYPE_CHECKING:
     import pandas as pd

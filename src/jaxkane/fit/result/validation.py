@@ -14,8 +14,8 @@ import numpy as np
 from ..._common.lookup import positive_number
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
-from ..problem.declarations import Free
-from ..problem.from_declarations import leaf_names, parameters_of
+from ..problem.declarations import Free, leaf_names
+from ..problem.from_declarations import parameters_of
 from ..problem.model import Unknowns
 from ..problem.problem import Problem
 from ..problem.specification import ProblemSpec, refuse_other, with_options

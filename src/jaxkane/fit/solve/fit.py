@@ -281,9 +281,10 @@ def _resting(result: Fit, place: int, method: Any, run: dict[str, Any]) -> Fit:
     variables do not influence the cost.
     """
     parameters, point = result.parameters, result.point
-    if place not in np.asarray(parameters.places) or not parameters.is_near_bound(place, point.parameters):
+    resting = parameters.resting(place, point.parameters)
+    if resting is None:
         return result
-    fixed, x = parameters.resting(place, point.parameters)
+    fixed, x = resting
     problem = dataclasses.replace(result.problem, model=dataclasses.replace(result.problem.model, parameters=fixed))
     start = dataclasses.replace(point, parameters=on_device(x), meaning=problem.start.meaning)
     try:
