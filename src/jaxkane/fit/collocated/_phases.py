@@ -17,10 +17,9 @@ from jaxtyping import Array
 from ..._collocate.functions import Bound, Variables, bounds_of
 from ..._collocate.lobatto import Lobatto
 from ..._collocate.program import Block, EvaluatedBlock
-from ..._collocate.transcription import Builder, Layout, Motion, nodes_of
+from ..._collocate.transcription import Builder, Layout, Motion, PhaseProblem, nodes_of
 from ..._common.lookup import positive_number, refuse_unknown
 from ..._integrate.inputs import Samples, inputs_at
-from ..._kane.constraint_residuals import n_configuration_constraints
 from ..._kane.right_hand_side import vector_field
 from ..._scalarjit.cache_key import jit
 from ..._system.system import System, unpacked
@@ -122,7 +121,7 @@ class Deviations(eqx.Module):
 
 
 @dataclasses.dataclass(frozen=True)
-class TrialPhase:
+class TrialPhase(PhaseProblem):
     """One trial as a phase (see `PhaseProblem`), from the first sample of its window on.
 
     - `problem`: the problem of the fit. `k`: the index of the window. A trial without measurements has no window.
@@ -134,7 +133,9 @@ class TrialPhase:
     unknown_inputs: Mapping[str, float]
     within: Mapping[str, Bound]
 
-    cost = final_cost = conditions = path = None
+    # Unknown inputs are constant in each interval, so that their integrals over intervals are independent. With
+    # continuous inputs, those of neighbouring intervals were correlated, and an inertia was 8 % too small.
+    is_piecewise = True
 
     @functools.cached_property
     def trial(self) -> Trial:
@@ -156,17 +157,9 @@ class TrialPhase:
         return self.trial.name
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return state_names(self.system)
-
-    @property
     def durations(self) -> Bound:
         duration = float(self.trial.t[-1] - self.trial.t[0])
         return duration, duration
-
-    @property
-    def has_free_duration(self) -> bool:
-        return False
 
     @property
     def bounds_of_controls(self) -> dict[str, Bound]:
@@ -196,21 +189,8 @@ class TrialPhase:
         return TrialParameters(model.parameters, model.nuisance, self.window.applies)
 
     @property
-    def is_piecewise(self) -> bool:
-        """Unknown inputs are constant in each interval, so that their integrals over intervals are independent.
-
-        With continuous inputs, those of neighbouring intervals were correlated, and an inertia was 8 % too small.
-        """
-        return True
-
-    @property
     def n_local(self) -> int:
         return self.problem.model.nuisance.trial_center.size
-
-    @property
-    def n_constraints(self) -> int:
-        q = jax.ShapeDtypeStruct((len(self.system.coordinates),), jnp.float64)
-        return n_configuration_constraints(self.system, jnp.zeros(()), q)
 
     def variables(self) -> TrialVariables:
         return TrialVariables(
