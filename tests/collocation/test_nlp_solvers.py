@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from mechanisms import Sled
 
-from jaxkane.collocation import Cyipopt, Ipopt, Problem, TrustConstr, solve
+from jaxkane.collocation import Ipopt, Problem, TrustConstr, solve
 
 
 def needs(package):
     return pytest.mark.skipif(importlib.util.find_spec(package) is None, reason=f"{package} is not installed")
 
 
-IPOPTS = [pytest.param(Ipopt(), marks=needs("casadi")), pytest.param(Cyipopt(), marks=needs("cyipopt"))]
-SOLVERS = [*IPOPTS, TrustConstr()]
+IPOPT = pytest.param(Ipopt(), marks=needs("casadi"))
+SOLVERS = [IPOPT, TrustConstr()]
 
 
 @functools.cache
@@ -30,7 +30,7 @@ def fastest():
     )  # fmt: skip
 
 
-@pytest.mark.slow_cases(all_but=["Cyipopt"])
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
 def test_all_solvers_converge_to_the_same_plan(solver):
     """2.05 s without the error of four intervals. A place that is farther by 1 m costs 1.25 s at the speed limit."""
@@ -74,7 +74,7 @@ def test_interrupt_returns_the_best_iterate(solver):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.parametrize("solver", IPOPTS, ids=lambda solver: type(solver).__name__)
+@pytest.mark.parametrize("solver", [IPOPT], ids=lambda solver: type(solver).__name__)
 def test_a_second_interrupt_ends_the_program(solver):
     with pytest.raises(KeyboardInterrupt):
         solve(fastest(), intervals=4, solver=Interrupted(solver, 6, times=2))
@@ -136,7 +136,7 @@ def test_an_error_in_a_function_is_not_hidden():
         solve(fastest(), intervals=4, solver=Failing())
 
 
-@pytest.mark.parametrize("solver", IPOPTS, ids=lambda solver: type(solver).__name__)
+@pytest.mark.parametrize("solver", [IPOPT], ids=lambda solver: type(solver).__name__)
 def test_largest_number_of_iterations(solver):
     plan = solve(fastest(), intervals=4, solver=solver, max_iterations=3)
     assert not plan.ok

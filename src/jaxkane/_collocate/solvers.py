@@ -1,7 +1,6 @@
-"""Solvers of nonlinear programs: IPOPT through CasADi or cyipopt, and SciPy's trust-region method.
+"""Solvers of nonlinear programs: IPOPT from the wheel of CasADi, and SciPy's trust-region method.
 
-`Ipopt` and `Cyipopt` run the same program. CasADi has wheels for all platforms; cyipopt is for those who have it, for
-instance with the linear solvers of HSL. `TrustConstr` needs no other package, but takes many more iterations.
+CasADi has wheels for all platforms. `TrustConstr` needs no other package, but takes many more iterations.
 """
 
 from __future__ import annotations
@@ -78,18 +77,6 @@ class Monitor:
             self.iterations += 1
         return self.is_interrupted or self.error is not None
 
-    def guarded(self, f: Callable[..., Any]) -> Callable[..., Any]:
-        """The same function, whose exceptions are kept for the end: IPOPT would hide them."""
-
-        def call(*args: Any) -> Any:
-            try:
-                return f(*args)
-            except BaseException as error:
-                self.error = self.error or error
-                raise
-
-        return call
-
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:
         """Ctrl-C stops the solver after its current iteration. A second Ctrl-C raises `KeyboardInterrupt`."""
@@ -161,11 +148,6 @@ _IPOPT_STATUS = {
     "Not_Enough_Degrees_Of_Freedom": (False, "there are more equations than variables"),
     "User_Requested_Stop": (False, INTERRUPTED),
 }
-_IPOPT_CODES = {0: "Solve_Succeeded", 1: "Solved_To_Acceptable_Level", 2: "Infeasible_Problem_Detected"}
-_IPOPT_CODES |= {3: "Search_Direction_Becomes_Too_Small", 4: "Diverging_Iterates", 5: "User_Requested_Stop"}
-_IPOPT_CODES |= {6: "Feasible_Point_Found", -1: "Maximum_Iterations_Exceeded", -2: "Restoration_Failed"}
-_IPOPT_CODES |= {-3: "Error_In_Step_Computation", -4: "Maximum_CpuTime_Exceeded", -5: "Maximum_WallTime_Exceeded"}
-_IPOPT_CODES |= {-10: "Not_Enough_Degrees_Of_Freedom", -13: "Invalid_Number_Detected"}
 
 
 def _ipopt_options(max_iterations: int, is_warm: bool, options: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -200,37 +182,36 @@ class Ipopt:
         import casadi as ca
 
         n, m = program.n, program.m
-        dense, none = ca.Sparsity.dense, ca.Sparsity.dense(0, 1)
-        x_type, g_type, number = dense(n, 1), dense(m, 1), dense(1, 1)
-        given = [x_type, none]
-        jacobian = _casadi_sparsity(ca, m, n, *program.jacobian_structure)
+        x_type, g_type, number, none = (ca.Sparsity.dense(k, 1) for k in (n, m, 1, 0))
         rows, columns = program.hessian_structure
-        hessian = _casadi_sparsity(ca, n, n, columns, rows)  # CasADi has the upper triangle
-        order = np.lexsort((columns, rows))
+        order = np.lexsort((columns, rows))  # CasADi has the upper triangle
+
+        def sparsity(k: int, rows: np.ndarray, columns: np.ndarray) -> Any:
+            return ca.Sparsity.triplet(k, n, rows.tolist(), columns.tolist())
 
         def second(x: Any, p: Any, factor: Any, multipliers: Any) -> list[Any]:
             # CasADi passes None for zeros.
             factor = 0.0 if factor is None else float(factor[0])
-            values = program.hessian(x.copy(), np.zeros(m) if multipliers is None else multipliers.copy(), factor)
-            return [values[order]]
+            return [program.hessian(x, np.zeros(m) if multipliers is None else multipliers, factor)[order]]
 
+        f, df, g, dg = program.objective, program.gradient, program.constraints, program.jacobian
+        given, jacobian, hessian = [x_type, none], sparsity(m, *program.jacobian_structure), sparsity(n, columns, rows)
+        of_iterate = [{"x": x_type, "lam_x": x_type, "g": g_type, "lam_g": g_type, "f": number}.get(name, none)
+                      for name in map(ca.nlpsol_out, range(ca.nlpsol_n_out()))]  # fmt: skip
         functions = [
             _callback(ca, monitor, "functions", given, [number, g_type], lambda x, p: [f(x), g(x)]),
             _callback(ca, monitor, "cost_gradient", given, [number, x_type], lambda x, p: [f(x), df(x)]),
             _callback(ca, monitor, "constraint_jacobian", given, [g_type, jacobian], lambda x, p: [g(x), dg(x)]),
             _callback(ca, monitor, "lagrangian_hessian", [*given, number, g_type], [hessian], second),
+            _callback(ca, monitor, "iteration", of_iterate, [number], lambda x, *_: [monitor(x)]),
         ]
-        f, df, g, dg = (
-            _of_copies(h) for h in (program.objective, program.gradient, program.constraints, program.jacobian)
-        )
-        iteration = _iteration_callback(ca, monitor, n, m)
         x = ca.MX.sym("x", n)
         cost, constraints = functions[0](x, ca.MX(0, 1))
         settings = {
             "grad_f": functions[1],
             "jac_g": functions[2],
             "hess_lag": functions[3],
-            "iteration_callback": iteration,
+            "iteration_callback": functions[4],
             "print_time": False,
             "no_nlp_grad": True,  # CasADi would differentiate the callback
             "show_eval_warnings": False,
@@ -253,19 +234,8 @@ class Ipopt:
         return Solution(found, lam_g, lam_x, ok, status, int(stats["iter_count"]))
 
 
-def _of_copies(f: Callable[[np.ndarray], Any]) -> Callable[[np.ndarray], Any]:
-    """A function of numbers in a buffer that IPOPT overwrites."""
-    return lambda x: f(x.copy())
-
-
-def _casadi_sparsity(ca: Any, n_rows: int, n_columns: int, rows: np.ndarray, columns: np.ndarray) -> Any:
-    """The sparsity of entries that are ordered by columns, or will be."""
-    return ca.Sparsity.triplet(n_rows, n_columns, rows.tolist(), columns.tolist())
-
-
 def _callback(ca: Any, monitor: Monitor, name: str, inputs: Any, outputs: Any, f: Callable[..., Any]) -> Any:
-    """A function of NumPy arrays as a function of CasADi."""
-    guarded = monitor.guarded(f)
+    """A function of NumPy arrays as a function of CasADi. The monitor keeps its exceptions, which IPOPT would hide."""
 
     class Function(ca.Callback):
         def __init__(self) -> None:
@@ -288,107 +258,18 @@ def _callback(ca: Any, monitor: Monitor, name: str, inputs: Any, outputs: Any, f
             return True
 
         def eval_buffer(self, given: Any, results: Any) -> int:
-            arrays = [None if x is None else np.frombuffer(x, np.float64) for x in given]
             try:
-                values = guarded(*arrays)
-            except BaseException:
-                return 1  # the exception is kept by the monitor
+                # copies, because IPOPT overwrites the buffers
+                values = f(*(None if x is None else np.frombuffer(x, np.float64).copy() for x in given))
+            except BaseException as error:
+                monitor.error = monitor.error or error
+                return 1
             for buffer, value in zip(results, values, strict=True):
                 if buffer is not None:
                     np.frombuffer(buffer, np.float64)[:] = value
             return 0
 
     return Function()
-
-
-def _iteration_callback(ca: Any, monitor: Monitor, n: int, m: int) -> Any:
-    sizes = {"f": 1, "x": n, "lam_x": n, "g": m, "lam_g": m}
-
-    class Iteration(ca.Callback):
-        def __init__(self) -> None:
-            ca.Callback.__init__(self)
-            self.construct("iteration", {})
-
-        def get_n_in(self) -> int:
-            return ca.nlpsol_n_out()
-
-        def get_n_out(self) -> int:
-            return 1
-
-        def get_sparsity_in(self, i: int) -> Any:
-            return ca.Sparsity.dense(sizes.get(ca.nlpsol_out(i), 0), 1)
-
-        def eval(self, given: Any) -> list[int]:
-            try:
-                return [int(monitor(np.array(given[0], float).ravel()))]
-            except BaseException as error:
-                monitor.error = monitor.error or error
-                return [1]
-
-    return Iteration()
-
-
-@dataclasses.dataclass(frozen=True)
-class Cyipopt:
-    """IPOPT through the package cyipopt, with the linear solvers that it was built with."""
-
-    def __call__(
-        self,
-        program: NonlinearProgram,
-        z: np.ndarray,
-        monitor: Monitor,
-        *,
-        is_warm: bool = False,
-        max_iterations: int = 500,
-        options: Mapping[str, Any] | None = None,
-    ) -> Solution:
-        import cyipopt  # pyright: ignore[reportMissingImports]
-
-        latest = [z]
-
-        class Functions:
-            objective = staticmethod(monitor.guarded(_remembering(program.objective, latest)))
-            gradient = staticmethod(monitor.guarded(_of_copies(program.gradient)))
-            constraints = staticmethod(monitor.guarded(_of_copies(program.constraints)))
-            jacobian = staticmethod(monitor.guarded(_of_copies(program.jacobian)))
-
-            def jacobianstructure(self) -> Any:
-                return program.jacobian_structure
-
-            def hessianstructure(self) -> Any:
-                return program.hessian_structure
-
-            def hessian(self, x: np.ndarray, multipliers: np.ndarray, factor: float) -> np.ndarray:
-                return monitor.guarded(program.hessian)(x.copy(), multipliers.copy(), factor)
-
-            def intermediate(self, *_: Any) -> bool:
-                current = problem.get_current_iterate() if hasattr(problem, "get_current_iterate") else None
-                return not monitor(np.array(latest[0] if current is None else current["x"]))
-
-        problem = cyipopt.Problem(
-            n=program.n, m=program.m, problem_obj=Functions(), lb=program.lower, ub=program.upper,
-            cl=program.g_lower, cu=program.g_upper,
-        )  # fmt: skip
-        for name, value in _ipopt_options(max_iterations, is_warm, options).items():
-            problem.add_option(name, value)
-        with monitor.interruptible():
-            found, info = problem.solve(z)
-        if monitor.error is not None:
-            raise monitor.error
-        bound_multipliers = np.asarray(info["mult_x_U"]) - np.asarray(info["mult_x_L"])
-        if monitor.is_interrupted:
-            return monitor.interrupted(found, info["mult_g"], bound_multipliers)
-        name = _IPOPT_CODES.get(info["status"], str(info["status_msg"]))
-        ok, status = _IPOPT_STATUS.get(name, (False, name))
-        return Solution(found, np.asarray(info["mult_g"]), bound_multipliers, ok, status, monitor.iterations - 1)
-
-
-def _remembering(f: Callable[[np.ndarray], float], latest: list[np.ndarray]) -> Callable[[np.ndarray], float]:
-    def call(x: np.ndarray) -> float:
-        latest[0] = x.copy()
-        return f(latest[0])
-
-    return call
 
 
 @dataclasses.dataclass(frozen=True)
@@ -408,26 +289,21 @@ class TrustConstr:
         max_iterations: int = 500,
         options: Mapping[str, Any] | None = None,
     ) -> Solution:
-        free = np.nonzero(program.lower < program.upper)[0]  # a variable with equal bounds has no interior
+        free = program.lower < program.upper  # a variable with equal bounds has no interior
+        z = np.where(free, np.clip(z, program.lower, program.upper), program.lower)
 
         def whole(part: np.ndarray) -> np.ndarray:
             every = z.copy()
-            every[fixed] = program.lower[fixed]
             every[free] = part
             return every
 
-        fixed = np.setdiff1d(np.arange(program.n), free)
-        rows, columns = program.jacobian_structure
-        h_rows, h_columns = program.hessian_structure
-
         def symmetric(values: np.ndarray) -> Any:
-            lower = scipy.sparse.csc_matrix((values, (h_rows, h_columns)), (program.n, program.n))
-            every = lower + lower.T - scipy.sparse.diags(lower.diagonal())
-            return every.tocsr()[free][:, free]
+            lower = scipy.sparse.csr_matrix((values, program.hessian_structure), (program.n, program.n))
+            return (lower + scipy.sparse.tril(lower, -1).T).tocsr()[free][:, free]
 
         def jacobian(x: np.ndarray) -> Any:
-            every = scipy.sparse.csc_matrix((program.jacobian(whole(x)), (rows, columns)), (program.m, program.n))
-            return every[:, free]
+            values = program.jacobian(whole(x))
+            return scipy.sparse.csc_matrix((values, program.jacobian_structure), (program.m, program.n))[:, free]
 
         none = np.zeros(program.m)
         constraints: Any = scipy.optimize.NonlinearConstraint(
@@ -437,7 +313,7 @@ class TrustConstr:
         with monitor.interruptible():
             result = scipy.optimize.minimize(
                 lambda x: program.objective(whole(x)),
-                np.clip(z, program.lower, program.upper)[free],
+                z[free],
                 jac=lambda x: program.gradient(whole(x))[free],
                 hess=lambda x: symmetric(program.hessian(whole(x), none)),
                 method="trust-constr",
@@ -463,11 +339,9 @@ NOT_MET = "the constraints are not met at the last iterate"
 
 
 def default_solver() -> Solver:
-    """IPOPT through CasADi or cyipopt if one of them is installed, else SciPy's method, with a warning once."""
+    """IPOPT if CasADi is installed, else SciPy's method, with a warning once."""
     if importlib.util.find_spec("casadi") is not None:
         return Ipopt()
-    if importlib.util.find_spec("cyipopt") is not None:
-        return Cyipopt()
     warnings.warn(
         "IPOPT is not installed, so SciPy's trust-constr is used, which takes many more iterations. Run "
         "`pip install jaxkane[collocation]`, or pass solver=jaxkane.collocation.TrustConstr().",

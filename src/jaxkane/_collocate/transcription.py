@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ import numpy as np
 import scipy.sparse
 
 from .._integrate.inputs import is_samples
+from .._kane.constraint_residuals import n_configuration_constraints
 from .._system.system import System, names_of, units_of
 from .functions import (
     Bound,
@@ -30,7 +31,6 @@ from .functions import (
     Path,
     Variables,
     bounds_of,
-    called,
     constraints_of,
     named,
 )
@@ -38,49 +38,63 @@ from .lobatto import Lobatto
 from .program import Block, Bounds, EvaluatedBlock, NonlinearProgram
 
 
-class PhaseProblem(Protocol):
-    """What a phase of a motion is: see `jaxkane.collocation.Problem` for the meaning of each attribute.
+class PhaseProblem:
+    """A phase of a motion: see `jaxkane.collocation.Problem` for the meaning of each attribute.
 
     `parameters` has the method `apply` and the attribute `size`; its last `n_local` numbers belong to this phase alone,
     the others are shared by all phases. `ends` and `limits` are bounds by name. If `is_piecewise`, a control has one
     value in each interval; else it is continuous, with a value at each node.
     """
 
+    system: System
+    durations: Bound
+    bounds_of_controls: dict[str, Bound]
+    limits: dict[str, Bound]
+    ends: Mapping[str, Mapping[str, Condition]]
+    signals: Any
+    parameters: Any
+    cost: Any = None
+    final_cost: Any = None
+    conditions: Any = None
+    path: Any = None
+    n_local = 0
+    is_piecewise = False
+
     @property
-    def cost(self) -> Any: ...
+    def title(self) -> str:
+        """The name of the system, for messages."""
+        return type(self.system).__name__
+
     @property
-    def final_cost(self) -> Any: ...
+    def names(self) -> tuple[str, ...]:
+        """Names of coordinates, independent speeds and first-order states, in the order of the variables of a node."""
+        coordinates, speeds, _, states = names_of(self.system)
+        return (*coordinates, *speeds, *states)
+
     @property
-    def conditions(self) -> Any: ...
+    def has_free_duration(self) -> bool:
+        return self.durations[0] < self.durations[1]
+
     @property
-    def path(self) -> Any: ...
-    @property
-    def system(self) -> System: ...
-    @property
-    def title(self) -> str: ...
-    @property
-    def names(self) -> tuple[str, ...]: ...
-    @property
-    def durations(self) -> Bound: ...
-    @property
-    def has_free_duration(self) -> bool: ...
-    @property
-    def bounds_of_controls(self) -> dict[str, Bound]: ...
-    @property
-    def limits(self) -> dict[str, Bound]: ...
-    @property
-    def ends(self) -> Mapping[str, Mapping[str, Condition]]: ...
-    @property
-    def signals(self) -> Any: ...
-    @property
-    def parameters(self) -> Any: ...
-    @property
-    def n_local(self) -> int: ...
-    @property
-    def is_piecewise(self) -> bool: ...
-    @property
-    def n_constraints(self) -> int: ...
-    def variables(self) -> Variables: ...
+    def n_constraints(self) -> int:
+        """The number of residuals of the configuration constraints."""
+        q = jax.ShapeDtypeStruct((len(self.system.coordinates),), jnp.float64)
+        return n_configuration_constraints(self.system, jnp.zeros(()), q)
+
+    def variables(self) -> Variables:
+        """How the variables of a node are read."""
+        signals = self.signals
+        if not self.has_free_duration and not callable(signals):
+            signals = {name: x for name, x in signals.items() if not is_samples(x)}  # they are data of the nodes
+        return Variables(
+            system=self.system,
+            signals=signals,
+            parameters=self.parameters,
+            duration=None if self.has_free_duration else jnp.asarray(self.durations[0], float),
+            origin=jnp.zeros(()),
+            controls=tuple(self.bounds_of_controls),
+            n_y=len(self.names),
+        )
 
 
 class Motion(NamedTuple):
@@ -134,19 +148,16 @@ class Layout:
     def shared(self) -> np.ndarray:
         return np.concatenate([[] if self.duration is None else [self.duration], self.parameters]).astype(int)
 
-    def node(self, k: Any) -> np.ndarray:
+    def node(self, k: Any, interval: np.ndarray | None = None) -> np.ndarray:
         """The indices (..., n_z) of the states and controls at nodes k (...,).
 
-        A control that is constant in each interval has the value of the interval that begins at the node.
+        A control that is constant in each interval has the value of `interval` (...,), by default of the interval that
+        begins at the node.
         """
-        k = np.asarray(k)
+        k, n_y, n_w = np.asarray(k), self.variables.n_y, len(self.variables.controls)
         if not self.problem.is_piecewise:
-            return self.first + k[..., None] * self.variables.n_z + np.arange(self.variables.n_z)
-        return self.in_interval(np.minimum(k // self.every, len(self.mesh) - 2), k)
-
-    def in_interval(self, i: np.ndarray, k: np.ndarray) -> np.ndarray:
-        """The same for nodes k (...,) of intervals i (...,), with constant controls."""
-        n_y, n_w = self.variables.n_y, len(self.variables.controls)
+            return self.first + k[..., None] * (n_y + n_w) + np.arange(n_y + n_w)
+        i = np.minimum(k // self.every, len(self.mesh) - 2) if interval is None else interval
         states = self.first + k[..., None] * n_y + np.arange(n_y)
         controls = self.first + self.K * n_y + i[..., None] * n_w + np.arange(n_w)
         return np.concatenate([states, controls], axis=-1)
@@ -170,7 +181,7 @@ class Layout:
             return np.arange(self.K), self.columns, nodes
         i = np.broadcast_to(np.arange(N)[:, None], nodes.shape).ravel()
         shared = np.tile(self.shared, (nodes.size, 1))
-        columns = np.concatenate([self.in_interval(i, nodes.ravel()), shared], axis=1)
+        columns = np.concatenate([self.node(nodes.ravel(), i), shared], axis=1)
         return nodes.ravel(), columns, np.arange(nodes.size).reshape(nodes.shape)
 
     @property
@@ -192,22 +203,6 @@ class Layout:
         times = float(self.variables.origin) + s * self.problem.durations[0]
         inputs = {name: np.asarray(jax.vmap(signal)(jnp.asarray(times))) for name, signal in sampled.items()}
         return {"s": s, "inputs": inputs}
-
-
-def variables_of(problem: PhaseProblem) -> Variables:
-    """How the nodes of a problem are read."""
-    signals = problem.signals
-    if not problem.has_free_duration and not callable(signals):
-        signals = {name: x for name, x in signals.items() if not is_samples(x)}  # they are data of the nodes
-    return Variables(
-        system=problem.system,
-        signals=signals,
-        parameters=problem.parameters,
-        duration=None if problem.has_free_duration else jnp.asarray(problem.durations[0], float),
-        origin=jnp.zeros(()),
-        controls=tuple(problem.bounds_of_controls),
-        n_y=len(problem.names),
-    )
 
 
 def nodes_of(mesh: np.ndarray, method: Lobatto) -> np.ndarray:
@@ -243,8 +238,7 @@ class Transcription:
         objectives: Callable[[Builder, Sequence[Layout]], None] | None = None,
         sizes: Sequence[np.ndarray | None] | None = None,
     ):
-        self.links, self.method, self._objectives = links, method, objectives
-        self._known_sizes = [None] * len(phases) if sizes is None else sizes
+        self.method = method
         self.layouts = _layouts(phases, meshes, method)
         self.n = 1 + max(int(layout.columns.max()) for layout in self.layouts)
         self.parameters = self.layouts[0].variables.parameters
@@ -254,22 +248,19 @@ class Transcription:
             if layout.duration is not None:
                 self.x[layout.duration] = motion.duration
         self.x[self.shared_parameters] = theta
-        self._build()
-
-    def _build(self) -> None:
         self.x_bounds = self._variable_bounds()
         dynamics = [_dynamics(layout) for layout in self.layouts]
         self._check_finite_dynamics(dynamics)
-        self.x_scale = self._scales(dynamics)
+        self.x_scale = self._scales(dynamics, [None] * len(phases) if sizes is None else sizes)
         builder = Builder(self.n, self.method)
         for p, (layout, block) in enumerate(zip(self.layouts, dynamics, strict=True)):
             builder.defects(p, layout, block, self.x_scale)
         for p, layout in enumerate(self.layouts):
             self._add_functions(builder, p, layout)
-        for i, how in enumerate(self.links):
+        for i, how in enumerate(links):
             self._add_link(builder, i, how, dynamics)
-        if self._objectives is not None:
-            self._objectives(builder, self.layouts)
+        if objectives is not None:
+            objectives(builder, self.layouts)
         self.rows = builder.rows
         self._named_blocks = [*((block, "equations of motion") for block in dynamics), *builder.user_blocks]
         self._check_functions(builder)
@@ -360,10 +351,10 @@ class Transcription:
                 f"{layout.s[k]:.3g} of the duration, where the state is {at}. Pass another guess to solve."
             )
 
-    def _scales(self, blocks: Sequence[EvaluatedBlock]) -> np.ndarray:
+    def _scales(self, blocks: Sequence[EvaluatedBlock], known_sizes: Sequence[np.ndarray | None]) -> np.ndarray:
         """Typical sizes (n,) of the variables: one for each name."""
         scale = np.ones(self.n)
-        for layout, block, known in zip(self.layouts, blocks, self._known_sizes, strict=True):
+        for layout, block, known in zip(self.layouts, blocks, known_sizes, strict=True):
             values = scales_of(layout, block, self.x)
             if known is not None:
                 # A state that should be zero is as large as its error (2e-5 m beside 200 m in the flight of an
@@ -381,10 +372,11 @@ class Transcription:
             block = EvaluatedBlock(Block(Integrand(variables, problem.cost), data, layout.columns, 1))
             builder.cost(block, layout.quadrature(self.method))
         along = {k: v for k, v in problem.limits.items() if k not in (*problem.names, *variables.controls)}
-        path = self._constraints(layout, "path", problem.path) if problem.path is not None else {}
+        path = self._returned("path", Path(variables, (), problem.path), data, layout.columns)
         if along or path:
-            block = Block(Path(variables, tuple(along), problem.path), data, layout.columns, len(along) + len(path))
-            builder.constraints("path", p, EvaluatedBlock(block), [*along.items(), *path.items()])
+            function = Path(variables, tuple(along), problem.path)
+            items = [*along.items(), *constraints_of("path", path, is_equality=False).items()]
+            builder.constraints("path", p, EvaluatedBlock(Block(function, data, layout.columns, len(items))), items)
         self._add_ends(builder, p, layout)
 
     def _add_ends(self, builder: Builder, p: int, layout: Layout) -> None:
@@ -394,10 +386,15 @@ class Transcription:
             label: {k: bounds_of(k, v) for k, v in problem.ends[label].items() if k not in names}
             for label in ("start", "end")
         }
-        conditions = self._constraints(layout, "conditions", problem.conditions)
         fixed = [c for c in problem.system.coordinates if not isinstance(problem.ends["start"].get(c, ()), tuple)]
         n_h = 0 if len(fixed) == len(problem.system.coordinates) else problem.n_constraints
-        items = [(f"{name}", bounds) for name, bounds in conditions.items()]
+        places = np.array([0, layout.K - 1])
+        columns = np.concatenate([*layout.node(places), layout.shared])[None]
+        data = layout.node_data(layout.s[places])
+        data = tuple(jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], data) for i in (0, 1))
+        conditions = Ends(variables, None, problem.conditions, (), (), False)
+        conditions = self._returned("conditions", conditions, data, columns)
+        items = [*constraints_of("conditions", conditions, is_equality=True).items()]
         items += [(f"{name} at the {label}", b) for label in ("start", "end") for name, b in by_name[label].items()]
         items += [(f"configuration constraint {i}", (0.0, 0.0)) for i in range(n_h)]
         has_cost = problem.final_cost is not None
@@ -406,10 +403,6 @@ class Transcription:
         ends = Ends(
             variables, problem.final_cost, problem.conditions, tuple(by_name["start"]), tuple(by_name["end"]), n_h > 0
         )
-        places = np.array([0, layout.K - 1])
-        columns = np.concatenate([*layout.node(places), layout.shared])[None]
-        data = layout.node_data(layout.s[places])
-        data = tuple(jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], data) for i in (0, 1))
         block = EvaluatedBlock(Block(ends, data, columns, has_cost + len(items)))
         builder.constraints("conditions", p, block, items, has_cost=has_cost)
 
@@ -426,48 +419,28 @@ class Transcription:
         durations = dict.fromkeys(x.duration for x in (one, other) if x.duration is not None)
         columns = np.concatenate([one.node(one.K - 1), other.node(0), [*durations], one.parameters]).astype(int)[None]
         if callable(how):
-            names = [*self._names_of_link(link, data, columns)]
+            names = [*self._returned("how", link, data, columns)]
+            if not names:
+                raise ValueError("The function `links` returns no residuals. Return by name what must be zero.")
         else:
             names = [f"link {i}: {name}" for name in ([how] if how is not None else []) + [*linked]]
         block = EvaluatedBlock(Block(link, data, columns, len(names)))
         builder.constraints("links", i, block, [(name, (0.0, 0.0)) for name in names])
 
-    def _names_of_link(self, link: Link, data: Any, columns: np.ndarray) -> list[str]:
-        found: list[str] = []
+    def _returned(self, field: str, function: Any, data: Any, columns: np.ndarray) -> Mapping[str, Any]:
+        """The values by name that a function of the user returns, which is a field of the function of a block."""
+        found: dict[str, Any] = {}
+        f = getattr(function, field)
+        if f is None:
+            return found
 
-        def recorded(last: Any, first: Any) -> Any:
-            values = called("links", link.how, last, first)
-            found.extend(named("links", values))
-            if not found:
-                raise ValueError(
-                    "The function `links` returns no residuals. Return a dict by name of what must be zero."
-                )
-            return values
+        def recorded(*args: Any) -> Any:
+            values = f(*args)
+            found.update(named("links" if field == "how" else field, values))
+            return values or {"": 0.0}  # blocks of no values are not evaluated
 
         node = jax.tree.map(lambda a: jnp.asarray(a)[0], data)
-        jax.eval_shape(dataclasses.replace(link, how=recorded), node, jnp.asarray(self.x[columns[0]]))
-        return found
-
-    def _constraints(self, layout: Layout, label: str, f: Any) -> dict[str, Bound]:
-        """The bounds of the constraints that a function of the user returns, by name."""
-        if f is None:
-            return {}
-        found: dict[str, Bound] = {}
-        last = layout.K - 1
-
-        def record(x: Any) -> Any:
-            first = layout.variables.now(
-                jax.tree.map(lambda a: jnp.asarray(a)[0], layout.node_data(layout.s[:1])), x[0]
-            )
-            if label == "path":
-                values = called(label, f, first.t, first)
-            else:
-                end = jax.tree.map(lambda a: jnp.asarray(a)[0], layout.node_data(layout.s[-1:]))
-                duration = layout.variables.shared(x[0][layout.variables.n_z :])[1]
-                values = called(label, f, first, layout.variables.now(end, x[1]), duration)
-            found.update(constraints_of(label, values, is_equality=label != "path"))
-
-        jax.eval_shape(record, self.x[layout.columns[[0, last]]])
+        jax.eval_shape(dataclasses.replace(function, **{field: recorded}), node, jnp.asarray(self.x[columns[0]]))
         return found
 
     def _check_functions(self, builder: Builder) -> None:

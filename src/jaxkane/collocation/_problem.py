@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._collocate.functions import Bound, Condition, Now, Variables, bounds_of
-from .._collocate.transcription import variables_of
+from .._collocate.functions import Bound, Condition, Now, bounds_of
+from .._collocate.transcription import PhaseProblem
 from .._common.lookup import as_names, real_number, refuse_unknown
 from .._integrate.inputs import as_signals, is_samples
 from .._integrate.jumps import names_of_jumps
 from .._kane.arguments import check_is_system, is_concrete, refuse_multipliers
 from .._kane.checks import check_system
-from .._kane.constraint_residuals import check_state, configuration_residual, n_configuration_constraints
+from .._kane.constraint_residuals import check_state, configuration_residual
 from .._kane.contact import has_contacts
 from .._kane.right_hand_side import output_names
 from .._system.parameters import in_batches
@@ -30,7 +30,7 @@ Values = Mapping[str, Condition] | State
 
 
 @dataclasses.dataclass(frozen=True)
-class Problem:
+class Problem(PhaseProblem):
     """Find the controls of a motion of least cost, and optionally its duration and parameters of the system.
 
         problem = jk.collocation.Problem(
@@ -108,11 +108,6 @@ class Problem:
         self.signals  # noqa: B018  raises an exception for wrong inputs
         self.parameters  # noqa: B018  the same for parameters
 
-    @property
-    def title(self) -> str:
-        """The name of the system, for messages."""
-        return type(self.system).__name__
-
     def _check_system(self) -> None:
         if has_contacts(self.system):
             raise ValueError(
@@ -189,12 +184,6 @@ class Problem:
         return not free or int(np.linalg.matrix_rank(J[:, free], tol=1e-9)) < len(J)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of coordinates, independent speeds and first-order states, in the order of the variables of a node."""
-        coordinates, speeds, _, states = names_of(self.system)
-        return (*coordinates, *speeds, *states)
-
-    @property
     def durations(self) -> Bound:
         """The least and the greatest duration [s]."""
         given = self.duration
@@ -205,10 +194,6 @@ class Problem:
             return low, high
         number = real_number(given, "Problem: `duration`")
         return number, number
-
-    @property
-    def has_free_duration(self) -> bool:
-        return self.durations[0] < self.durations[1]
 
     @property
     def bounds_of_controls(self) -> dict[str, Bound]:
@@ -261,26 +246,6 @@ class Problem:
         if label == "end" and self.n_constraints:
             values = {k: v for k, v in values.items() if k not in self.system.dependent_coordinates}
         return values
-
-    def variables(self) -> Variables:
-        """How the variables of a node are read."""
-        return variables_of(self)
-
-    @property
-    def is_piecewise(self) -> bool:
-        """Whether controls are constant in each interval."""
-        return False
-
-    @property
-    def n_local(self) -> int:
-        """The number of parameters that belong to this phase alone."""
-        return 0
-
-    @property
-    def n_constraints(self) -> int:
-        """The number of residuals of the configuration constraints."""
-        q = jax.ShapeDtypeStruct((len(self.system.coordinates),), jnp.float64)
-        return n_configuration_constraints(self.system, jnp.zeros(()), q)
 
     @property
     def signals(self) -> Any:

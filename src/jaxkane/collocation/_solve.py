@@ -62,7 +62,7 @@ def solve(
     - `method`: "trapezoid" (order 2), "hermite-simpson" (order 4) or "lobatto" (order 6).
     - `tolerance`: the largest permitted local error of an interval, relative to the size of each state. None: the first
         mesh is not refined, and a plan with a local error above 1 % is not `ok`.
-    - `solver`: a `Solver`; by default `Ipopt` if CasADi is installed, else `Cyipopt`, else `TrustConstr`.
+    - `solver`: a `Solver`; by default `Ipopt` if CasADi is installed, else `TrustConstr`.
     - `options`: options of the solver, by the names that the solver uses.
     - `starts`: the number of searches. The first one starts from `guess`. For the others, random deviations are added
         to the coordinates.

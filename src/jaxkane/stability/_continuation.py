@@ -1,4 +1,4 @@
-"""Families of steady motions by pseudo-arclength continuation, through their folds."""
+"""Pseudo-arclength continuation of a curve of solutions through its folds; families of steady motions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._common.lookup import by_name, hint
-from .._integrate.trajectory import refuse_other_system
 from .._kane.constraint_residuals import coordinate_units
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Numbers
@@ -72,95 +71,31 @@ class Family(eqx.Module):
         return "\n".join([text, *map(wrapped, items)])
 
 
-def steady_family(
-    system: System,
-    start: SteadyMotion,
-    *,
-    towards: Mapping[str, float],
-    until: Mapping[str, float] | None = None,
-    hold: tuple[str, ...] = (),
-    find: tuple[str, ...] = (),
-    step: float = 0.05,
-    max_step: float | None = None,
-    steps: int = 500,
-) -> Family:
-    """The family of steady motions through one of them, by pseudo-arclength continuation.
-
-        F(z) = 0,   tangent . (z - z_predicted) = 0
-
-    z are the unknowns of `steady_turn`: non-cyclic coordinates, independent speeds and inputs to find. F are its
-    equations. The arclength is measured in scaled unknowns and has no unit. Angles are in rad; speeds and inputs are
-    relative to their values at the start. Lengths and unknowns that are zero at the start are scaled by the change that
-    balances the terms of an equation. The step is halved if Newton's method fails, and increased if it converges
-    quickly. The curve can be followed through folds.
-
-    **Arguments:**
-
-    - `start`: a steady motion from `steady_turn`.
-    - `towards`: {name: +1 or -1}, the initial direction.
-    - `until`: {name: value} of coordinates and speeds, also dependent ones. The family ends exactly at the first of
-        these values that it reaches.
-    - `hold`: as in `steady_turn`, but one quantity less, because the family is a curve.
-    - `find`: as in `steady_turn`.
-    - `step`: the first step of arclength.
-    - `max_step`: the largest step of arclength; four times `step` by default.
-    - `steps`: the largest number of steps.
-
-    **Returns:** a `Family`, whose first member is `start`. Its members are not differentiable; pass one to
-    `steady_turn` for that.
-
-    **Raises:** `ValueError` if no curve, or more than one, passes through the start.
-    """
-    label = f"family({type(system).__name__})"
-    if not isinstance(start, SteadyMotion):
-        raise TypeError(f"{label}: `start` must be a SteadyMotion, e.g. from steady_turn; got {start!r}.")
-    refuse_other_system(label, system, start)
-    q, t = start.q, jnp.asarray(start.t, start.q.dtype)
-    inputs = {**start.inputs, **{name: start.x[i] for i, name in enumerate(system.states)}}
-    find, until = (*find, *system.states), dict(until or {})
-    equations = SteadyEquations(system, find, tuple(hold))
-    SteadyEquations(system, find, tuple(until))  # refuses a name that is neither a coordinate nor a speed
-    targets = [quantity(system, t, q, start.u, k) for k in equations.hold]
-    targets = jnp.stack(targets) if targets else jnp.zeros(0, q.dtype)
-    args = system, t, q, start.u, inputs, targets
-    z0 = equations.unknowns(q, start.u, inputs)
-    scale = np.asarray(_scale(equations, z0, args))
-    limits, names = np.array(list(until.values()), float), tuple(until)
-
-    def evaluate(y):
-        found = _residual_and_slope(
-            equations, jnp.asarray(y * scale, q.dtype), args, jnp.asarray(scale, q.dtype), names
-        )
-        F, J, g, G = map(np.asarray, found)
-        G = G * scale
-        size = np.maximum(np.abs(limits), np.linalg.norm(G, axis=1))
-        size = np.where(size > 0, size, 1.0)
-        return F, J * scale, (g - limits) / size, G / size[:, None]
-
-    curve = SolutionCurve(evaluate, float(jnp.finfo(q.dtype).eps))
-    y = np.asarray(z0) / scale
-    tangent = curve.tangent(y, None)
-    tangent = tangent * _direction_sign(equations, system, tuple(hold), towards, tangent, curve, y)
-    max_step = 4 * step if max_step is None else max_step
-    points, arc, met = curve.follow(y, tangent, step, max_step, steps)
-    reason = f"{steps} steps"
-    if met is not None:
-        name, value = list(until.items())[met]
-        reason = f"{name} = {value:g}"
-    elif len(points) <= steps:
-        reason = "no further motion was found: equations or coordinates become singular"
-    return _as_family(equations, args, np.array(points) * scale, jnp.asarray(scale, q.dtype), arc, reason)
-
-
 class SolutionCurve:
     """Newton's method on a curve F(y) = 0 with fewer equations than unknowns, and the tangents of the curve.
 
-    - `evaluate`: (y) -> F, dF/dy, limits g, dg/dy, all relative to their sizes.
-    - `eps`: their rounding error.
+    - `scale` (n,): the unit of each unknown: z = y * scale. `first` (n,): the unknowns y at the start.
+    - `until`: values by name of quantities, at the first of which the curve ends.
+    - `eps`: the rounding error.
     """
 
-    def __init__(self, evaluate: Any, eps: float):
-        self.evaluate, self.eps = evaluate, eps
+    stuck = ""
+
+    def __init__(self, z: Array, scale: np.ndarray, until: Mapping[str, float], eps: float):
+        self.scale, self.until, self.eps = scale, dict(until), eps
+        self.first = np.asarray(z) / scale
+
+    def equations(self, y) -> tuple[Any, Any, Any, Any]:
+        """F, dF/dy, and the quantities g of `until` with dg/dy."""
+        raise NotImplementedError
+
+    def evaluate(self, y):
+        """F, dF/dy, limits g, dg/dy, all relative to their sizes."""
+        F, J, g, G = self.equations(y)
+        limits = np.array(list(self.until.values()), float)
+        size = np.maximum(np.abs(limits), np.linalg.norm(G, axis=1))
+        size = np.where(size > 0, size, 1.0)
+        return F, J, (g - limits) / size, G / size[:, None]
 
     def tangent(self, y, before: Any) -> Any:
         J = self.evaluate(y)[1]
@@ -175,10 +110,16 @@ class SolutionCurve:
         ahead = null.T @ (null @ before)
         return ahead / np.linalg.norm(ahead)
 
-    def follow(self, y, tangent, step: float, max_step: float, steps: int):
-        """Follow the curve from y. **Returns:** points, their arclengths, and the index of the limit that ended it, or
-        None."""
-        points, arc, h = [y], [0.0], step
+    def follow(
+        self, place: int, sign: float, step: float, max_step: float | None, steps: int
+    ) -> tuple[Any, list[float], str]:
+        """Follow the curve from its start, along which the unknown at `place` first rises or falls by `sign`.
+
+        **Returns:** unknowns z (m, n), arclengths (m,), and why the curve ends.
+        """
+        y, arc, h, reason = self.first, [0.0], step, ""
+        points, tangent, max_step = [y], self.tangent(y, None), 4 * step if max_step is None else max_step
+        tangent = tangent * float(np.sign(sign * tangent[place]) or 1.0)
         while len(points) <= steps and h >= 1e-4 * step:
             attempt = self.correct(y + h * tangent, tangent)
             new = None if attempt is None else self.tangent(attempt[0], tangent)
@@ -198,10 +139,12 @@ class SolutionCurve:
             points.append(z)
             arc.append(arc[-1] + float(np.linalg.norm(z - y)))
             if met is not None:
-                return points, arc, met
+                reason = "{} = {:g}".format(*list(self.until.items())[met])
+                break
             y, tangent = z, self.tangent_ahead(z, new)
             h = min(max_step, 1.5 * h) if quick else h
-        return points, arc, None
+        reason = reason or (f"{steps} steps" if len(points) > steps else self.stuck)
+        return np.array(points) * self.scale, arc, reason
 
     def accepts(self, y, tangent, z, new, met: int | None) -> bool:
         """Whether the step from y to z is kept. Otherwise it is repeated with half of its length.
@@ -220,9 +163,9 @@ class SolutionCurve:
         before, after = self.evaluate(y)[2], self.evaluate(z)[2]
         return [int(i) for i in np.nonzero((before < 0) != (after < 0))[0] if abs(before[i]) > 4e6 * self.eps]
 
-    def correct(self, y, tangent, tries: int = 12):
+    def correct(self, y, tangent):
         start = y
-        for k in range(tries):
+        for k in range(12):
             F, J, _, _ = self.evaluate(y)
             if not (np.all(np.isfinite(F)) and np.all(np.isfinite(J))):
                 return None
@@ -257,6 +200,66 @@ class SolutionCurve:
         return y
 
 
+class SteadyCurve(SolutionCurve):
+    """A curve of steady motions through one of them. The unknowns z and F are those of `steady_turn`."""
+
+    stuck = "no further motion was found: equations or coordinates become singular"
+
+    def __init__(self, system: System, start: SteadyMotion, hold: tuple[str, ...], find: tuple[str, ...], until: Any):
+        q, t, find = start.q, jnp.asarray(start.t, start.q.dtype), (*find, *system.states)
+        inputs = {**start.inputs, **{name: start.x[i] for i, name in enumerate(system.states)}}
+        self.steady, self.hold = SteadyEquations(system, find, tuple(hold)), hold
+        SteadyEquations(system, find, tuple(until))  # refuses a name that is neither a coordinate nor a speed
+        targets = [quantity(system, t, q, start.u, k) for k in self.steady.hold]
+        targets = jnp.stack(targets) if targets else jnp.zeros(0, q.dtype)
+        self.args = system, t, q, start.u, inputs, targets
+        z = self.steady.unknowns(q, start.u, inputs)
+        super().__init__(z, np.asarray(_scale(self.steady, z, self.args)), until, float(jnp.finfo(q.dtype).eps))
+
+    def equations(self, y):
+        scale = jnp.asarray(self.scale)
+        found = _residual_and_slope(self.steady, jnp.asarray(y) * scale, self.args, scale, tuple(self.until))
+        F, J, g, G = map(np.asarray, found)
+        return F, J * self.scale, g, G * self.scale
+
+    def place(self, towards: Mapping[str, float]) -> int:
+        """The index of the unknown that `towards` names. **Raises:** `ValueError` if there is no curve, or several."""
+        label, names = f"family({type(self.args[0]).__name__})", self.steady.names
+        if len(towards) != 1 or next(iter(towards)) not in (*names, *self.hold):
+            one_of = hint(next(iter(towards), ""), names, "it is one of")
+            raise ValueError(f"{label}: `towards` must be one name with +1 or -1, got {dict(towards)}; {one_of}")
+        J, (name,) = self.evaluate(self.first)[1], towards
+        s = np.zeros(J.shape[1])  # with inputs to find there are fewer equations than unknowns
+        s[: len(J)] = np.linalg.svd(J, compute_uv=False)[: len(s)]
+        for is_wrong, reason in (
+            (s[-1] > max(1e-8, 100 * self.eps) * s[0], "no curve of steady motions passes through the start: too many "
+             f"quantities are held ({', '.join(self.hold) or 'none'}). Remove one from `hold`."),
+            (s[-2] < max(1e-10, 10 * self.eps) * s[0], "more than one curve of steady motions passes through the "
+             "start. Add quantities to `hold`, or start at some distance from the bifurcation."),
+            (name in self.hold, f"{name} is in `hold`, so it cannot change along the family. Name another."),
+        ):  # fmt: skip
+            if is_wrong:
+                raise ValueError(f"{label}: {reason}")
+        return names.index(name)
+
+    def family(self, zs: np.ndarray, arc: list[float], reason: str) -> Family:
+        """The members with unknowns z (m, n)."""
+        system, t, q, u, inputs, _ = self.args
+
+        @jax.jit
+        @jax.vmap
+        def members(z):
+            r = jnp.max(jnp.abs(_residual_and_slope(self.steady, z, self.args, jnp.asarray(self.scale), ())[0]))
+            motion = as_motion(system, t, *self.steady.parts(z, q, u, inputs), r)
+            trim = {k: motion.inputs[k] for k in self.steady.find if k in motion.inputs}
+            return (motion.q, motion.u, motion.u_dep, motion.x), motion.residual, trim
+
+        (q_all, u_all, u_dep, x), residual, trim = members(jnp.asarray(zs, q.dtype))
+        inputs = {k: x for k, x in {**inputs, **trim}.items() if k not in system.states}
+        names, units = names_of(system), tuple(units_of(system).items())
+        return Family(q_all, u_all, u_dep, x, jnp.asarray(arc), residual, inputs, t, names, reason, units)
+
+
 @jit
 def _residual_and_slope(equations: SteadyEquations, z, args, scale, names: tuple[str, ...]):
     """Residuals F (m,) relative to the sizes of their terms, quantities g by name, and the derivatives of both."""
@@ -289,46 +292,3 @@ def _scale(equations: SteadyEquations, z, args):
     is_coordinate = np.arange(len(names)) < len(equations.q_free)
     scale = jnp.where(~is_coordinate & (jnp.abs(z) > 1e-3 * by_effect), jnp.abs(z), by_effect)
     return jnp.where(is_angle | ~(scale > 0), 1.0, scale)
-
-
-def _direction_sign(
-    equations: SteadyEquations, system: System, hold: tuple[str, ...], towards, tangent, curve: SolutionCurve, y
-) -> float:
-    label = type(system).__name__
-    (name, sign), *more = towards.items()
-    if more or name not in (*equations.names, *hold):
-        one_of = hint(name, equations.names, "it is one of")
-        raise ValueError(f"family: `towards` must be one name with +1 or -1, got {dict(towards)}; {one_of}")
-    J = curve.evaluate(y)[1]
-    s = np.zeros(J.shape[1])  # with inputs to find there are fewer equations than unknowns
-    s[: len(J)] = np.linalg.svd(J, compute_uv=False)[: len(s)]
-    if s[-1] > max(1e-8, 100 * curve.eps) * s[0]:
-        raise ValueError(
-            f"{label}: no curve of steady motions passes through the start: too many quantities are held "
-            f"({', '.join(hold) or 'none'}). Remove one from `hold`."
-        )
-    if s[-2] < max(1e-10, 10 * curve.eps) * s[0]:
-        raise ValueError(
-            f"{label}: more than one curve of steady motions passes through the start. Add quantities to "
-            "`hold`, or start at some distance from the bifurcation."
-        )
-    if name in hold:
-        raise ValueError(f"{label}: {name} is in `hold`, so it cannot change along the family. Name another.")
-    return float(np.sign(sign * tangent[equations.names.index(name)]) or 1.0)
-
-
-def _as_family(equations: SteadyEquations, args, zs, scale, arc, reason) -> Family:
-    system, t, q, u, inputs, _ = args
-
-    @jax.jit
-    @jax.vmap
-    def members(z):
-        r = jnp.max(jnp.abs(_residual_and_slope(equations, z, args, scale, ())[0]))
-        motion = as_motion(system, t, *equations.parts(z, q, u, inputs), r)
-        trim = {k: motion.inputs[k] for k in equations.find if k in motion.inputs}
-        return (motion.q, motion.u, motion.u_dep, motion.x), motion.residual, trim
-
-    (q_all, u_all, u_dep, x), residual, trim = members(jnp.asarray(zs, q.dtype))
-    inputs = {k: x for k, x in {**inputs, **trim}.items() if k not in system.states}
-    names, units = names_of(system), tuple(units_of(system).items())
-    return Family(q_all, u_all, u_dep, x, jnp.asarray(arc), residual, inputs, t, names, reason, units)

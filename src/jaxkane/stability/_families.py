@@ -13,11 +13,12 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Bool, Complex, Float
 
-from .._common.lookup import hint, not_there
+from .._common.lookup import not_there, refuse_unknown
+from .._integrate.trajectory import refuse_other_system
 from .._scalarjit.cache_key import jit
 from .._system.parameters import parameters_in, with_parameters
 from .._system.system import System, packed
-from ._continuation import Family, SolutionCurve, steady_family
+from ._continuation import Family, SolutionCurve, SteadyCurve
 from ._orbit_equations import OrbitArguments, OrbitEquations, packed_rates, repeats
 from ._periodic import Orbit, as_orbit, normal_at, orbit_equations, scales_at
 from ._steady import SteadyMotion
@@ -146,62 +147,50 @@ def family(
 
     **Raises:** `ValueError` if no curve, or more than one, passes through the start.
     """
+    label, until = f"family({type(system).__name__})", dict(until or {})
+    if isinstance(start, SteadyMotion):
+        refuse_other_system(label, system, start)
+        steady = SteadyCurve(system, start, tuple(hold), tuple(find), until)
+        return steady.family(*steady.follow(steady.place(towards), *towards.values(), step, max_step, steps))
     if not isinstance(start, Orbit):
-        options = {"hold": hold, "find": find, "step": step, "max_step": max_step, "steps": steps}
-        return steady_family(system, start, towards=towards, until=until, **options)
-    label = f"family({type(system).__name__})"
-    if hold or find:
+        raise TypeError(f"{label}: `start` must be a SteadyMotion, e.g. from steady_turn, or an Orbit; got {start!r}.")
+    if hold or find or len(towards) != 1:
         raise ValueError(
-            f"{label}: `hold` and `find` apply to steady motions only. Omit them: a family of orbits uses the `hold` "
-            "of `periodic`."
+            f"{label}: for orbits, `towards` must be one name with +1 or -1, got {dict(towards)}. Omit `hold` and "
+            "`find`: the family uses the `hold` of `periodic`."
         )
-    if len(towards) != 1:
-        raise ValueError(f"{label}: `towards` must be one name with +1 or -1, got {dict(towards)}.")
     ((name, sign),) = towards.items()
-    parameter, equations = _parameter(label, system, start, name)
-    args = start.arguments._replace(system=system, center=packed(start.state))
-    kept = [start.equations.hold.index(i) for i in equations.hold]
-    args = args._replace(targets=args.targets[np.array(kept, int)])
+    curve = _OrbitCurve(*_released(label, system, start, name), start.unknowns, until, label)
+    equations, parameter, args = curve.orbit, curve.parameter, curve.args
     if parameter and not equations.autonomous:
         z, other = start.unknowns, _with_value(args, parameter, 1.01 * _value(args, parameter) + 1e-4)
         if not repeats(*other[:3], other.start, equations.period(z, other), equations.skipped(z, other)):
             raise ValueError(f"{label}: {name!r} changes the period of the force. Pass a function as its `period`.")
-    curve = _OrbitCurve(equations, parameter, args, start.unknowns, dict(until or {}), label)
-    y = curve.first
-    if np.max(np.abs(curve.evaluate(y)[0])) > 1e-6:
+    if np.max(np.abs(curve.evaluate(curve.first)[0])) > 1e-6:
         raise ValueError(f"{label}: `start` is not an orbit of this system. Pass its own system, `start.system`.")
-    curve.move_phase(y)
-    tangent = curve.tangent(y, None)
-    ahead = tangent[curve.place(name)]
-    tangent = tangent * float(np.sign(sign * ahead) or 1.0)
-    max_step = 4 * step if max_step is None else max_step
-    points, arc, met = curve.follow(y, tangent, step, max_step, steps)
-    reason = f"{steps} steps" if len(points) > steps else "Newton's method, which found no further orbit"
-    if met is not None:
-        reached, value = list(curve.until.items())[met]
-        reason = f"{reached} = {value:g}"
-    zs = jnp.asarray(np.array(points) * curve.scale)
-    rows = [curve.member(y) for y in points]
+    curve.move_phase(curve.first)
+    zs, arc, reason = curve.follow(curve.places[name], sign, step, max_step, steps)
+    rows = [curve.member(z / curve.scale) for z in zs]
     values, period, states, multipliers = map(jnp.asarray, map(np.array, zip(*rows, strict=True)))
     first = dataclasses.replace(start, equations=equations, arguments=args, system=system)
     special = tuple(
         Bifurcation(kind, curve.member(y)[0], _orbit_at(equations, parameter, jnp.asarray(y * curve.scale), args))
         for kind, y in curve.found
     )
-    return OrbitFamily(values, period, states, multipliers, jnp.asarray(arc), zs, first, special, parameter, reason)
+    arc, zs = jnp.asarray(arc), jnp.asarray(zs)
+    return OrbitFamily(values, period, states, multipliers, arc, zs, first, special, parameter, reason)
 
 
-def _parameter(label: str, system: System, start: Orbit, name: str) -> tuple[str, OrbitEquations]:
-    """The name of the parameter that changes, or "" if none does, and the equations without the released entry."""
-    equations = start.equations
+def _released(label: str, system: System, start: Orbit, name: str) -> tuple[OrbitEquations, str, OrbitArguments]:
+    """The equations without the released entry, the name of the parameter that changes, or "" if none does, and the
+    arguments."""
+    equations, args = start.equations, start.arguments._replace(system=system, center=packed(start.state))
     parameters = [key for key, value, _ in parameters_in(system) if np.ndim(value) == 0]
     inputs = [] if callable(start.inputs) else [key for key, x in start.inputs.items() if not callable(x)]
     if name in parameters or name in inputs:
-        return name, equations
+        return equations, name, args
     entries = (*system.coordinates, *system.speeds, *system.states)
-    if name != "period" and name not in entries:
-        known = (*parameters, *inputs, *entries, "period")
-        raise ValueError(f"{label}: `towards` has no quantity {name!r}; {hint(name, known, 'it has')}")
+    refuse_unknown([name], (*parameters, *inputs, *entries, "period"), f"{label}: `towards` has no quantity", "it has")
     if not equations.hold:
         raise ValueError(
             f"{label}: the orbit is isolated if no parameter changes, because `periodic` was called without `hold`. "
@@ -213,19 +202,21 @@ def _parameter(label: str, system: System, start: Orbit, name: str) -> tuple[str
             f"{label}: `towards` contains {name}, which is not in the `hold` of `periodic`. Name a quantity of this "
             "`hold`, or a parameter."
         )
-    return "", dataclasses.replace(equations, hold=tuple(i for i in equations.hold if i != released))
+    kept = np.array([k for k, i in enumerate(equations.hold) if i != released], int)
+    equations = dataclasses.replace(equations, hold=tuple(i for i in equations.hold if i != released))
+    return equations, "", args._replace(targets=args.targets[kept])
 
 
 class _OrbitCurve(SolutionCurve):
-    """The curve of the orbits, in scaled unknowns y = (z, p) / scale."""
+    """The curve of the orbits, with the unknowns (z, p)."""
+
+    stuck = "Newton's method, which found no further orbit"
 
     def __init__(
         self, equations: OrbitEquations, parameter: str, args: OrbitArguments, z: Array, until: Any, label: str
     ):
-        self.equations, self.parameter = equations, parameter
-        system = args.system
-        entries = (*system.coordinates, *system.speeds, *system.states)
-        self.args = args
+        self.orbit, self.parameter, self.args = equations, parameter, args
+        entries = (*args.system.coordinates, *args.system.speeds, *args.system.states)
         self.places = {entries[k]: i for i, k in enumerate(equations.closed)}
         if equations.autonomous:
             self.places["period"] = z.size - 1
@@ -234,59 +225,40 @@ class _OrbitCurve(SolutionCurve):
             self.places[parameter] = z.size
             p = float(_value(args, parameter))
             z, sizes = jnp.append(z, p), np.append(sizes, abs(p) or 1.0)
-        self.scale, self.first = sizes, np.asarray(z) / sizes
-        unknown = [key for key in until if key not in self.places]
-        if unknown:
-            raise ValueError(
-                f"{label}: `until` contains the unknown name {unknown[0]!r}; "
-                f"{hint(unknown[0], self.places, 'there are')}"
-            )
-        self.until, self._memory = until, {}
+        refuse_unknown(until, self.places, f"{label}: `until` contains the unknown name")
+        self._memory: dict[bytes, Any] = {}
         self.found: list[tuple[str, Any]] = []  # kinds and places of the bifurcations so far
-        super().__init__(self._evaluated, max(float(jnp.finfo(z.dtype).eps), equations.rtol))
-
-    def place(self, name: str) -> int:
-        return self.places[name]
+        super().__init__(z, sizes, until, max(float(jnp.finfo(z.dtype).eps), equations.rtol))
 
     def _all(self, y) -> Any:
         key = y.tobytes()
         if key not in self._memory:
             if len(self._memory) > 8:
                 self._memory.pop(next(iter(self._memory)))
-            found = _extended(self.equations, self.parameter, jnp.asarray(y * self.scale), self.args)
+            found = _extended(self.orbit, self.parameter, jnp.asarray(y * self.scale), self.args)
             self._memory[key] = tuple(map(np.asarray, found))
         return self._memory[key]
 
-    def _evaluated(self, y):
+    def equations(self, y):
         F, J, rows, _, _ = self._all(y)
-        where = np.array([self.places[key] for key in self.until], int)
-        limits = np.array(list(self.until.values()), float) / self.scale[where]
-        size = np.maximum(np.abs(limits), 1.0)
-        G = np.eye(len(y))[where]
-        return F / rows, J * self.scale / rows[:, None], (y[where] - limits) / size, G / size[:, None]
+        G = np.diag(self.scale)[np.array([self.places[key] for key in self.until], int)]
+        return F / rows, J * self.scale / rows[:, None], G @ y, G
 
     def move_phase(self, y) -> None:
         """Let the phase condition contain the orbit's own start, so that it stays transversal along the family."""
-        if self.equations.autonomous and not self.equations.section:
-            z_p = jnp.asarray(y * self.scale)
-            center, normal = _phase(self.equations, self.parameter, z_p, self.args)
+        if self.orbit.autonomous and not self.orbit.section:
+            center, normal = _phase(self.orbit, self.parameter, jnp.asarray(y * self.scale), self.args)
             self.args = self.args._replace(center=center, normal=normal)
             self._memory.clear()
-        if self.equations.jumps:
-            self.args = self.args._replace(period=jnp.asarray(self._summary(y)[0]))
+        if self.orbit.jumps:
+            self.args = self.args._replace(period=jnp.asarray(self._all(y)[4][0]))
 
     def member(self, y) -> tuple[Any, ...]:
         """The value of the parameter, the period, the packed state and the multipliers."""
-        T, state, M = self._summary(y)
+        *_, M, (T, *state) = self._all(y)
         values = np.linalg.eigvals(M) if np.all(np.isfinite(M)) else np.full(len(M), np.nan)
         values = values[np.argsort(-np.abs(values), kind="stable")].astype(complex)
-        p = y[-1] * self.scale[-1] if self.parameter else T
-        return float(p), float(T), state, values
-
-    def _summary(self, y):
-        matrix = self._all(y)[3]
-        T, state = self._all(y)[4][0], self._all(y)[4][1:]
-        return T, state, matrix
+        return float(y[-1] * self.scale[-1] if self.parameter else T), float(T), np.array(state), values
 
     def tests(self, y, tangent) -> dict[str, float]:
         """Functions that change their sign at a bifurcation.
@@ -295,10 +267,10 @@ class _OrbitCurve(SolutionCurve):
         """
         if not self.parameter:
             return {}
-        M = self._summary(y)[2]
+        M = self._all(y)[3]
         values = np.linalg.eigvals(M)
         found = {"fold": tangent[-1], "period doubling": np.linalg.det(M + np.eye(len(M)))}
-        if not self.equations.hold:
+        if not self.orbit.hold:
             pairs = [1.0 - a * b for i, a in enumerate(values) for b in values[i + 1 :]]
             found["Neimark-Sacker"] = float(np.real(np.prod(pairs))) if pairs else 1.0
             found["branch point"] = np.linalg.det(M - np.eye(len(M)))
@@ -317,9 +289,8 @@ class _OrbitCurve(SolutionCurve):
     def _between(self, y, tangent, z, new) -> list[tuple[str, Any]] | None:
         """Kinds and places of the bifurcations between y and z, in their order. None if the search for one fails."""
         before, after = self.tests(y, tangent), self.tests(z, new)
-        kinds = [kind for kind in before if before[kind] * after[kind] < 0]
         length, found = float(tangent @ (z - y)), []
-        for kind in kinds:
+        for kind in [kind for kind in before if before[kind] * after[kind] < 0]:
 
             def test(s, kind=kind):
                 if s in (0.0, length):
@@ -338,20 +309,14 @@ class _OrbitCurve(SolutionCurve):
             attempt = self.correct(y + s * tangent, tangent)
             if attempt is None:
                 return None
-            if self._is_real(kind, attempt[0]):
+            values: Any = np.linalg.eigvals(self._all(attempt[0])[3])
+            pairs = values[np.abs(values.imag) > 1e-7]
+            # Two real multipliers whose product is 1 are not a Neimark-Sacker point.
+            if kind != "Neimark-Sacker" or np.min(np.abs(np.abs(pairs) - 1.0), initial=1.0) < 1e-6:
                 found.append((s, kind, attempt[0]))
-        folds = [s for s, kind, _ in found if kind == "fold"]
-        if folds:  # a multiplier is 1 at a fold too
+        if any(kind == "fold" for _, kind, _ in found):  # a multiplier is 1 at a fold too
             found = [entry for entry in found if entry[1] != "branch point"]
         return [(kind, at) for _, kind, at in sorted(found, key=lambda entry: entry[0])]
-
-    def _is_real(self, kind: str, y) -> bool:
-        """Whether a Neimark-Sacker point has a conjugate pair. Two real multipliers whose product is 1 do not count."""
-        if kind != "Neimark-Sacker":
-            return True
-        values: Any = np.linalg.eigvals(self._summary(y)[2])
-        pairs = values[np.abs(values.imag) > 1e-7]
-        return bool(len(pairs) and np.min(np.abs(np.abs(pairs) - 1.0)) < 1e-6)
 
 
 def _value(args: OrbitArguments, name: str) -> Any:
@@ -362,8 +327,6 @@ def _value(args: OrbitArguments, name: str) -> Any:
 
 
 def _with_value(args: OrbitArguments, name: str, value: Any) -> OrbitArguments:
-    if not name:
-        return args
     if any(key == name for key, _, _ in parameters_in(args.system)):
         return args._replace(system=with_parameters(args.system, {name: value}))
     return args._replace(inputs={**args.inputs, name: value})
@@ -377,10 +340,7 @@ def _split(parameter: str, z_p: Array, args: OrbitArguments) -> tuple[Array, Orb
 def _extended(equations: OrbitEquations, parameter: str, z_p: Array, args: OrbitArguments):
     """F, J, the sizes of the rows, the derivative of the return map, and the period with the packed state."""
     z, there = _split(parameter, z_p, args)
-    if parameter:
-        at = equations.evaluate(z, args, z_p[-1:], lambda p: _with_value(args, parameter, p[0]))
-    else:
-        at = equations.evaluate(z, args)
+    at = equations.evaluate(z, args, z_p[z.size :], lambda p: _split(parameter, jnp.append(z, p), args)[1])
     rows = scales_at(equations, z, there, at)[1]
     matrix = equations.return_matrix(at.segments, z, there)
     return at.F, at.J, rows, matrix, jnp.append(equations.period(z, there), equations.states(z, there)[0])
@@ -394,11 +354,9 @@ def _phase(equations: OrbitEquations, parameter: str, z_p: Array, args: OrbitArg
 
 @jit
 def _orbit_at(equations: OrbitEquations, parameter: str, z_p: Array, args: OrbitArguments) -> Orbit:
+    center, normal = _phase(equations, parameter, z_p, args)
     z, args = _split(parameter, z_p, args)
-    center = equations.states(z, args)[0]
-    args = args._replace(
-        center=center, normal=normal_at(equations, z, args), targets=center[np.array(equations.hold, int)]
-    )
+    args = args._replace(center=center, normal=normal, targets=center[np.array(equations.hold, int)])
     if equations.jumps:
         args = args._replace(period=equations.period(z, args))
     at = equations.evaluate(z, args)
@@ -441,8 +399,7 @@ def limit_cycle(
             f"{label}: `amplitude` must be one of {', '.join(entries)} with a number; got {dict(amplitude)}."
         )
     known = [*(key for key, value, _ in parameters_in(system) if np.ndim(value) == 0), *system.inputs]
-    if parameter not in known:
-        raise ValueError(f"{label}: there is no parameter {parameter!r}; {hint(parameter, known)}")
+    refuse_unknown([parameter], known, f"{label}: there is no parameter")
     ((name, deviation),) = amplitude.items()
     center = packed(motion.state)
     inputs = {key: motion.inputs[key] for key in system.inputs}

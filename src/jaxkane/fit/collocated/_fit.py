@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import functools
@@ -11,13 +12,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
 
+from ..._collocate.functions import bounds_of
 from ..._collocate.lobatto import lobatto
 from ..._collocate.program import Bounds, NonlinearProgram
 from ..._collocate.second_order import refused_unless_minimum
 from ..._collocate.solvers import INTERRUPTED, Solution, Solver, default_solver, run
 from ..._collocate.transcription import Transcription
+from ..._common.lookup import positive_number, refuse_unknown
 from ..._integrate.jumps import refuse_jumps
 from ..._scalarjit.cache_key import jit
 from ..._system.system import System
@@ -25,12 +27,12 @@ from ..problem.declarations import Items
 from ..problem.parameters import Parameters
 from ..problem.problem import Problem
 from ..problem.specification import ProblemSpec
-from ..problem.trial import Trial
-from ..result.statistics import check_level, names_of
-from ..result.tables import text_table
-from ._kkt import Kkt
-from ._marginal import Marginal
-from ._phases import TrialPhase, add_squares, checked_inputs, checked_within, guessed
+from ..problem.trial import Trial, trial_names
+from ..problem.windows import state_names
+from ..result.statistics import intervals, t_quantile
+from ..result.tables import parameter_rows, text_table
+from ._marginal import Kkt, Marginal
+from ._phases import TrialPhase, add_squares, guessed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,24 +85,22 @@ class Collocation:
         **options: Any,
     ) -> CollocationFit:
         """Fit by collocation. The arguments are those of `jaxkane.fit.fit`."""
-        _check_options(options)
+        for name, reason in _NOT_SUPPORTED.items():
+            if options.get(name):
+                raise ValueError(f"`{name}` cannot be used with `transcription=Collocation()`. {reason}. Omit it.")
         problem = Problem.with_first_steps(ProblemSpec(system, free, **options), trials)
         _check_problem(problem)
         return solved(problem, self, progress)
 
 
-def _check_options(options: Mapping[str, Any]) -> None:
-    reasons = {
-        "window": "Collocation has no windows",
-        "defect_std": "Pass `unknown_inputs` for disturbances",
-        "noise": "Pass `unknown_inputs` for disturbances",
-        "errors": "Collocation supports independent normal errors only",
-        "zero_order_hold": "Collocation needs continuous inputs",
-        "simulation": "Collocation does not simulate",
-    }
-    for name, reason in reasons.items():
-        if options.get(name):
-            raise ValueError(f"`{name}` cannot be used with `transcription=Collocation()`. {reason}. Omit it.")
+_NOT_SUPPORTED = {
+    "window": "Collocation has no windows",
+    "defect_std": "Pass `unknown_inputs` for disturbances",
+    "noise": "Pass `unknown_inputs` for disturbances",
+    "errors": "Collocation supports independent normal errors only",
+    "zero_order_hold": "Collocation needs continuous inputs",
+    "simulation": "Collocation does not simulate",
+}
 
 
 def _check_problem(problem: Problem) -> None:
@@ -115,17 +115,23 @@ def _check_problem(problem: Problem) -> None:
         )
         raise ValueError(f"Collocation does not support the {kind} {name}. {remedy}")
     refuse_jumps(problem.system, "Collocation", "Its motions are smooth. Omit `transcription`.")
-    if problem.model.nuisance.window:
-        raise ValueError("Collocation has no windows: each='window' cannot be used. Pass each='trial'.")
-    if problem.parameters.distributions:
-        raise ValueError("Collocation does not support distributions over groups. Pass prior=(mean, deviation).")
-    if jnp.result_type(float) != jnp.float64:
-        raise ValueError("Collocation needs float64. Call jaxkane.configure() first.")
+    for is_wrong, reason in (
+        (problem.model.nuisance.window, "has no windows: each='window' cannot be used. Pass each='trial'."),
+        (problem.parameters.distributions, "does not support distributions over groups. Pass prior=(mean, deviation)."),
+        (jnp.result_type(float) != jnp.float64, "needs float64. Call jaxkane.configure() first."),
+    ):
+        if is_wrong:
+            raise ValueError(f"Collocation {reason}")
 
 
 def solved(problem: Problem, how: Collocation, progress: bool) -> CollocationFit:
-    densities = checked_inputs(problem, how.unknown_inputs)
-    within = checked_within(problem, how.within, tuple(densities))
+    system, name = problem.system, type(problem.system).__name__
+    refuse_unknown(how.unknown_inputs, system.inputs, f"`unknown_inputs`: {name} has no input", "it has")
+    densities = {k: positive_number(v, f"`unknown_inputs` of {k!r}") for k, v in how.unknown_inputs.items()}
+    refuse_unknown(
+        how.within, (*state_names(system), *densities), f"`within`: {name} has no state or unknown input", "it has"
+    )
+    within = {k: bounds_of(f"`within` of {k!r}", value) for k, value in how.within.items()}
     method = lobatto(how.method)
     phases = [TrialPhase(problem, k, densities, within) for k in range(len(problem.slices))]
     meshes = [phase.mesh(how.intervals_per_sample) for phase in phases]
@@ -142,14 +148,14 @@ def solved(problem: Problem, how: Collocation, progress: bool) -> CollocationFit
     solution = run(solver, program, transcription.z, progress=progress, max_iterations=how.max_iterations)
     solution = refused_unless_minimum(program, transcription.shared, solution)
     if densities and solution.ok:
-        found = Marginal(transcription, shared, local).minimum(solution)
-        point, covariance = found.point, found.covariance
-        status = solution.status if found.ok else "the largest number of steps of the parameters was reached"
-        solution = Solution(
-            point.z, point.multipliers, solution.bound_multipliers, found.ok, status, solution.iterations
-        )
+        point, covariance, ok = Marginal(transcription, shared, local).minimum(solution)
+        status = solution.status if ok else "the largest number of steps of the parameters was reached"
+        solution = dataclasses.replace(solution, z=point.z, multipliers=point.multipliers, ok=ok, status=status)
     else:
-        covariance = covariance_of(transcription, solution)
+        covariance = np.full((len(shared),) * 2, np.nan)  # if it does not exist
+        with contextlib.suppress(np.linalg.LinAlgError):
+            border = np.concatenate([shared, local])
+            covariance = Kkt(transcription.program, border, solution.z, solution.multipliers).covariance(shared)
     return CollocationFit(problem, how, transcription, solution, covariance)
 
 
@@ -160,16 +166,6 @@ def with_fixed(program: NonlinearProgram, variables: np.ndarray, z: np.ndarray) 
     lower[variables] = upper[variables] = z[variables] * program.x_scale[variables]
     changed.x_bounds = Bounds(lower, upper)
     return changed
-
-
-def covariance_of(transcription: Transcription, solution: Solution) -> np.ndarray:
-    """The covariance (p, p) of the scaled shared parameters; NaN if it does not exist."""
-    shared, local = transcription.shared_parameters, transcription.local_parameters
-    try:
-        kkt = Kkt(transcription.program, np.concatenate([shared, local]), solution.z, solution.multipliers)
-    except np.linalg.LinAlgError:
-        return np.full((len(shared),) * 2, np.nan)
-    return kkt.covariance(shared)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -219,19 +215,16 @@ class CollocationFit:
 
     @property
     def ok(self) -> bool:
-        """Whether the search converged and the data determine all parameters."""
         return self.status == "converged"
 
     @property
     def message(self) -> str:
-        """The status as a sentence."""
-        words = {
+        return {
             "converged": "The search converged.",
             "undetermined": "The search converged, but the data do not determine all parameters.",
             "interrupted": "The search was interrupted.",
             "failed": f"The search ended early: {self.solution.status}.",
-        }
-        return words[self.status]
+        }[self.status]
 
     @functools.cached_property
     def _x(self) -> np.ndarray:
@@ -272,7 +265,7 @@ class CollocationFit:
 
     @property
     def start(self) -> dict[str, float]:
-        return self._by_name(self.parameters.values(jnp.zeros(self.parameters.size)))
+        return self._by_name(self.parameters.start)
 
     def _by_name(self, values: Any) -> dict[str, float]:
         return dict(zip(self.names, np.asarray(values, float).tolist(), strict=True))
@@ -292,6 +285,12 @@ class CollocationFit:
     def standard_errors(self) -> dict[str, float]:
         return self._by_name(np.sqrt(np.diag(self.covariance)))
 
+    errors = standard_errors
+
+    @property
+    def error_kinds(self) -> dict[str, str]:
+        return dict.fromkeys(self.names, "formal")
+
     @property
     def correlation(self) -> np.ndarray:
         deviation = np.sqrt(np.diag(self.covariance))
@@ -299,68 +298,52 @@ class CollocationFit:
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Confidence intervals by name, truncated at the bounds of the parameters."""
-        check_level(level)
-        half = scipy.stats.norm.ppf(0.5 * (1 + level)) * np.array([*self.standard_errors.values()])
-        values = np.array([*self.estimates.values()])
-        ends = np.clip([values - half, values + half], *np.expand_dims(self.parameters.bounds.T, 1))
-        return {name: (float(a), float(b)) for name, a, b in zip(self.names, *ends, strict=True)}
+        half_widths = t_quantile(level, np.inf) * np.array([*self.standard_errors.values()])
+        return dict(zip(self.names, intervals(self.parameters, self._theta, half_widths), strict=True))
 
     @functools.cached_property
-    def _at_samples(self) -> dict[str, tuple[dict[str, np.ndarray], dict[str, np.ndarray]]]:
-        """By trial, states and inputs by name, and fitted measurements by channel. NaN before the window."""
+    def _at_samples(self) -> list[tuple[Trial, dict[str, np.ndarray], dict[str, np.ndarray]]]:
+        """For each trial, states and inputs by name, and fitted measurements by channel. NaN before the window."""
         every = self.transcription_options.intervals_per_sample * (len(self.transcription.method.c) - 1)
-        found = {}
-        layouts = zip(self._slices, self.transcription.layouts, self.transcription.motions(self._x), strict=True)
-        for (trial, first), layout, motion in layouts:
+        found, motions = [], self.transcription.motions(self._x)
+        for (k, first, _), layout, motion in zip(self.problem.slices, self.transcription.layouts, motions, strict=True):
             places = np.arange(0, layout.K, every)
             data = layout.node_data(layout.s[places])
-            x = jnp.asarray(self._x[layout.columns[places]])
-            read, inputs = _read(layout.variables, data, x)
-            values = dict(zip(layout.problem.names, motion.Y[places].T, strict=True))
-            values |= {name: np.asarray(value) for name, value in inputs.items()}
+            read, inputs = _read(layout.variables, data, jnp.asarray(self._x[layout.columns[places]]))
+            values = dict(zip(layout.problem.names, motion.Y[places].T, strict=True)) | inputs
             both = values, dict(zip(self.problem.channels, np.asarray(read).T, strict=True))
-            found[trial] = [{k: np.append(np.full(first, np.nan), x) for k, x in each.items()} for each in both]
+            before = np.full(first, np.nan)
+            both = ({name: np.append(before, x) for name, x in each.items()} for each in both)
+            found.append((self.problem.trials[k], *both))
         return found
 
-    @property
-    def _slices(self) -> list[tuple[str, int]]:
-        """For each phase, the name of its trial and the index of its first sample."""
-        names = names_of(self.problem.trials)
-        return [(names[k], first) for k, first, _ in self.problem.slices]
+    def _by_trial(self, values: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        names = trial_names(self.problem.trials)
+        return {names[k]: value for (k, _, _), value in zip(self.problem.slices, values, strict=True)}
 
     @property
     def motions(self) -> dict[str, dict[str, np.ndarray]]:
-        return {name: values for name, (values, _) in self._at_samples.items()}
+        return self._by_trial([values for _, values, _ in self._at_samples])
 
     @property
     def fitted(self) -> dict[str, dict[str, np.ndarray]]:
-        return {name: read for name, (_, read) in self._at_samples.items()}
+        return self._by_trial([read for _, _, read in self._at_samples])
 
     @property
     def residuals(self) -> dict[str, dict[str, np.ndarray]]:
-        trials = dict(zip(names_of(self.problem.trials), self.problem.trials, strict=True))
-        return {
-            name: {c: (read[c] - x) / trials[name].sigma[c] for c, x in trials[name].measured.items()}
-            for name, read in self.fitted.items()
-        }
+        return self._by_trial(
+            [{c: (y[c] - x) / trial.sigma[c] for c, x in trial.measured.items()} for trial, _, y in self._at_samples]
+        )
 
     def nuisance(self) -> dict[str, dict[str, float]]:
         """The estimates that belong to one trial only, by trial and name."""
         model, n = self.problem.model.nuisance, self.parameters.size
-        rows = {}
-        for (name, _), layout in zip(self._slices, self.transcription.layouts, strict=True):
-            values = np.asarray(model.trial_center) + self._x[layout.parameters[n:]]
-            rows[name] = dict(zip(model.trial_names, values.tolist(), strict=True))
-        return rows
+        values = [model.trial_center + self._x[layout.parameters[n:]] for layout in self.transcription.layouts]
+        return self._by_trial([dict(zip(model.trial_names, np.asarray(x).tolist(), strict=True)) for x in values])
 
     def __repr__(self) -> str:
-        rows: list[tuple[str, ...]] = [("parameter", "unit", "start", "estimate", "standard error", "95 % interval")]
-        for name, unit in zip(self.names, self.parameters.units, strict=True):
-            low, high = self.intervals()[name]
-            numbers = self.start[name], self.estimates[name], self.standard_errors[name]
-            rows.append((name, unit, *(f"{x:.6g}" for x in numbers), f"{low:.6g} to {high:.6g}"))
         head = f"{self.problem.title}. By collocation: {self.message} Cost {self.cost:.6g}."
-        return "\n".join([head, *self.notes, text_table(rows, left=(0, 1))])
+        return "\n".join([head, *self.notes, text_table(parameter_rows(self), left=(0, 1))])
 
 
 @jit

@@ -14,13 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..._collocate.functions import Bound, Variables, bounds_of
+from ..._collocate.functions import Bound, Variables
 from ..._collocate.lobatto import Lobatto
 from ..._collocate.program import Block, EvaluatedBlock
-from ..._collocate.transcription import Builder, Layout, Motion, nodes_of
-from ..._common.lookup import positive_number, refuse_unknown
+from ..._collocate.transcription import Builder, Layout, Motion, PhaseProblem, nodes_of
 from ..._integrate.inputs import Samples, inputs_at
-from ..._kane.constraint_residuals import n_configuration_constraints
 from ..._kane.right_hand_side import vector_field
 from ..._scalarjit.cache_key import jit
 from ..._system.system import System, unpacked
@@ -28,7 +26,7 @@ from ..problem.model import Model, Nuisance
 from ..problem.parameters import Parameters
 from ..problem.problem import Problem
 from ..problem.trial import Trial
-from ..problem.windows import Windows, state_names
+from ..problem.windows import Windows
 
 DELAY = "delay of input"
 
@@ -93,15 +91,6 @@ class Squares(eqx.Module):
         return jnp.sum(residual**2)[None]
 
 
-class UnknownInputs(eqx.Module):
-    """The squares of the unknown inputs (n_w,) of an interval, divided by their spectral densities (1,)."""
-
-    densities: Array
-
-    def __call__(self, data: Any, w: Array) -> Array:
-        return jnp.sum(w**2 / self.densities)[None]
-
-
 class Priors(eqx.Module):
     """The squares of the priors of the shared parameters (1,)."""
 
@@ -122,7 +111,7 @@ class Deviations(eqx.Module):
 
 
 @dataclasses.dataclass(frozen=True)
-class TrialPhase:
+class TrialPhase(PhaseProblem):
     """One trial as a phase (see `PhaseProblem`), from the first sample of its window on.
 
     - `problem`: the problem of the fit. `k`: the index of the window. A trial without measurements has no window.
@@ -134,7 +123,9 @@ class TrialPhase:
     unknown_inputs: Mapping[str, float]
     within: Mapping[str, Bound]
 
-    cost = final_cost = conditions = path = None
+    # Unknown inputs are constant in each interval, so that their integrals over intervals are independent. With
+    # continuous inputs, those of neighbouring intervals were correlated, and an inertia was 8 % too small.
+    is_piecewise = True
 
     @functools.cached_property
     def trial(self) -> Trial:
@@ -156,17 +147,9 @@ class TrialPhase:
         return self.trial.name
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return state_names(self.system)
-
-    @property
     def durations(self) -> Bound:
         duration = float(self.trial.t[-1] - self.trial.t[0])
         return duration, duration
-
-    @property
-    def has_free_duration(self) -> bool:
-        return False
 
     @property
     def bounds_of_controls(self) -> dict[str, Bound]:
@@ -196,21 +179,8 @@ class TrialPhase:
         return TrialParameters(model.parameters, model.nuisance, self.window.applies)
 
     @property
-    def is_piecewise(self) -> bool:
-        """Unknown inputs are constant in each interval, so that their integrals over intervals are independent.
-
-        With continuous inputs, those of neighbouring intervals were correlated, and an inertia was 8 % too small.
-        """
-        return True
-
-    @property
     def n_local(self) -> int:
         return self.problem.model.nuisance.trial_center.size
-
-    @property
-    def n_constraints(self) -> int:
-        q = jax.ShapeDtypeStruct((len(self.system.coordinates),), jnp.float64)
-        return n_configuration_constraints(self.system, jnp.zeros(()), q)
 
     def variables(self) -> TrialVariables:
         return TrialVariables(
@@ -232,26 +202,6 @@ class TrialPhase:
         return np.interp(places, np.arange(len(s)), s)
 
 
-def checked_inputs(problem: Problem, unknown_inputs: Mapping[str, float]) -> dict[str, float]:
-    """Spectral densities by name.
-
-    **Raises:** `ValueError` for unknown names and densities that are not positive.
-    """
-    system = problem.system
-    refuse_unknown(unknown_inputs, system.inputs, f"`unknown_inputs`: {type(system).__name__} has no input", "it has")
-    return {k: positive_number(v, f"`unknown_inputs` of {k!r}") for k, v in unknown_inputs.items()}
-
-
-def checked_within(problem: Problem, within: Mapping[str, Any], controls: Sequence[str]) -> dict[str, Bound]:
-    """Bounds by name of states and unknown inputs.
-
-    **Raises:** `ValueError` for unknown names and bounds that exclude each other.
-    """
-    known = (*state_names(problem.system), *controls)
-    refuse_unknown(within, known, f"`within`: {type(problem.system).__name__} has no state", "it has")
-    return {name: bounds_of(f"`within` of {name!r}", value) for name, value in within.items()}
-
-
 def add_squares(problem: Problem, densities: Array, every: int, builder: Builder, layouts: Sequence[Layout]) -> None:
     """Add the squares of residuals, unknown inputs and priors to the cost. `every`: nodes from sample to sample."""
     nuisance = problem.model.nuisance
@@ -271,26 +221,29 @@ def add_squares(problem: Problem, densities: Array, every: int, builder: Builder
         if densities.size:
             N = len(layout.mesh) - 1
             columns = layout.node(np.arange(N) * layout.every)[:, variables.n_y :]
-            unknown = Block(UnknownInputs(densities), np.zeros((N, 0)), columns, 1)
-            builder.cost(EvaluatedBlock(unknown), np.diff(layout.mesh) * layout.problem.durations[0])
+            durations = np.diff(layout.mesh) * layout.problem.durations[0]
+            _add_deviations(builder, columns, np.zeros(densities.size), np.sqrt(densities), durations)
         names = layout.problem.names
         starts = np.asarray(nuisance.start_deviation)[: len(nuisance.start)]
         given = [i for i, deviation in enumerate(starts) if math.isfinite(deviation)]
         if given:
             at = np.array([names.index(nuisance.start[i]) for i in given])
-            _add_deviations(builder, layout.node(0)[at], window.start[at], starts[given])
+            _add_deviations(builder, layout.node(0)[at][None], window.start[at], starts[given])
         if np.isfinite(nuisance.trial_deviation).any():
             own = np.isfinite(nuisance.trial_deviation)
-            zeros = np.zeros(int(own.sum()))
-            _add_deviations(builder, layout.parameters[n:][own], zeros, np.asarray(nuisance.trial_deviation)[own])
+            deviation = np.asarray(nuisance.trial_deviation)[own]
+            _add_deviations(builder, layout.parameters[n:][own][None], np.zeros(deviation.size), deviation)
     if np.any(problem.parameters.has_prior):
         columns = layouts[0].parameters[:n][None]
         builder.cost(EvaluatedBlock(Block(Priors(problem.parameters), np.zeros((1, 0)), columns, 1)), np.ones(1))
 
 
-def _add_deviations(builder: Builder, columns: np.ndarray, mean: np.ndarray, deviation: np.ndarray) -> None:
-    function = Deviations(jnp.asarray(mean), jnp.asarray(deviation))
-    builder.cost(EvaluatedBlock(Block(function, np.zeros((1, 0)), columns[None], 1)), np.ones(1))
+def _add_deviations(
+    builder: Builder, columns: np.ndarray, mean: Any, deviation: Any, weights: np.ndarray | None = None
+) -> None:
+    """Add the squares of variables (B, n) relative to their prior means and standard deviations (n,)."""
+    block = Block(Deviations(jnp.asarray(mean), jnp.asarray(deviation)), np.zeros((len(columns), 0)), columns, 1)
+    builder.cost(EvaluatedBlock(block), np.ones(1) if weights is None else weights)
 
 
 def guessed(phase: TrialPhase, mesh: np.ndarray, method: Lobatto) -> Motion:
