@@ -451,8 +451,16 @@ def _results(equation: Equation, xs: Sequence[Any]) -> Sequence[Any]:
     return evaluated(equation, xs)
 
 
-_OF_TWO = {"add": add, "sub": sub, "mul": mul}
-_OF_EXACT: dict[str, Callable[..., Any]] = {**OPERATORS, "abs": abs, "square": lambda x: x * x}
+# Rules for equations with exact values: (parameters, values) -> the exact result, or None.
+_OF_EXACT: dict[str, Callable[..., float | None]] = {
+    **{name: lambda params, *xs, f=f: f(*xs) for name, f in OPERATORS.items()},
+    "div": lambda params, x, y: x / y if y else None,
+    "abs": lambda params, x: abs(x),
+    "square": lambda params, x: x * x,
+    "integer_pow": lambda params, x: x ** params["y"] if x or params["y"] > 0 else None,
+}
+# Operations that one exact value makes trivial, with these values.
+_TRIVIAL = {"add": (add, (0.0,)), "sub": (sub, (0.0,)), "mul": (mul, (0.0, 1.0, -1.0))}
 
 
 def _with_exact(equation: Equation, xs: Sequence[Any]) -> Component | None:
@@ -467,11 +475,8 @@ def _with_exact(equation: Equation, xs: Sequence[Any]) -> Component | None:
         return xs[0] if aval.shape == () and jnp.issubdtype(aval.dtype, jnp.floating) else None
     numbers = [float(x) if is_literal(v) else x for x, v in zip(xs, equation.invars, strict=True)]
     if all(map(is_exact, numbers)):
-        if name == "integer_pow" and (numbers[0] or equation.params["y"] > 0):
-            return numbers[0] ** equation.params["y"]
-        return _OF_EXACT[name](*numbers) if name in _OF_EXACT and not (name == "div" and numbers[1] == 0.0) else None
-    if name == "div" and exact[1] and xs[1] == 1.0:
-        return xs[0]
-    trivial = (0.0, 1.0, -1.0) if name == "mul" else (0.0,)
-    is_trivial = next(x for x, e in zip(xs, exact, strict=True) if e) in trivial
-    return _OF_TWO[name](*xs) if name in _OF_TWO and is_trivial else None
+        return _OF_EXACT[name](equation.params, *numbers) if name in _OF_EXACT else None
+    if name == "div" and exact[1]:
+        return xs[0] if xs[1] == 1.0 else None
+    f, trivial = _TRIVIAL.get(name, (None, ()))
+    return f(*xs) if f and next(x for x, e in zip(xs, exact, strict=True) if e) in trivial else None
