@@ -29,7 +29,7 @@ from .._version import __version__
 from ..estimate import Belief, Filter, predict, update
 from ..estimate._filter import sensed
 from ..estimate._process_noise import MODES
-from ._source import COMPARE, C, CText, in_comment, variable_units
+from ._source import COMPARE, C, CText, in_comment, sections_of, variable_units
 
 
 class ExportedFilter(NamedTuple):
@@ -175,16 +175,15 @@ class _FilterText(CText):
 
     def _function(self, function: str, outputs: dict[str, np.ndarray]) -> str:
         is_disturbed = function == "rates" and self.filter.method == "unscented"
-        read = ("t", "v", "w", *(["e"] if is_disturbed else []))
+        arguments = [f"{self.type} t", *(f"const {self.type} *{x}" for x in ("v", "w", *["e"] * is_disturbed))]
+        arguments.append(f"const {self.name}_parameters *p")
         try:
-            body = self.body((*read, "p"), outputs, self._words(is_disturbed))
+            text = self.function(f"{self.name}_{function}", arguments, outputs, self._words(is_disturbed))
         except NotScalarError as error:
             raise ValueError(
                 f"{self.formulas.name}: the filter cannot be written in C, because it contains {error}."
             ) from None
-        arguments = ", ".join([f"{self.type} t", *(f"const {self.type} *{word}" for word in read[1:])])
-        arguments += f", const {self.name}_parameters *p" + "".join(f", {self.type} *{output}" for output in outputs)
-        return f"static inline void {self.name}_{function}({arguments}) {body}"
+        return f"static inline {text}"
 
     def header(self) -> str:
         formulas, filter = self.formulas, self.filter
@@ -277,10 +276,7 @@ class _FilterText(CText):
 
 
 def _template(*sections: str) -> Template:
-    """Sections of `filter_template.h`. Each section follows a line `// name`."""
-    text = (Path(__file__).parent / "filter_template.h").read_text(encoding="utf-8")
-    parts = re.split(r"^// (\w+)\n", text, flags=re.MULTILINE)
-    by_name = dict(zip(parts[1::2], parts[2::2], strict=True))
+    by_name = sections_of("filter_template.h")
     return Template("".join(by_name[name] for name in sections))
 
 

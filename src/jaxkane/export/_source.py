@@ -274,6 +274,13 @@ def c(
     return files
 
 
+def sections_of(template: str) -> dict[str, str]:
+    """The sections of a template by name. Each section follows a line `// name`; a section "" precedes them."""
+    text = (Path(__file__).parent / template).read_text(encoding="utf-8")
+    parts = ["", *re.split(r"^// (\w+)\n", text, flags=re.MULTILINE)]
+    return dict(zip(parts[::2], parts[1::2], strict=True))
+
+
 class CText:
     """Elements of all C sources of a system: its name, the struct of its parameters, numbers, and bodies of
     functions."""
@@ -328,15 +335,23 @@ class CText:
     def numbers(self, numbers: Any) -> str:
         return six_a_line([self.constant(x) for x in np.ravel(numbers)] or ["0"])
 
-    def body(self, read: Sequence[str], by_output: dict[str, np.ndarray], words: dict[int, str]) -> str:
-        """The body of a function with these arguments, in braces."""
+    def declaration(self, name: str, arguments: Iterable[str], by_output: Iterable[str]) -> str:
+        """The declaration of a function, e.g. `void name(double t, const double *q, double *q_dot)`."""
+        return f"void {name}({', '.join([*arguments, *(f'{self.type} *{output}' for output in by_output)])})"
+
+    def function(
+        self, name: str, arguments: Sequence[str], by_output: dict[str, np.ndarray], words: dict[int, str]
+    ) -> str:
+        """A function that computes these outputs from the declared arguments."""
         lines, outputs = as_source(self.formulas.graph, list(by_output.values()), words, C)
         for output, elements in zip(by_output, outputs, strict=True):
             lines += [f"{output}[{i}] = {text};" for i, text in enumerate(elements)]
         text = "\n    ".join(lines)
         # Without this use, compilers warn about an unused argument. All functions have the same arguments.
+        read = [re.split(r"[ *]", argument)[-1] for argument in arguments]
         unused = [f"(void){word};" for word in (*read, *by_output) if not _is_read(word, text)]
-        return "{\n    " + "\n    ".join([*unused, *lines]) + "\n}\n"
+        body = "\n    ".join([*unused, *lines])
+        return f"{self.declaration(name, arguments, by_output)} {{\n    {body}\n}}\n"
 
 
 class _CModule(CText):
@@ -345,19 +360,14 @@ class _CModule(CText):
     def __init__(self, formulas: Formulas, functions: tuple[str, ...], name: str):
         super().__init__(formulas, name)
         self.functions, self.nodes = functions, {function: formulas.nodes(function) for function in functions}
-
-    def _comment(self) -> str:
-        title = in_comment(_title(self.formulas))
-        return f"/* {title}\n   The results depend only on the arguments; all numbers are {self.type}. */\n"
-
-    def _signature(self, function: str) -> str:
-        read = f"{self.type} t, const {self.type} *q, const {self.type} *u, const {self.type} *inputs"
-        outputs = "".join(f", {self.type} *{output}" for output in self.nodes[function])
-        return f"void {self.name}_{function}({read}, const {self.name}_parameters *p{outputs})"
+        title, real = in_comment(_title(formulas)), self.type
+        self.comment = f"/* {title}\n   The results depend only on the arguments; all numbers are {real}. */\n"
+        self.arguments = [f"{real} t", *(f"const {real} *{kind}" for kind in ("q", "u", "inputs"))]
+        self.arguments.append(f"const {self.name}_parameters *p")
 
     def header(self) -> str:
         guard, unit_of = f"{self.name.upper()}_H", variable_units(self.formulas.system)
-        lines = [self._comment(), f"#ifndef {guard}", f"#define {guard}", "", "#ifdef __cplusplus"]
+        lines = [self.comment, f"#ifndef {guard}", f"#define {guard}", "", "#ifdef __cplusplus"]
         lines += ['extern "C" {', "#endif", "", *self.struct(), "", "/* The parameters that were exported. */"]
         lines += [f"extern const {self.name}_parameters {self.name}_default;", ""]
         lines += ["/* Arguments of the functions:", "", "   t: time [s]"]
@@ -374,21 +384,24 @@ class _CModule(CText):
                 for output, nodes in self.nodes[function].items()
             )
             lines.append(f"/* {shapes}{in_comment(_meaning(self.formulas, function))} */")
-            lines += [f"{self._signature(function)};", ""]
+            declaration = self.declaration(f"{self.name}_{function}", self.arguments, self.nodes[function])
+            lines += [f"{declaration};", ""]
         return "\n".join([*lines, "#ifdef __cplusplus", "}", "#endif", "", "#endif", ""])
 
     def source(self, header: str) -> str:
         outputs = [nodes for by_output in self.nodes.values() for nodes in by_output.values()]
         default = f"const {self.name}_parameters {self.name}_default = {{\n    {self.default()}\n}};\n"
-        parts = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n', default, *self.helpers(outputs)]
-        read = ("t", "q", "u", "inputs", "p")
-        bodies = (self.body(read, by_output, self.input_words) for by_output in self.nodes.values())
-        return "\n".join([*parts, *map("{} {}".format, map(self._signature, self.functions), bodies)])
+        parts = [self.comment, f'#include "{header}"\n\n#include <math.h>\n', default, *self.helpers(outputs)]
+        parts += [
+            self.function(f"{self.name}_{function}", self.arguments, by_output, self.input_words)
+            for function, by_output in self.nodes.items()
+        ]
+        return "\n".join(parts)
 
     def test(self, header: str) -> str:
         """A program that calls every function at one state, and compares with stored values."""
         state, expected, sizes = _state_and_outputs(self.formulas, self.functions)
-        lines = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n#include <stdio.h>\n']
+        lines = [self.comment, f'#include "{header}"\n\n#include <math.h>\n#include <stdio.h>\n']
         lines += [self.array(kind, state[kind]) for kind in ("q", "u", "inputs")]
         calls = []
         for function in self.functions:
