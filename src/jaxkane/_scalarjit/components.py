@@ -55,7 +55,9 @@ def component(value: Component, what: str = "A component, an angle, a rate or a 
         return float(value)
     shape, kind = getattr(value, "shape", None), getattr(getattr(value, "dtype", None), "kind", "")
     if shape != () or kind in tuple("cUSOmM"):
-        raise TypeError(f"{what} must be one number, got {_described(value, shape)}")
+        hint = f": by name it is q[{value!r}], u[{value!r}] or inputs[{value!r}]" if isinstance(value, str) else ""
+        got = f"an array of shape {shape}: take one entry, as a[0]" if shape else f"{value!r}{hint}"
+        raise TypeError(f"{what} must be one number, got {got}.")
     return jnp.asarray(value) if isinstance(value, np.ndarray) else value
 
 
@@ -79,14 +81,6 @@ def positive(value: Component, what: str) -> Component:
     if is_exact(component(value, what)) and not value > 0:
         raise ValueError(f"{what} must be positive, got {value}.")
     return value
-
-
-def _described(value: Any, shape: Any) -> str:
-    if shape:
-        return f"an array of shape {shape}: take one entry, as a[0]."
-    if isinstance(value, str):
-        return f"{value!r}: by name it is q[{value!r}], u[{value!r}] or inputs[{value!r}]."
-    return f"{value!r}."
 
 
 def is_exact(a: Component) -> bool:
@@ -308,7 +302,7 @@ def _eliminated(A: Rows, rights: Sequence[Sequence[Component]]) -> tuple[list[tu
 
 def _chosen(condition: Any, a: Component, b: Component) -> Component:
     """`a` if the condition is true, else `b`."""
-    if isinstance(condition, bool):
+    if isinstance(condition, (bool, np.bool_)):
         return a if condition else b
     return a if is_exact(a) and is_exact(b) and a == b else jnp.where(condition, a, b)
 
@@ -354,8 +348,10 @@ def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
         pivot = M[j][j]
         for k in range(j):
             pivot = sub(pivot, mul(mul(L[j][k], L[j][k]), d[k]))
-        if pivot is not M[j][j]:
-            pivot = _regular(pivot, M[j][j])
+        if pivot is not M[j][j]:  # NaN if it is not larger than the rounding error of the diagonal entry
+            exact = is_exact(pivot) and is_exact(M[j][j])
+            threshold = rounding_of_pivots(float if exact else jnp.result_type(pivot, M[j][j])) * M[j][j]
+            pivot = _chosen(pivot > threshold, pivot, math.nan)
         d.append(pivot)
         for i in range(j + 1, n):
             entry = M[j][i]
@@ -371,14 +367,6 @@ def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
         for k in range(i + 1, n):
             x[i] = sub(x[i], mul(L[k][i], x[k]))
     return tuple(x)
-
-
-def _regular(pivot: Component, diagonal: Component) -> Component:
-    """The pivot, or NaN if it is not larger than the rounding error of the diagonal entry."""
-    if is_exact(pivot) and is_exact(diagonal):
-        return pivot if pivot > rounding_of_pivots(float) * diagonal else math.nan
-    threshold = rounding_of_pivots(jnp.result_type(pivot, diagonal)) * diagonal
-    return jnp.where(pivot > threshold, pivot, math.nan)
 
 
 def _quotient(a: Component, b: Component) -> Component:
@@ -436,7 +424,9 @@ class Replay:
             key = (id(equation), *(x if is_exact(x) else id(x) for x in xs))
             if key not in memory:
                 known = _with_exact(equation, xs)
-                memory[key] = _results(equation, xs) if known is None else [known], xs, self
+                pairs = zip(xs, equation.invars, strict=True)
+                arrays = [np.asarray(x, v.aval.dtype) if is_exact(x) else x for x, v in pairs]
+                memory[key] = evaluated(equation, arrays) if known is None else [known], xs, self
             values.update(zip(equation.outvars, memory[key][0], strict=True))
         results = [values[v] if _is_variable(v) else v if is_exact(v) else v.val for v in self.results[quantity]]
         return jax.tree.unflatten(self.structures[quantity], results)
@@ -444,11 +434,6 @@ class Replay:
 
 def _is_variable(v: Variable) -> bool:
     return not is_exact(v) and not is_literal(v)
-
-
-def _results(equation: Equation, xs: Sequence[Any]) -> Sequence[Any]:
-    xs = [np.asarray(x, v.aval.dtype) if is_exact(x) else x for x, v in zip(xs, equation.invars, strict=True)]
-    return evaluated(equation, xs)
 
 
 # Rules for equations with exact values: (parameters, values) -> the exact result, or None.
