@@ -162,26 +162,38 @@ _UNROLL_UP_TO = 12
 
 def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:
     """The solutions x of A x = b for several right-hand sides b."""
-    if len(A) <= _CRAMER_UP_TO:
-        return _solutions_and_det(A, rights)[0]
-    blocks = _blocks(A)
-    if blocks is not None:
-        return _solved_by_blocks(A, rights, blocks)
+    if found := _written_out(A, rights):
+        return found[0]
     solution = _solved_by_lapack(stack(A), jnp.stack([stack([b])[0] for b in rights], axis=-1))
     return [tuple(solution[i, j] for i in range(len(A))) for j in range(len(rights))]
 
 
 def determinant(A: Rows) -> Component:
     """det A."""
+    found = _written_out(A, ())
+    return found[1] if found else _det_by_lapack(stack(A))
+
+
+def _written_out(
+    A: Rows, rights: Sequence[Sequence[Component]]
+) -> tuple[list[tuple[Component, ...]], Component] | None:
+    """Solutions and det A, or None if no diagonal blocks are small enough to be written out."""
     if len(A) <= _CRAMER_UP_TO:
-        return _solutions_and_det(A)[1]
+        return _solutions_and_det(A, rights)
     blocks = _blocks(A)
     if blocks is None:
-        return _det_by_lapack(stack(A))
-    rows, columns = ([i for block in blocks for i in block[side]] for side in (0, 1))
-    sign = np.linalg.det(np.eye(len(A))[rows]) * np.linalg.det(np.eye(len(A))[columns])
-    factors = [_solutions_and_det(_part(A, *block))[1] for block in blocks]
-    return functools.reduce(mul, factors, float(round(sign)))
+        return None
+    orders = [[i for block in blocks for i in block[side]] for side in (0, 1)]
+    det: Component = float(round(math.prod(np.linalg.det(np.eye(len(A))[order]) for order in orders)))
+    solutions: list[dict[int, Component]] = [{} for _ in rights]
+    for rows, columns in blocks:
+        pairs = zip(rights, solutions, strict=True)
+        remaining = [[functools.reduce(sub, (mul(A[i][j], x[j]) for j in x), b[i]) for i in rows] for b, x in pairs]
+        solved, factor = _solutions_and_det([[A[i][j] for j in columns] for i in rows], remaining)
+        det = mul(det, factor)
+        for x, values in zip(solutions, solved, strict=True):
+            x.update(zip(columns, values, strict=True))
+    return [tuple(x[j] for j in range(len(A))) for x in solutions], det
 
 
 # By these names `unsupported_primitives` distinguishes calls of the method itself from those of a system.
@@ -234,21 +246,6 @@ def _matched(reads: np.ndarray) -> list[int] | None:
     if not all(find(row, set()) for row in range(len(reads))):
         return None
     return sorted(owner, key=owner.__getitem__)
-
-
-def _part(A: Rows, rows: list[int], columns: list[int]) -> Rows:
-    return [[A[i][j] for j in columns] for i in rows]
-
-
-def _solved_by_blocks(A: Rows, rights: Sequence[Sequence[Component]], blocks: list[Block]) -> list:
-    solutions: list[dict[int, Component]] = [{} for _ in rights]
-    for rows, columns in blocks:
-        remaining = []
-        for b, x in zip(rights, solutions, strict=True):
-            remaining.append([functools.reduce(sub, (mul(A[i][j], x[j]) for j in x), b[i]) for i in rows])
-        for x, solved in zip(solutions, _solutions_and_det(_part(A, rows, columns), remaining)[0], strict=True):
-            x.update(zip(columns, solved, strict=True))
-    return [tuple(x[j] for j in range(len(A))) for x in solutions]
 
 
 def _solutions_and_det(

@@ -359,7 +359,8 @@ def jacobian(
         slopes = iter([_read(v, along, sparse) for v in jaxpr.outvars])
         pairs = zip(has_tangent, avals[1], strict=True)
         outputs = [(next(slopes) if has else np.full(aval.shape, NOTHING), aval) for has, aval in pairs]
-        columns.append([sparse.instantiated(x, str(aval.dtype)) for x, aval in outputs])
+        zeros = [graph.constant(0.0, str(aval.dtype)) for _, aval in outputs]
+        columns.append([np.where(x == NOTHING, zero, x) for zero, (x, _) in zip(zeros, outputs, strict=True)])
     return [
         np.stack([column[i] for column in columns], axis=-1) if columns else np.zeros((*aval.shape, 0), np.int64)
         for i, aval in enumerate(avals[1])
@@ -397,6 +398,3 @@ class _SparseGraph:
                     return NOTHING
             operands = tuple(self.graph.constant(0.0, dtype) if i == NOTHING else i for i in operands)
         return self.graph.apply(operation, operands, dtype)
-
-    def instantiated(self, nodes: np.ndarray, dtype: str) -> np.ndarray:
-        return np.where(nodes == NOTHING, self.graph.constant(0.0, dtype), nodes)

@@ -106,7 +106,8 @@ class _FilterText(CText):
 
     def __init__(self, filter: Filter, belief: Belief, name: str, dtype: str):
         self.filter, self.belief, system = filter, belief, filter.system
-        more = {"all_rates": Function(("rate",), all_rates), "sensed": Function(("z",), self._sensed)}
+        more = {"all_rates": Function(("rate",), all_rates)}
+        more["sensed"] = Function(("z",), lambda system, *args: (sensed(system, filter.sensors, *args[:-1]),))
         more["weights"] = Function(("weight",), lambda system, t, q, *_: (coordinate_weights(system, t, q),))
         formulas = Formulas(system, dtype, more)
         super().__init__(formulas, name)
@@ -118,9 +119,6 @@ class _FilterText(CText):
         self.estimated += [of_parameter[name] for name in filter.parameters]
         places = [(len(formulas.arguments), i, len(filter.noise)) for i in range(len(filter.noise))]
         self.noise = [formulas.graph.add("input", place, formulas.dtype) for place in places]
-
-    def _sensed(self, system, t, q, u, w, _):
-        return (sensed(system, self.filter.sensors, t, q, u, w),)
 
     def _words(self, is_disturbed: bool) -> dict[int, str]:
         """The C expressions of input nodes: the estimated state is in v, inputs are in w, all others in *p."""

@@ -7,8 +7,9 @@ interface (`fmu_2_template.c`, `fmu_3_template.c`).
 
 from __future__ import annotations
 
+import functools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from string import Template
 from typing import Any, NamedTuple
 
@@ -285,18 +286,18 @@ def _functions_of(system: System, events: Events, outputs: Sequence[str]) -> dic
         u_dep = dependent_speeds(system, t, q, u) if system.dependent_speeds else ()
         return (jnp.stack([*u_dep, *(values[name] for name in outputs)]),)
 
-    def after_event(event: int) -> Callable[..., Any]:
-        return lambda system, t, q, u, w, _: (after_stages(system, t, _packed(system, q, u, w), event, which)[0],)
+    def after(event: int, system: System, t: Any, q: Any, u: Any, w: Any, _: Any) -> tuple[Any, ...]:
+        return (after_stages(system, t, _packed(system, q, u, w), event, which)[0],)
 
     functions = {"motion": Function(("rate",), all_rates)}
     if outputs or system.dependent_speeds:
         functions["outputs"] = Function(("sensed",), sensed)
     if events.names or system.dependent_speeds:
         functions["events"] = Function(("g", "g_dot", "condition"), _events)
-        functions["event functions"] = Function(("g",), _event_functions)
+        functions["event functions"] = Function(("g",), lambda *args: _events(*args)[:1])
     for i, name in enumerate(events.names):
         if events.stages[i]:
-            functions[_jump_name(name)] = Function(("after",), after_event(i))
+            functions[_jump_name(name)] = Function(("after",), functools.partial(after, i))
     return functions
 
 
@@ -311,12 +312,6 @@ def _events(system, t, q, u, w, _):
         return values.values, values.rates, values.conditions
     rates = jnp.append(values.rates, jnp.zeros((), values.rates.dtype))
     return jnp.append(values.values, values.bound), rates, values.conditions
-
-
-def _event_functions(system, t, q, u, w, _):
-    """Event functions and det C_dep, to be differentiated."""
-    values = event_values(system, t, _packed(system, q, u, w), None)
-    return (jnp.append(values.values, values.bound) if system.dependent_speeds else values.values,)
 
 
 def _jump_name(event: str) -> str:
