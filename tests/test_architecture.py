@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import importlib
 import os
 import re
 import subprocess
@@ -137,6 +138,20 @@ def test_public_names():
     assert len(jk.catalog.CATALOG) >= 15
 
 
+def test_the_names_for_type_checkers_are_those_of_the_module():
+    tree = ast.parse((SOURCE / "__init__.py").read_text(encoding="utf-8"))
+    declared = {
+        alias.asname: ".".join(filter(None, ("jaxkane", node.module)))
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if alias.asname and not alias.asname.startswith("_")
+    }
+    assert declared.keys() | {"__version__"} == set(jk.__all__)
+    for name, module in declared.items():
+        assert getattr(importlib.import_module(module), name) is getattr(jk, name)
+
+
 def test_fit_exports_at_most_46_names():
     """Classes that are only returned stay in the modules of their functions."""
     tree = ast.parse((SOURCE / "fit" / "__init__.py").read_text(encoding="utf-8"))
@@ -159,10 +174,11 @@ def test_importing_changes_nothing_and_prints_nothing():
         "import os, sys, jax; before = dict(os.environ), jax.config.values.copy(); import jaxkane; "
         "from jaxkane._scalarjit.compat import NO_FUSIONS, WRONG_FUSIONS; "  # but for two releases that are repaired
         "before[0].update({'XLA_FLAGS': f'{NO_FUSIONS}='} if jax.__version_info__ in WRONG_FUSIONS else {}); "
-        "late = {'scipy', 'optax', 'matplotlib', 'pandas', 'tqdm', 'jaxkane.fit', 'jaxkane.plot', 'jaxkane.sweep'}; "
-        "assert not late & sys.modules.keys(), late & sys.modules.keys(); "
+        "unused = {'scipy', 'optax', 'matplotlib', 'pandas', 'tqdm', 'jaxkane.fit', 'jaxkane.plot', 'jaxkane.sweep'}; "
+        "assert not {*unused, 'diffrax', 'jaxkane._kane'} & sys.modules.keys(), sys.modules.keys(); "
+        "jaxkane.System, jaxkane.simulate; assert not unused & sys.modules.keys(), unused & sys.modules.keys(); "
         "import jaxkane.stability; assert not {'scipy.signal', 'scipy.stats'} & sys.modules.keys(); "
-        "assert all(hasattr(jaxkane, name) for name in dir(jaxkane)) and late & sys.modules.keys(); "
+        "assert all(hasattr(jaxkane, name) for name in dir(jaxkane)) and unused & sys.modules.keys(); "
         "assert {'jaxkane.symbolic', 'jaxkane.export'} < sys.modules.keys(); "
         "assert not {'sympy', 'casadi', 'mujoco'} & sys.modules.keys(); "
         "here = {}; exec('from jaxkane import *', here); assert {'fit', 'animate', 'simulate'} <= here.keys(); "

@@ -679,9 +679,9 @@ def test_systems_and_functions_that_cannot_be_exported_are_rejected(monkeypatch,
         jk.export.c(Strange(), tmp_path / "a.c", functions=("rate",))
     with pytest.raises(TypeError, match=r"e\.g\. \('rates',\)"):
         jk.export.numpy(Strange(), functions="rates")
-    with pytest.raises(ValueError, match=r"`platforms` must contain some of cpu, cuda, rocm, tpu; got .*gpu"):
+    with pytest.raises(ValueError, match=r"`platforms`.* cpu, cuda, rocm, tpu; got .*gpu"):
         jk.export.stablehlo(Strange(), platforms=("cpu", "gpu"))
-    with pytest.raises(TypeError, match=r"`platforms` must be a sequence of names, e\.g\. \('cpu',\)"):
+    with pytest.raises(TypeError, match=r"`platforms`.* cpu, cuda, rocm, tpu; got .cpu"):
         jk.export.stablehlo(Strange(), platforms="cpu")
     with pytest.raises(ValueError, match=r"Strange has no dependent speeds.*Omit it"):
         jk.export.numpy(Strange(), functions=("dependent_speeds",))

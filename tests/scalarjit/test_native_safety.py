@@ -178,11 +178,11 @@ CHANGES = {
 @pytest.fixture
 def unknown(monkeypatch):
     """A process that has not compared the header yet."""
-    native.tell.cache_clear()
-    native._refused.cache_clear()
+    native.warn_not_native.cache_clear()
+    native.why_not.cache_clear()
     yield
     monkeypatch.undo()
-    native._refused.cache_clear()
+    native.why_not.cache_clear()
 
 
 @pytest.mark.parametrize("change", CHANGES)
@@ -227,7 +227,7 @@ class Text:
 
 
 def test_after_an_llvm_error_xla_is_used(monkeypatch):
-    native.tell.cache_clear()
+    native.warn_not_native.cache_clear()
     f = ScalarFunction(lambda x: jnp.sin(x) * 1.75)
     with monkeypatch.context() as broken:
         broken.setattr(native, "Writer", Text)

@@ -23,19 +23,6 @@ _MAPPINGS_OF_A_PROGRAM = 900  # of a simulation with a contact and its derivativ
 _uses = itertools.count()
 
 
-class _Entry:
-    """A result in a cache.
-
-    used: time of the last request, as an increasing number.
-    owners: weak references, to keep their callbacks alive.
-    """
-
-    __slots__ = ("owners", "result", "used")
-
-    def __init__(self, result: Any, owners: list[Any]) -> None:
-        self.result, self.owners, self.used = result, owners, next(_uses)
-
-
 class Cache:
     """Results by key, shared by threads.
 
@@ -48,7 +35,8 @@ class Cache:
 
     def __init__(self, size: int = 256, programs: bool = False) -> None:
         self.size, self.programs = size, programs
-        self._entries: collections.OrderedDict[Hashable, _Entry] = collections.OrderedDict()
+        # result, weak references to its owners (to keep their callbacks alive), time of the last request
+        self._entries: collections.OrderedDict[Hashable, tuple[Any, list[Any], int]] = collections.OrderedDict()
         self._lock = threading.RLock()  # comparing keys may run code that uses a cache
         # Callbacks of weak references run anywhere, also while this thread changes the dict. They only append here.
         self._ended: collections.deque[Hashable] = collections.deque()
@@ -63,12 +51,11 @@ class Cache:
     def known(self, key: Hashable, default: Any = MISSING) -> Any:
         with self._lock:
             self._drop_ended()
-            entry = self._entries.get(key)
-            if entry is None:
+            if key not in self._entries:
                 return default
-            self._entries.move_to_end(key)
-            entry.used = next(_uses)
-            return entry.result
+            result, references, _ = self._entries.pop(key)
+            self._entries[key] = result, references, next(_uses)  # as the last one
+            return result
 
     def keep(self, key: Hashable, result: Any, owners: Iterable[Any] = ()) -> Any:
         """Keep a result until one of its `owners` ceases to exist. The `id` of an owner may be part of the key, because
@@ -79,8 +66,8 @@ class Cache:
         references = [weakref.ref(x, lambda _: ended.append(key)) for x in owners]
         with self._lock:
             self._drop_ended()
-            self._entries[key] = _Entry(result, references)
-            self._entries.move_to_end(key)
+            self._entries.pop(key, None)
+            self._entries[key] = result, references, next(_uses)
             if len(self._entries) > self.size:
                 self._entries.popitem(last=False)
         return result
@@ -106,15 +93,15 @@ class Cache:
     def uses(self) -> list[int]:
         """The times of the last request of each result."""
         with self._lock:
-            return [entry.used for entry in self._entries.values()]
+            return [used for *_, used in self._entries.values()]
 
     def drop(self, last_use: int) -> list[Hashable]:
         """Drop the results that were not requested after `last_use`. **Returns:** their keys."""
-        dropped = []
         with self._lock:
-            while self._entries and next(iter(self._entries.values())).used <= last_use:
-                dropped.append(self._entries.popitem(last=False))
-        return [key for key, _ in dropped]
+            dropped = {key: entry for key, entry in self._entries.items() if entry[-1] <= last_use}
+            for key in dropped:
+                del self._entries[key]
+        return [*dropped]  # the programs are freed outside of the lock
 
 
 def owners_of(x: Any) -> list[Any]:
@@ -153,12 +140,11 @@ class _Limit:
     def check(self, new: int) -> None:
         """`new`: the hash of the key of a program that will be compiled."""
         self._expected += _MAPPINGS_OF_A_PROGRAM
-        if not self._lock.acquire(blocking=False):  # another thread runs this check
+        # To list 4000 mappings takes 10 ms or more, so they are read only if the limit may have been reached.
+        is_far = self._expected <= self.mappings and new not in self.dropped
+        if is_far or not self._lock.acquire(blocking=False):  # another thread runs this check
             return
         try:
-            # To list 4000 mappings takes 10 ms or more, so they are read only if the limit may have been reached.
-            if self._expected <= self.mappings and new not in self.dropped:
-                return
             used, most = memory_mappings()
             if new in self.dropped:
                 self._double(most)
@@ -186,8 +172,6 @@ class _Limit:
             uses = sorted(use for cache in caches for use in cache.uses())
             for cache in caches if uses else ():
                 self.dropped.update(map(hash, cache.drop(uses[int(fraction * (len(uses) - 1))])))
-            if (used := memory_mappings()[0]) <= self.mappings:
-                return used
             gc.collect()  # programs may be in reference cycles
             if (used := memory_mappings()[0]) <= self.mappings:
                 return used

@@ -18,7 +18,7 @@ import sys
 import sysconfig
 import types
 from collections.abc import Callable, Iterable, Mapping
-from operator import is_
+from operator import attrgetter, is_
 from typing import Any
 
 import numpy as np
@@ -63,9 +63,8 @@ def is_of_library(kind: type) -> bool:
     return _is_library(kind.__module__)
 
 
-def _definition_of(f: types.FunctionType) -> tuple[Any, ...]:
-    """The parts of a function that autoreload replaces."""
-    return f.__code__, f.__defaults__, f.__kwdefaults__
+# The parts of a function that autoreload replaces.
+_definition_of = attrgetter("__code__", "__defaults__", "__kwdefaults__")
 
 
 def _items_of(mapping: Mapping[Any, Any]) -> tuple[Any, ...]:

@@ -280,14 +280,8 @@ _SETTINGS = (
     "jax_default_matmul_precision",
     "jax_debug_nans",
 )
-
-
-class _Checks:
-    """The number of traces in which equinox's checks return NaN, and equinox's setting before the first of them."""
-
-    lock = threading.Lock()
-    traces = 0
-    before = ""
+_lock = threading.Lock()
+_before: list[str] = []  # equinox's setting before the first of the present traces, once for each of them
 
 
 @contextlib.contextmanager
@@ -304,17 +298,16 @@ def storable_checks() -> Iterator[None]:
     if not keeps or not hasattr(equinox, "EQX_ON_ERROR"):
         yield
         return
-    with _Checks.lock:  # other threads may trace at the same time: the first sets it, and the last restores it
-        if not _Checks.traces:
-            _Checks.before, equinox.EQX_ON_ERROR = equinox.EQX_ON_ERROR, "nan"
-        _Checks.traces += 1
+    with _lock:  # other threads may trace at the same time: the first sets it, and the last restores it
+        _before.append(_before[0] if _before else equinox.EQX_ON_ERROR)
+        equinox.EQX_ON_ERROR = "nan"
     try:
         yield
     finally:
-        with _Checks.lock:
-            _Checks.traces -= 1
-            if not _Checks.traces:
-                equinox.EQX_ON_ERROR = _Checks.before
+        with _lock:
+            before = _before.pop()
+            if not _before:
+                equinox.EQX_ON_ERROR = before
 
 
 def filter_jit_uncached(f: Callable[..., Any]) -> Callable[..., Any]:

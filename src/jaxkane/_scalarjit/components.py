@@ -55,7 +55,9 @@ def component(value: Component, what: str = "A component, an angle, a rate or a 
         return float(value)
     shape, kind = getattr(value, "shape", None), getattr(getattr(value, "dtype", None), "kind", "")
     if shape != () or kind in tuple("cUSOmM"):
-        raise TypeError(f"{what} must be one number, got {_described(value, shape)}")
+        hint = f": by name it is q[{value!r}], u[{value!r}] or inputs[{value!r}]" if isinstance(value, str) else ""
+        got = f"an array of shape {shape}: take one entry, as a[0]" if shape else f"{value!r}{hint}"
+        raise TypeError(f"{what} must be one number, got {got}.")
     return jnp.asarray(value) if isinstance(value, np.ndarray) else value
 
 
@@ -79,14 +81,6 @@ def positive(value: Component, what: str) -> Component:
     if is_exact(component(value, what)) and not value > 0:
         raise ValueError(f"{what} must be positive, got {value}.")
     return value
-
-
-def _described(value: Any, shape: Any) -> str:
-    if shape:
-        return f"an array of shape {shape}: take one entry, as a[0]."
-    if isinstance(value, str):
-        return f"{value!r}: by name it is q[{value!r}], u[{value!r}] or inputs[{value!r}]."
-    return f"{value!r}."
 
 
 def is_exact(a: Component) -> bool:
@@ -168,26 +162,38 @@ _UNROLL_UP_TO = 12
 
 def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:
     """The solutions x of A x = b for several right-hand sides b."""
-    if len(A) <= _CRAMER_UP_TO:
-        return _solutions_and_det(A, rights)[0]
-    blocks = _blocks(A)
-    if blocks is not None:
-        return _solved_by_blocks(A, rights, blocks)
+    if found := _written_out(A, rights):
+        return found[0]
     solution = _solved_by_lapack(stack(A), jnp.stack([stack([b])[0] for b in rights], axis=-1))
     return [tuple(solution[i, j] for i in range(len(A))) for j in range(len(rights))]
 
 
 def determinant(A: Rows) -> Component:
     """det A."""
+    found = _written_out(A, ())
+    return found[1] if found else _det_by_lapack(stack(A))
+
+
+def _written_out(
+    A: Rows, rights: Sequence[Sequence[Component]]
+) -> tuple[list[tuple[Component, ...]], Component] | None:
+    """Solutions and det A, or None if no diagonal blocks are small enough to be written out."""
     if len(A) <= _CRAMER_UP_TO:
-        return _solutions_and_det(A)[1]
+        return _solutions_and_det(A, rights)
     blocks = _blocks(A)
     if blocks is None:
-        return _det_by_lapack(stack(A))
-    rows, columns = ([i for block in blocks for i in block[side]] for side in (0, 1))
-    sign = np.linalg.det(np.eye(len(A))[rows]) * np.linalg.det(np.eye(len(A))[columns])
-    factors = [_solutions_and_det(_part(A, *block))[1] for block in blocks]
-    return functools.reduce(mul, factors, float(round(sign)))
+        return None
+    orders = [[i for block in blocks for i in block[side]] for side in (0, 1)]
+    det: Component = float(round(math.prod(np.linalg.det(np.eye(len(A))[order]) for order in orders)))
+    solutions: list[dict[int, Component]] = [{} for _ in rights]
+    for rows, columns in blocks:
+        pairs = zip(rights, solutions, strict=True)
+        remaining = [[functools.reduce(sub, (mul(A[i][j], x[j]) for j in x), b[i]) for i in rows] for b, x in pairs]
+        solved, factor = _solutions_and_det([[A[i][j] for j in columns] for i in rows], remaining)
+        det = mul(det, factor)
+        for x, values in zip(solutions, solved, strict=True):
+            x.update(zip(columns, values, strict=True))
+    return [tuple(x[j] for j in range(len(A))) for x in solutions], det
 
 
 # By these names `unsupported_primitives` distinguishes calls of the method itself from those of a system.
@@ -242,21 +248,6 @@ def _matched(reads: np.ndarray) -> list[int] | None:
     return sorted(owner, key=owner.__getitem__)
 
 
-def _part(A: Rows, rows: list[int], columns: list[int]) -> Rows:
-    return [[A[i][j] for j in columns] for i in rows]
-
-
-def _solved_by_blocks(A: Rows, rights: Sequence[Sequence[Component]], blocks: list[Block]) -> list:
-    solutions: list[dict[int, Component]] = [{} for _ in rights]
-    for rows, columns in blocks:
-        remaining = []
-        for b, x in zip(rights, solutions, strict=True):
-            remaining.append([functools.reduce(sub, (mul(A[i][j], x[j]) for j in x), b[i]) for i in rows])
-        for x, solved in zip(solutions, _solutions_and_det(_part(A, rows, columns), remaining)[0], strict=True):
-            x.update(zip(columns, solved, strict=True))
-    return [tuple(x[j] for j in range(len(A))) for x in solutions]
-
-
 def _solutions_and_det(
     A: Rows, rights: Sequence[Sequence[Component]] = ()
 ) -> tuple[list[tuple[Component, ...]], Component]:
@@ -308,7 +299,7 @@ def _eliminated(A: Rows, rights: Sequence[Sequence[Component]]) -> tuple[list[tu
 
 def _chosen(condition: Any, a: Component, b: Component) -> Component:
     """`a` if the condition is true, else `b`."""
-    if isinstance(condition, bool):
+    if isinstance(condition, (bool, np.bool_)):
         return a if condition else b
     return a if is_exact(a) and is_exact(b) and a == b else jnp.where(condition, a, b)
 
@@ -354,8 +345,10 @@ def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
         pivot = M[j][j]
         for k in range(j):
             pivot = sub(pivot, mul(mul(L[j][k], L[j][k]), d[k]))
-        if pivot is not M[j][j]:
-            pivot = _regular(pivot, M[j][j])
+        if pivot is not M[j][j]:  # NaN if it is not larger than the rounding error of the diagonal entry
+            exact = is_exact(pivot) and is_exact(M[j][j])
+            threshold = rounding_of_pivots(float if exact else jnp.result_type(pivot, M[j][j])) * M[j][j]
+            pivot = _chosen(pivot > threshold, pivot, math.nan)
         d.append(pivot)
         for i in range(j + 1, n):
             entry = M[j][i]
@@ -371,14 +364,6 @@ def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
         for k in range(i + 1, n):
             x[i] = sub(x[i], mul(L[k][i], x[k]))
     return tuple(x)
-
-
-def _regular(pivot: Component, diagonal: Component) -> Component:
-    """The pivot, or NaN if it is not larger than the rounding error of the diagonal entry."""
-    if is_exact(pivot) and is_exact(diagonal):
-        return pivot if pivot > rounding_of_pivots(float) * diagonal else math.nan
-    threshold = rounding_of_pivots(jnp.result_type(pivot, diagonal)) * diagonal
-    return jnp.where(pivot > threshold, pivot, math.nan)
 
 
 def _quotient(a: Component, b: Component) -> Component:
@@ -436,7 +421,9 @@ class Replay:
             key = (id(equation), *(x if is_exact(x) else id(x) for x in xs))
             if key not in memory:
                 known = _with_exact(equation, xs)
-                memory[key] = _results(equation, xs) if known is None else [known], xs, self
+                pairs = zip(xs, equation.invars, strict=True)
+                arrays = [np.asarray(x, v.aval.dtype) if is_exact(x) else x for x, v in pairs]
+                memory[key] = evaluated(equation, arrays) if known is None else [known], xs, self
             values.update(zip(equation.outvars, memory[key][0], strict=True))
         results = [values[v] if _is_variable(v) else v if is_exact(v) else v.val for v in self.results[quantity]]
         return jax.tree.unflatten(self.structures[quantity], results)
@@ -446,13 +433,16 @@ def _is_variable(v: Variable) -> bool:
     return not is_exact(v) and not is_literal(v)
 
 
-def _results(equation: Equation, xs: Sequence[Any]) -> Sequence[Any]:
-    xs = [np.asarray(x, v.aval.dtype) if is_exact(x) else x for x, v in zip(xs, equation.invars, strict=True)]
-    return evaluated(equation, xs)
-
-
-_OF_TWO = {"add": add, "sub": sub, "mul": mul}
-_OF_EXACT: dict[str, Callable[..., Any]] = {**OPERATORS, "abs": abs, "square": lambda x: x * x}
+# Rules for equations with exact values: (parameters, values) -> the exact result, or None.
+_OF_EXACT: dict[str, Callable[..., float | None]] = {
+    **{name: lambda params, *xs, f=f: f(*xs) for name, f in OPERATORS.items()},
+    "div": lambda params, x, y: x / y if y else None,
+    "abs": lambda params, x: abs(x),
+    "square": lambda params, x: x * x,
+    "integer_pow": lambda params, x: x ** params["y"] if x or params["y"] > 0 else None,
+}
+# Operations that one exact value makes trivial, with these values.
+_TRIVIAL = {"add": (add, (0.0,)), "sub": (sub, (0.0,)), "mul": (mul, (0.0, 1.0, -1.0))}
 
 
 def _with_exact(equation: Equation, xs: Sequence[Any]) -> Component | None:
@@ -467,11 +457,8 @@ def _with_exact(equation: Equation, xs: Sequence[Any]) -> Component | None:
         return xs[0] if aval.shape == () and jnp.issubdtype(aval.dtype, jnp.floating) else None
     numbers = [float(x) if is_literal(v) else x for x, v in zip(xs, equation.invars, strict=True)]
     if all(map(is_exact, numbers)):
-        if name == "integer_pow" and (numbers[0] or equation.params["y"] > 0):
-            return numbers[0] ** equation.params["y"]
-        return _OF_EXACT[name](*numbers) if name in _OF_EXACT and not (name == "div" and numbers[1] == 0.0) else None
-    if name == "div" and exact[1] and xs[1] == 1.0:
-        return xs[0]
-    trivial = (0.0, 1.0, -1.0) if name == "mul" else (0.0,)
-    is_trivial = next(x for x, e in zip(xs, exact, strict=True) if e) in trivial
-    return _OF_TWO[name](*xs) if name in _OF_TWO and is_trivial else None
+        return _OF_EXACT[name](equation.params, *numbers) if name in _OF_EXACT else None
+    if name == "div" and exact[1]:
+        return xs[0] if xs[1] == 1.0 else None
+    f, trivial = _TRIVIAL.get(name, (None, ()))
+    return f(*xs) if f and next(x for x, e in zip(xs, exact, strict=True) if e) in trivial else None

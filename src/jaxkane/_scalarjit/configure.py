@@ -102,7 +102,7 @@ def configure(
     if native is not None:
         kernels.use(native)
     if native and (why := kernels.why_not()):
-        kernels.tell(why)
+        kernels.warn_not_native(why)
     done = Configuration(bool(float64), folder, devices, kernels.is_on())
     if verbose and done != _last:
         print(_told(done))

@@ -55,24 +55,6 @@ class _Hash:
     def add(self, value: Any) -> None:
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes)):
             self.words(type(value).__name__, value if isinstance(value, bytes) else repr(value))
-        elif isinstance(value, Tracer):  # in a rule of an operation that was traced within another trace
-            self.words("traced", value.dtype, value.shape)
-        elif isinstance(value, (np.ndarray, np.generic, jax.Array)):
-            array = np.asarray(value)
-            self.words("array", array.dtype.str, array.shape, np.ascontiguousarray(array).tobytes())
-        elif isinstance(value, enum.Enum):
-            self.words("enum", type(value).__qualname__, value.name)
-        elif isinstance(value, Mapping):
-            self.words("dict", len(value))
-            for key, item in value.items():
-                self.add(key)
-                self.add(item)
-        elif isinstance(value, (list, tuple)):
-            self.words("sequence", len(value))
-            for item in value:
-                self.add(item)
-        elif isinstance(value, (set, frozenset)):
-            self.words("set", *sorted(digest(item, self.code) for item in value))
         elif hasattr(value, "eqns") or (hasattr(value, "jaxpr") and hasattr(value, "consts")):
             if id(value) not in self.programs:
                 inner = _Hash(self.code, self.programs)
@@ -80,32 +62,43 @@ class _Hash:
                 self.programs[id(value)] = value, inner.sha.hexdigest()
             self.words(self.programs[id(value)][1])
         else:
-            self.thing(value)
+            kind, parts = self.parts(value)
+            self.words(kind, len(parts))
+            for part in parts:
+                self.add(part)
 
-    def thing(self, value: Any) -> None:
-        """An object that is neither a number nor a program."""
+    def parts(self, value: Any) -> tuple[str, Sequence[Any]]:
+        """What a value is, and its contents."""
+        name = type(value).__qualname__
         inner, params = getattr(value, "program", None), getattr(value, "params", None)
+        if isinstance(value, Tracer):  # in a rule of an operation that was traced within another trace
+            return "traced", (str(value.dtype), value.shape)
+        if isinstance(value, (np.ndarray, np.generic, jax.Array)):
+            array = np.asarray(value)
+            return "array", (array.dtype.str, array.shape, array.tobytes())
+        if isinstance(value, enum.Enum):
+            return "enum", (name, value.name)
+        if isinstance(value, Mapping):
+            return "dict", [x for item in value.items() for x in item]
+        if isinstance(value, (list, tuple)):
+            return "sequence", value
+        if isinstance(value, (set, frozenset)):
+            return "set", sorted(digest(item, self.code) for item in value)
         if inner is not None:  # a program of scalars, see `_scalarjit.program`
-            self.add(inner)
-        elif isinstance(params, Mapping):  # an operation that contains programs itself: `jax.lax.custom_root`
-            self.words("operation", type(value).__qualname__)
-            self.add(params)
-        elif self.code is not None and hasattr(value, "callback_func"):  # `jax.pure_callback`, `io_callback`
-            self.words("called back", self.code(value.callback_func))
-        elif isinstance(value, (type, types.BuiltinFunctionType, np.dtype)):
-            self.words("named", getattr(value, "__qualname__", value))
-        elif dataclasses.is_dataclass(value):
-            self.words("object", type(value).__qualname__)
-            for field in dataclasses.fields(value):
-                self.words(field.name)
-                self.add(getattr(value, field.name, None))
-        elif not jax.tree_util.all_leaves([value]):
-            self.words("object", type(value).__qualname__)
-            self.add(jax.tree.leaves(value))
-        elif callable(value):
-            self.words("named", type(value).__qualname__, getattr(value, "__qualname__", ""))
-        else:
-            self.words(type(value).__qualname__, _ADDRESS.sub("", str(value)))
+            return "program", (inner,)
+        if isinstance(params, Mapping):  # an operation that contains programs itself: `jax.lax.custom_root`
+            return "operation", (name, params)
+        if self.code is not None and hasattr(value, "callback_func"):  # `jax.pure_callback`, `io_callback`
+            return "called back", (self.code(value.callback_func),)
+        if isinstance(value, (type, types.BuiltinFunctionType, np.dtype)):
+            return "named", (str(getattr(value, "__qualname__", value)),)
+        if dataclasses.is_dataclass(value):
+            return "object", (name, {x.name: getattr(value, x.name, None) for x in dataclasses.fields(value)})
+        if not jax.tree_util.all_leaves([value]):
+            return "object", (name, jax.tree.leaves(value))
+        if callable(value):
+            return "named", (name, str(getattr(value, "__qualname__", "")))
+        return name, (_ADDRESS.sub("", str(value)),)
 
     def program(self, program: Any) -> None:
         """Operations in their order; variables are identified by the position at which they were computed."""
@@ -122,15 +115,11 @@ class _Hash:
                 else:
                     self.words(numbers.setdefault(v, len(numbers)), v.aval)
 
-        self.words("program")
         name((*program.constvars, *program.invars))
         self.add(tuple(constants))
         for equation in program.eqns:
             self.words(equation.primitive.name)
             name(equation.invars)
-            for key, value in sorted(equation.params.items()):
-                if key not in _NOT_COMPUTED:
-                    self.words(key)
-                    self.add(value)
+            self.add({key: x for key, x in sorted(equation.params.items()) if key not in _NOT_COMPUTED})
             name(equation.outvars)
         name(program.outvars)

@@ -187,114 +187,112 @@ def _each(f: Callable[..., int], *xs: np.ndarray) -> np.ndarray:
 _name_of = functools.cache(str)  # of a dtype; NumPy would build the name anew each time
 
 
-def _operation(equation: Equation, xs: list[np.ndarray], graph: Graph) -> list[np.ndarray]:
+Each = Callable[..., np.ndarray]
+"""(operation, arrays of nodes, dtype of the result) -> nodes."""
+
+Number = Callable[..., np.ndarray]
+"""(value, dtype) -> the node of a constant."""
+
+# Operations that consist of others.
+_COMPOSED: dict[str, Callable[..., np.ndarray]] = {
+    "neg": lambda each, number, x: each("neg", x),
+    "ceil": lambda each, number, x: each("neg", each("floor", each("neg", x))),
+    "sign": lambda each, number, x: each(
+        "select",
+        each("gt", x, number(0.0), dtype="bool"),
+        number(1.0),
+        each("select", each("lt", x, number(0.0), dtype="bool"), number(-1.0), x),
+    ),
+    "logistic": lambda each, number, x: each("div", number(1.0), each("add", number(1.0), each("exp", each("neg", x)))),
+    "square": lambda each, number, x: each("mul", x, x),
+    # in JAX 0.12, in the derivative of tanh
+    "one_minus_square": lambda each, number, x: each("mul", each("sub", number(1.0), x), each("add", number(1.0), x)),
+    "rsqrt": lambda each, number, x: each("div", number(1.0), each("sqrt", x)),
+    "clamp": lambda each, number, low, x, high: each("min", each("max", x, low), high),
+}
+
+# Operations that only move scalars: (parameters, shape of the result, inputs) -> results.
+_MOVES: dict[str, Callable[..., Sequence[np.ndarray]]] = {
+    **dict.fromkeys(_SAME, lambda params, shape, *xs: xs),
+    **dict.fromkeys(("reshape", "squeeze"), lambda params, shape, x: [x.reshape(shape)]),
+    "concatenate": lambda params, shape, *xs: [np.concatenate(xs, axis=params["dimension"])],
+    "stack": lambda params, shape, *xs: [np.stack(xs, axis=params["axis"])],
+    "unstack": lambda params, shape, x: [*np.moveaxis(x, params["axis"], 0)],
+    "split": lambda params, shape, x: np.split(x, np.cumsum(params["sizes"])[:-1], axis=params["axis"]),
+    "transpose": lambda params, shape, x: [np.transpose(x, params["permutation"])],
+    "rev": lambda params, shape, x: [np.flip(x, params["dimensions"])],
+    "slice": lambda params, shape, x: [
+        x[tuple(map(slice, params["start_indices"], params["limit_indices"], params["strides"] or (1,) * x.ndim))]
+    ],
+    "broadcast_in_dim": lambda params, shape, x: [_broadcast(x, params["broadcast_dimensions"], shape)],
+    "pad": lambda params, shape, x, value: [_padded(x, value, params["padding_config"], shape)],
+}
+
+
+def _operation(equation: Equation, xs: list[np.ndarray], graph: Graph) -> Sequence[np.ndarray]:
     name, params, aval = equation.primitive.name, equation.params, equation.outvars[0].aval
     name = "add" if name == "add_any" else name
+    if name in _MOVES:
+        return _MOVES[name](params, aval.shape, *xs)
     dtype = _name_of(aval.dtype)
     x_dtype = _name_of(equation.invars[0].aval.dtype) if equation.invars else dtype
 
     def each(operation: str, *ys: np.ndarray, dtype: str = dtype) -> np.ndarray:
         return _each(lambda *numbers: graph.apply(operation, numbers, dtype), *ys)
 
-    moved = _moved(name, params, xs, aval.shape)
-    if moved is not None:
-        return moved
+    def number(value: Any, dtype: str = dtype) -> np.ndarray:
+        return np.array(graph.constant(value, dtype), np.int64)
+
     if name == "convert_element_type" and dtype in DTYPES and x_dtype not in DTYPES:
         return [_each(lambda v: graph.constant(v, dtype), xs[0])]  # integers are constants here
     if x_dtype not in DTYPES or dtype not in DTYPES:
         raise NotScalarError(f"{name} of {x_dtype}")
-    number = functools.partial(_full, (), graph=graph, dtype=dtype)
+    if name in _COMPOSED:
+        return [_COMPOSED[name](each, number, *xs)]
     match name:
         case "eq" | "ne" if x_dtype == "bool":  # as in jnp.mod, to check whether two signs differ
             differ = each("xor", *xs)
-            return [differ if name == "ne" else each("xor", differ, _full((), True, graph, "bool"))]
-        case "convert_element_type" if dtype == x_dtype:
-            return [xs[0]]
-        case "neg":
-            return [each(name, xs[0])]
-        case "ceil":
-            return [each("neg", each("floor", each("neg", xs[0])))]
+            return [differ if name == "ne" else each("xor", differ, number(True))]
+        case "convert_element_type" if dtype in FLOATS or dtype == x_dtype:
+            return [xs[0] if dtype == x_dtype else each("convert", xs[0])]
         case "round":
-            to_even = params["rounding_method"] == RoundingMethod.TO_NEAREST_EVEN
-            return [_rounded(xs[0], to_even, each, graph, dtype)]
-        case "sign":
-            positive, negative = (each(x, xs[0], number(0.0), dtype="bool") for x in ("gt", "lt"))
-            return [each("select", positive, number(1.0), each("select", negative, number(-1.0), xs[0]))]
-        case "logistic":
-            return [each("div", number(1.0), each("add", number(1.0), each("exp", each("neg", xs[0]))))]
-        case "square":
-            return [each("mul", xs[0], xs[0])]
-        case "one_minus_square":  # in JAX 0.12, in the derivative of tanh
-            return [each("mul", each("sub", number(1.0), xs[0]), each("add", number(1.0), xs[0]))]
+            return [_rounded(xs[0], params["rounding_method"] == RoundingMethod.TO_NEAREST_EVEN, each, number)]
         case "integer_pow":
             return [_power(xs[0], params["y"], each, number(1.0))]
-        case "rsqrt":
-            return [each("div", number(1.0), each("sqrt", xs[0]))]
         case "is_finite":
-            return [each("lt", each("abs", xs[0], dtype=x_dtype), _full((), np.inf, graph, x_dtype))]
+            return [each("lt", each("abs", xs[0], dtype=x_dtype), number(np.inf, x_dtype))]
         case "not" if dtype == "bool":
-            return [each("xor", xs[0], _full((), True, graph, "bool"))]
+            return [each("xor", xs[0], number(True))]
         case "select_n" if len(xs) == 3 and x_dtype == "bool":
             return [each("select", xs[0], xs[2], xs[1])]
-        case "clamp":
-            return [each("min", each("max", xs[1], xs[0]), xs[2])]
-        case "convert_element_type" if dtype in FLOATS:
-            return [each("convert", xs[0])]
         case "reduce_sum":
             return [_reduced("add", xs[0], params["axes"], each, number(0.0))]
         case "reduce_max" | "reduce_min" | "reduce_prod" | "reduce_and" | "reduce_or" if xs[0].size:
             return [_reduced(_OF_MANY[name], xs[0], params["axes"], each)]
-    if name in LOGIC and dtype == "bool":
-        return [each(name, *xs)]
-    if name in COMPARISONS and x_dtype in FLOATS:
-        return [each(name, *xs)]
-    of_one_type = dtype in FLOATS and all(_name_of(v.aval.dtype) == dtype for v in equation.invars)
-    if of_one_type and name in ARITHMETIC | SIMPLE | LIBRARY:
+    is_float = dtype in FLOATS and all(_name_of(v.aval.dtype) == dtype for v in equation.invars)
+    if (
+        (name in LOGIC and dtype == "bool")
+        or (name in COMPARISONS and x_dtype in FLOATS)
+        or (name in ARITHMETIC | SIMPLE | LIBRARY and is_float)
+    ):
         return [each(name, *xs)]
     raise NotScalarError(f"{name} of {x_dtype}")
 
 
-def _moved(name: str, params: Any, xs: list[np.ndarray], shape: tuple[int, ...]) -> list[np.ndarray] | None:
-    """The results of an operation that only moves scalars; None for other operations."""
-    x = xs[0] if xs else np.empty(0)
-    match name:
-        case _ if name in _SAME:
-            return xs
-        case "reshape" | "squeeze":
-            return [x.reshape(shape)]
-        case "broadcast_in_dim":
-            kept = [shape[d] if d in params["broadcast_dimensions"] else 1 for d in range(len(shape))]
-            places = dict(zip(params["broadcast_dimensions"], x.shape, strict=True))
-            return [np.broadcast_to(x.reshape([places.get(d, 1) for d in range(len(kept))]), shape)]
-        case "concatenate":
-            return [np.concatenate(xs, axis=params["dimension"])]
-        case "stack":
-            return [np.stack(xs, axis=params["axis"])]
-        case "unstack":
-            return [np.take(x, i, axis=params["axis"]) for i in range(x.shape[params["axis"]])]
-        case "split":
-            return list(np.split(x, np.cumsum(params["sizes"])[:-1], axis=params["axis"]))
-        case "transpose":
-            return [np.transpose(x, params["permutation"])]
-        case "rev":
-            return [np.flip(x, params["dimensions"])]
-        case "slice":
-            steps = params["strides"] or (1,) * x.ndim
-            return [x[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]]
-        case "pad":
-            out = np.full(shape, xs[1], dtype=x.dtype)
-            places = [low + (1 + step) * np.arange(n) for n, (low, _, step) in zip(x.shape, params["padding_config"])]
-            kept = [(0 <= at) & (at < n) for at, n in zip(places, shape)]  # negative padding removes elements
-            out[np.ix_(*(at[k] for at, k in zip(places, kept)))] = x[np.ix_(*kept)]
-            return [out]
-    return None
+def _broadcast(x: np.ndarray, dimensions: Sequence[int], shape: tuple[int, ...]) -> np.ndarray:
+    sizes = dict(zip(dimensions, x.shape, strict=True))
+    return np.broadcast_to(x.reshape([sizes.get(d, 1) for d in range(len(shape))]), shape)
 
 
-def _full(shape: Sequence[int], value: Any, graph: Graph, dtype: str) -> np.ndarray:
-    return np.full(shape, graph.constant(value, dtype), dtype=np.int64)
+def _padded(x: np.ndarray, value: np.ndarray, padding: Any, shape: tuple[int, ...]) -> np.ndarray:
+    out = np.full(shape, value, dtype=x.dtype)
+    places = [low + (1 + step) * np.arange(n) for n, (low, _, step) in zip(x.shape, padding)]
+    kept = [(0 <= at) & (at < n) for at, n in zip(places, shape)]  # negative padding removes elements
+    out[np.ix_(*(at[k] for at, k in zip(places, kept)))] = x[np.ix_(*kept)]
+    return out
 
 
-def _power(x: np.ndarray, y: int, each: Callable[..., np.ndarray], one: np.ndarray) -> np.ndarray:
+def _power(x: np.ndarray, y: int, each: Each, one: np.ndarray) -> np.ndarray:
     power, factor, n = one, x, abs(y)
     while n:
         if n & 1:
@@ -303,21 +301,18 @@ def _power(x: np.ndarray, y: int, each: Callable[..., np.ndarray], one: np.ndarr
     return power if y >= 0 else each("div", one, power)
 
 
-def _rounded(x: np.ndarray, to_even: bool, each: Callable[..., np.ndarray], graph: Graph, dtype: str) -> np.ndarray:
+def _rounded(x: np.ndarray, to_even: bool, each: Each, number: Number) -> np.ndarray:
     """The nearest integer; halves are rounded to even, or else away from zero."""
-    half, one = _full((), 0.5, graph, dtype), _full((), 1.0, graph, dtype)
     below = each("floor", x)
-    rest, halved = each("sub", x, below), each("mul", half, below)
+    rest, halved = each("sub", x, below), each("mul", number(0.5), below)
     even = each("eq", halved, each("floor", halved), dtype="bool")
-    down = even if to_even else each("lt", x, _full((), 0.0, graph, dtype), dtype="bool")
-    down = each("and", each("eq", rest, half, dtype="bool"), down, dtype="bool")
-    down = each("or", each("lt", rest, half, dtype="bool"), down, dtype="bool")
-    return each("select", down, below, each("add", below, one))
+    down = even if to_even else each("lt", x, number(0.0), dtype="bool")
+    down = each("and", each("eq", rest, number(0.5), dtype="bool"), down, dtype="bool")
+    down = each("or", each("lt", rest, number(0.5), dtype="bool"), down, dtype="bool")
+    return each("select", down, below, each("add", below, number(1.0)))
 
 
-def _reduced(
-    operation: str, x: np.ndarray, axes: Iterable[int], each: Callable[..., np.ndarray], *first: np.ndarray
-) -> np.ndarray:
+def _reduced(operation: str, x: np.ndarray, axes: Iterable[int], each: Each, *first: np.ndarray) -> np.ndarray:
     for axis in sorted(axes, reverse=True):
         x = functools.reduce(lambda a, b: each(operation, a, b), [*first, *np.moveaxis(x, axis, 0)])
     return x

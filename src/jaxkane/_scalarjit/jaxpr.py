@@ -40,19 +40,16 @@ def is_small(equation: Equation) -> bool:
     return length <= _LONGEST and length * equation.outvars[0].aval.size <= _LARGEST
 
 
-def sum_of_products(equation: Equation, x: Array, y: Array) -> Array:
-    """The result of a `dot_general`, over (batch, free axes of x, free axes of y)."""
-    contracted, batch = equation.params["dimension_numbers"]
-    x, y = (_ordered(jnp.asarray(z), along, over) for z, along, over in zip((x, y), contracted, batch, strict=True))
+def sum_of_products(equation: Equation, *xs: Array) -> Array:
+    """The result of a `dot_general` of two arrays, over (batch, free axes of the first, free axes of the second)."""
+    factors = []
+    for x, contracted, batch in zip(xs, *equation.params["dimension_numbers"], strict=True):
+        free = [i for i in range(x.ndim) if i not in (*contracted, *batch)]
+        sizes = [math.prod(x.shape[i] for i in axes) for axes in (batch, free, contracted)]
+        factors.append(jnp.transpose(jnp.asarray(x), (*batch, *free, *contracted)).reshape(sizes))
+    x, y = factors
     aval = equation.outvars[0].aval
     return jnp.sum(x[:, :, None, :] * y[:, None, :, :], axis=-1).reshape(aval.shape).astype(aval.dtype)
-
-
-def _ordered(x: Array, contracted: tuple[int, ...], batch: tuple[int, ...]) -> Array:
-    """x with the axes (batch, free, contracted)."""
-    free = [i for i in range(x.ndim) if i not in (*contracted, *batch)]
-    sizes = [math.prod(x.shape[i] for i in axes) for axes in (batch, free, contracted)]
-    return jnp.transpose(x, (*batch, *free, *contracted)).reshape(sizes)
 
 
 # Operations that one compiled function may contain: elementwise work and moving of scalars. Calls into libraries
@@ -108,10 +105,18 @@ class _UniqueEquations:
         inner = None if self.keeps_solutions and is_solution(equation) else opened(equation)
         if inner is not None:
             return self.walk(inner, xs)
-        # Numbers are compared by their bits, all else by identity.
-        key = (equation.primitive, *(_bits(x) if is_literal(x) else id(x) for x in xs), _parameters_of(equation))
+        # Numbers are compared by their bits (-0.0 == 0.0, and the text of an array is rounded), all else by identity.
+        of_xs = [(np.asarray(x.val).tobytes(), str(x.aval)) if is_literal(x) else id(x) for x in xs]
+        key = (equation.primitive, *of_xs, _parameters_of(equation))
         if key not in self._known:
-            self._known[key] = self._put_down(equation, xs)
+            if equation.primitive.name == "dot_general" and is_small(equation):
+                product = functools.partial(sum_of_products, equation)
+                specs = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in xs]
+                self._known[key] = self.walk(jax.make_jaxpr(product)(*specs), xs)
+            else:
+                outputs = [*map(new_variable, equation.outvars)]  # a program may be opened twice
+                self.equations.append(equation.replace(invars=xs, outvars=outputs))
+                self._known[key] = outputs
         return self._known[key]
 
     def constant(self, variable: Variable, value: Any) -> Any:
@@ -122,19 +127,6 @@ class _UniqueEquations:
             self._known[key] = [new_variable(variable)]
             self.consts[self._known[key][0]] = value  # keeps the value alive, so that its id stays unique
         return self._known[key][0]
-
-    def _put_down(self, equation: Equation, xs: list[Any]) -> Sequence[Any]:
-        if equation.primitive.name == "dot_general" and is_small(equation):
-            specs = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in xs]
-            product = jax.make_jaxpr(functools.partial(sum_of_products, equation))(*specs)
-            return self.walk(product, xs)
-        outputs = [*map(new_variable, equation.outvars)]  # a program may be opened twice
-        self.equations.append(equation.replace(invars=xs, outvars=outputs))
-        return outputs
-
-
-def _bits(literal: Any) -> tuple[bytes, str]:
-    return np.asarray(literal.val).tobytes(), str(literal.aval)  # -0.0 == 0.0, and the text of an array is rounded
 
 
 def _parameters_of(equation: Equation) -> Any:
@@ -237,27 +229,20 @@ class Solved(NamedTuple):
         return cls(only(range(n - 1), [*inputs, x]), only([n - 1], [*inputs, r]))
 
 
-class _TangentRule(NamedTuple):
-    """The replacement of an equation in a derivative.
-
-    - `program`: (inputs, tangents of the differentiated ones) -> the nonzero tangents of the results.
-    - `given`: which results have a nonzero tangent.
-    """
-
-    program: ClosedJaxpr
-    given: tuple[bool, ...]
-
-
 _rules = Cache(4096)
 
 
-def _tangent_rule(equation: Equation, differentiated: tuple[bool, ...]) -> _TangentRule:
-    """JAX's rule for an equation with these differentiated inputs, traced once for all equal equations."""
+def _tangent_rule(equation: Equation, differentiated: tuple[bool, ...]) -> tuple[ClosedJaxpr, tuple[bool, ...]]:
+    """JAX's rule for an equation with these differentiated inputs, traced once for all equal equations.
+
+    **Returns:** a program (inputs, tangents of the differentiated ones) -> the nonzero tangents of the results, and
+    which results have one.
+    """
     types = tuple((v.aval.shape, v.aval.dtype, v.aval.weak_type) for v in equation.invars)
     parameters = _parameters_of(equation)
     key = (equation.primitive, parameters, differentiated, types, settings())
 
-    def make() -> _TangentRule:
+    def make() -> tuple[ClosedJaxpr, tuple[bool, ...]]:
         given: list[bool] = []
 
         def tangents(*values: Any) -> list[Any]:
@@ -268,7 +253,7 @@ def _tangent_rule(equation: Equation, differentiated: tuple[bool, ...]) -> _Tang
 
         avals = [v.aval for v in equation.invars]
         of_tangents = [aval for aval, d in zip(avals, differentiated, strict=True) if d]
-        return _TangentRule(program_of(tangents, *specs_of([*avals, *of_tangents])), tuple(given))
+        return program_of(tangents, *specs_of([*avals, *of_tangents])), tuple(given)
 
     return make() if isinstance(parameters, int) else _rules.get(key, make)
 
@@ -374,7 +359,8 @@ def jacobian(
         slopes = iter([_read(v, along, sparse) for v in jaxpr.outvars])
         pairs = zip(has_tangent, avals[1], strict=True)
         outputs = [(next(slopes) if has else np.full(aval.shape, NOTHING), aval) for has, aval in pairs]
-        columns.append([sparse.instantiated(x, str(aval.dtype)) for x, aval in outputs])
+        zeros = [graph.constant(0.0, str(aval.dtype)) for _, aval in outputs]
+        columns.append([np.where(x == NOTHING, zero, x) for zero, (x, _) in zip(zeros, outputs, strict=True)])
     return [
         np.stack([column[i] for column in columns], axis=-1) if columns else np.zeros((*aval.shape, 0), np.int64)
         for i, aval in enumerate(avals[1])
@@ -412,6 +398,3 @@ class _SparseGraph:
                     return NOTHING
             operands = tuple(self.graph.constant(0.0, dtype) if i == NOTHING else i for i in operands)
         return self.graph.apply(operation, operands, dtype)
-
-    def instantiated(self, nodes: np.ndarray, dtype: str) -> np.ndarray:
-        return np.where(nodes == NOTHING, self.graph.constant(0.0, dtype), nodes)

@@ -111,7 +111,9 @@ def _with_rough_zero(
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _zero_until(order: int, rough: Array, zero: Array, point: list[Array]) -> Array:
     """Zero; its derivatives are zero below this order and NaN from this order on, where `rough`."""
-    return jnp.where(_never(*point), jnp.nan, zero)
+    # Never true, but batched if any of `point` is. Primal and tangent must have the same batch axes in a `while_loop`.
+    never = functools.reduce(jnp.logical_or, [jnp.any(jnp.isnan(x)) for x in point], jnp.array(False)) & False
+    return jnp.where(never, jnp.nan, zero)
 
 
 @functools.partial(_zero_until.defjvp, symbolic_zeros=True)
@@ -123,12 +125,6 @@ def _(order: int, primals: PyTree, tangents: PyTree) -> PyTree:
     if order == 1:
         return y, jnp.where(rough, nan_if_moved(moving, point, zero), zero)
     return y, _zero_until(order - 1, rough, zero, point) * sum(map(jnp.sum, moving), zero)
-
-
-def _never(*points: Array) -> Array:
-    """Always False, but batched if any of `points` is. Primal and tangent must have the same batch axes inside a
-    `while_loop`."""
-    return functools.reduce(jnp.logical_or, [jnp.any(jnp.isnan(x)) for x in points], jnp.array(False)) & False
 
 
 def nan_if_moved(tangents: list[Array], point: list[Array], like: Array) -> Array:

@@ -258,7 +258,7 @@ class Program:
         except NotScalarError as error:
             self._warn_not_scalar(error)
         except (RuntimeError, OSError, MemoryError) as error:  # LLVM raises RuntimeError
-            native.tell(f"LLVM fails at {self.label}: {type(error).__name__}: {str(error)[:300]}")
+            native.warn_not_native(f"LLVM fails at {self.label}: {type(error).__name__}: {str(error)[:300]}")
         return None
 
     def _warn_not_scalar(self, error: NotScalarError) -> None:

@@ -29,7 +29,7 @@ from .._version import __version__
 from ..estimate import Belief, Filter, predict, update
 from ..estimate._filter import sensed
 from ..estimate._process_noise import MODES
-from ._source import COMPARE, C, CText, in_comment, variable_units
+from ._source import COMPARE, C, CText, in_comment, sections_of, variable_units
 
 
 class ExportedFilter(NamedTuple):
@@ -106,7 +106,8 @@ class _FilterText(CText):
 
     def __init__(self, filter: Filter, belief: Belief, name: str, dtype: str):
         self.filter, self.belief, system = filter, belief, filter.system
-        more = {"all_rates": Function(("rate",), all_rates), "sensed": Function(("z",), self._sensed)}
+        more = {"all_rates": Function(("rate",), all_rates)}
+        more["sensed"] = Function(("z",), lambda system, *args: (sensed(system, filter.sensors, *args[:-1]),))
         more["weights"] = Function(("weight",), lambda system, t, q, *_: (coordinate_weights(system, t, q),))
         formulas = Formulas(system, dtype, more)
         super().__init__(formulas, name)
@@ -118,9 +119,6 @@ class _FilterText(CText):
         self.estimated += [of_parameter[name] for name in filter.parameters]
         places = [(len(formulas.arguments), i, len(filter.noise)) for i in range(len(filter.noise))]
         self.noise = [formulas.graph.add("input", place, formulas.dtype) for place in places]
-
-    def _sensed(self, system, t, q, u, w, _):
-        return (sensed(system, self.filter.sensors, t, q, u, w),)
 
     def _words(self, is_disturbed: bool) -> dict[int, str]:
         """The C expressions of input nodes: the estimated state is in v, inputs are in w, all others in *p."""
@@ -175,16 +173,15 @@ class _FilterText(CText):
 
     def _function(self, function: str, outputs: dict[str, np.ndarray]) -> str:
         is_disturbed = function == "rates" and self.filter.method == "unscented"
-        read = ("t", "v", "w", *(["e"] if is_disturbed else []))
+        arguments = [f"{self.type} t", *(f"const {self.type} *{x}" for x in ("v", "w", *["e"] * is_disturbed))]
+        arguments.append(f"const {self.name}_parameters *p")
         try:
-            body = self.body((*read, "p"), outputs, self._words(is_disturbed))
+            text = self.function(f"{self.name}_{function}", arguments, outputs, self._words(is_disturbed))
         except NotScalarError as error:
             raise ValueError(
                 f"{self.formulas.name}: the filter cannot be written in C, because it contains {error}."
             ) from None
-        arguments = ", ".join([f"{self.type} t", *(f"const {self.type} *{word}" for word in read[1:])])
-        arguments += f", const {self.name}_parameters *p" + "".join(f", {self.type} *{output}" for output in outputs)
-        return f"static inline void {self.name}_{function}({arguments}) {body}"
+        return f"static inline {text}"
 
     def header(self) -> str:
         formulas, filter = self.formulas, self.filter
@@ -277,10 +274,7 @@ class _FilterText(CText):
 
 
 def _template(*sections: str) -> Template:
-    """Sections of `filter_template.h`. Each section follows a line `// name`."""
-    text = (Path(__file__).parent / "filter_template.h").read_text(encoding="utf-8")
-    parts = re.split(r"^// (\w+)\n", text, flags=re.MULTILINE)
-    by_name = dict(zip(parts[1::2], parts[2::2], strict=True))
+    by_name = sections_of("filter_template.h")
     return Template("".join(by_name[name] for name in sections))
 
 

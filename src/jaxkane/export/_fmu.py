@@ -11,7 +11,7 @@ import tempfile
 import uuid
 import warnings
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
@@ -88,7 +88,6 @@ def fmu(
     kinds = (kind,) if isinstance(kind, str) else tuple(kind)
     path = _checked(system, path, fmi, kinds, step)
     model = _model(system, path, step, state)
-    _refuse_unprintable(model)
     # The token depends on the contents only, so that equal systems give equal files.
     contents = model.source(fmi, "") + model_description(model, fmi, kinds, "", sources)
     token = str(uuid.uuid5(uuid.NAMESPACE_URL, contents))
@@ -117,33 +116,31 @@ def _checked(system: System, path: str | Path, fmi: str, kinds: tuple[str, ...],
     """The path, after checks of the arguments and of what an FMU can contain."""
     check_is_system(system)
     name, path = type(system).__name__, Path(path)
-    if path.suffix != ".fmu":
-        raise ValueError(f"`path` must end with .fmu, e.g. 'generated/bicycle.fmu'; got {str(path)!r}.")
-    if fmi not in VERSIONS:
-        raise ValueError(f"`fmi` must be {' or '.join(map(repr, VERSIONS))}, got {fmi!r}.")
-    if not kinds:
-        raise ValueError(f"`kind` is empty. Pass some of {', '.join(map(repr, KINDS))}.")
     refuse_unknown(kinds, KINDS, "fmu: there is no kind")
-    if not 0 < real_number(step, "fmu: `step`") < np.inf:
-        raise ValueError(f"fmu: `step` [s] must be positive and finite, got {step!r}.")
+    step = real_number(step, "fmu: `step`")
     if not is_concrete(system):
         raise TypeError(f"{name} is traced. Call this function outside of jax.jit, vmap and grad.")
-    if batched := in_batches(system):
-        raise ValueError(f"{name} is a batch: {', '.join(batched)} has additional leading axes. Pass one member of it.")
-    if not system.coordinates and not system.states:
-        raise ValueError(f"{name} has no coordinates and no first-order states, so an FMU would have no states.")
-    if has_contacts(system):
-        raise ValueError(
-            f"{name}: an FMU cannot represent contacts: {', '.join(layout_of(system).names)}. Replace them by spring "
-            "forces in `loads`, or by events with `then`."
-        )
-    if has_multipliers(system):
-        raise ValueError(f"{name}: an FMU cannot represent multipliers. Export the system with dependent speeds.")
-    if not is_written_out(len(system.speeds)):
-        raise ValueError(
-            f"{name}: an FMU supports at most 12 independent speeds, and this system has {len(system.speeds)}. "
-            "jaxkane.export.stablehlo supports any number."
-        )
+    batched, contacts = in_batches(system), layout_of(system).names if has_contacts(system) else ()
+    refused = {
+        f"`path` must end with .fmu, e.g. 'generated/bicycle.fmu'; got {str(path)!r}.": path.suffix != ".fmu",
+        f"`fmi` must be {' or '.join(map(repr, VERSIONS))}, got {fmi!r}.": fmi not in VERSIONS,
+        f"`kind` is empty. Pass some of {', '.join(map(repr, KINDS))}.": not kinds,
+        f"fmu: `step` [s] must be positive and finite, got {step!r}.": not 0 < step < np.inf,
+        f"{name} is a batch: {', '.join(batched)} has additional leading axes. Pass one member of it.": batched,
+        f"{name} has no coordinates and no first-order states, so an FMU would have no states.": not (
+            system.coordinates or system.states
+        ),
+        f"{name}: an FMU cannot represent contacts: {', '.join(contacts)}. Replace them by spring forces in `loads`, "
+        "or by events with `then`.": contacts,
+        f"{name}: an FMU cannot represent multipliers. Export the system with dependent speeds.": has_multipliers(
+            system
+        ),
+        f"{name}: an FMU supports at most 12 independent speeds, and this system has {len(system.speeds)}. "
+        "jaxkane.export.stablehlo supports any number.": not is_written_out(len(system.speeds)),
+    }
+    for message, is_wrong in refused.items():
+        if is_wrong:
+            raise ValueError(message)
     return path
 
 
@@ -156,49 +153,34 @@ def _model(system: System, path: Path, step: float, state: State | None) -> FMUM
     except ValueError as error:
         raise ValueError(f"fmu: there are no start values. {error} Pass other values as `state`.") from error
     with jax.enable_x64(True):
-        return FMUModel(system, start, name, step)
-
-
-def _refuse_unprintable(model: FMUModel) -> None:
-    """XML cannot contain control characters, and names of variables no line breaks."""
-    for x in model.variables:
-        for text in (x.name, x.unit):
-            wrong = [letter for letter in text if not (letter.isprintable() or letter == " ")]
-            if wrong:
-                raise ValueError(
-                    f"{model.formulas.name}: {text!r} contains {wrong[0]!r}, which an FMU cannot contain. Rename it."
-                )
+        model = FMUModel(system, start, name, step)
+    # XML cannot contain control characters, and names of variables no line breaks.
+    for text in (text for x in model.variables for text in (x.name, x.unit)):
+        if not text.isprintable():
+            raise ValueError(f"{model.formulas.name}: an FMU cannot contain the name or unit {text!r}. Rename it.")
+    return model
 
 
 def _compiled(source: str, name: str) -> tuple[bytes | None, str]:
     """A shared library, or None and the reason."""
-    compilers = [*_compilers()]
-    if not compilers:
+    command = shlex.split(os.environ.get("CC", "")) or [x for x in ("cc", "gcc", "clang") if shutil.which(x)][:1]
+    if not command:
         return None, "There is no C compiler ($CC, cc, gcc or clang)."
     with tempfile.TemporaryDirectory() as folder:
         file, target = Path(folder) / f"{name}.c", Path(folder) / f"{name}{_suffix()}"
         file.write_text(source, encoding="utf-8")
         options = ["-std=c99", "-O2", "-shared", "-fvisibility=hidden", "-ffp-contract=off"]
         options += [] if os.name == "nt" else ["-fPIC"]
-        command = [*compilers[0], *options, str(file), "-o", str(target), "-lm"]
+        command = [*command, *options, str(file), "-o", str(target), "-lm"]
         try:
             run = subprocess.run(command, capture_output=True, text=True, check=False)
         except OSError as error:
-            return None, f"The C compiler {compilers[0][0]!r} cannot be run: {error.strerror}."
+            return None, f"The C compiler {command[0]!r} cannot be run: {error.strerror}."
         if run.returncode or not target.exists():
             lines = [line for line in run.stderr.splitlines() if "error" in line] or run.stderr.splitlines()
             reason = f": {lines[0].strip()}" if lines else f" (status {run.returncode})"
-            return None, f"The C compiler {compilers[0][0]!r} failed{reason}."
+            return None, f"The C compiler {command[0]!r} failed{reason}."
         return target.read_bytes(), ""
-
-
-def _compilers() -> Iterator[list[str]]:
-    """Commands of C compilers that exist, the preferred one first."""
-    if command := shlex.split(os.environ.get("CC", "")):
-        yield command
-    for name in ("cc", "gcc", "clang"):
-        if shutil.which(name):
-            yield [name]
 
 
 def _suffix() -> str:

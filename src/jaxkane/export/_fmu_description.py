@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -25,49 +26,43 @@ def model_description(model: FMUModel, fmi: str, kinds: Sequence[str], token: st
     - `token`: the text that identifies this version of the FMU.
     - `has_sources`: whether the FMU contains its source. Only FMI 2.0 lists the source in this file.
     """
-    is_2, variables = fmi == "2.0", model.variables
+    is_2, variables, has_exchange = fmi == "2.0", model.variables, "model exchange" in kinds
     root = ElementTree.Element("fmiModelDescription", fmiVersion=fmi, modelName=model.formulas.name)
     root.set("guid" if is_2 else "instantiationToken", token)
-    if text := _first_line(model):
-        root.set("description", text)
+    # The first line of the docstring. Python gives a dataclass without one its signature.
+    text = (type(model.formulas.system).__doc__ or "").strip()
+    if text and not text.startswith(f"{model.formulas.name}("):
+        root.set("description", " ".join(text.partition("\n\n")[0].split()))
     root.set("generationTool", f"jaxkane {__version__}")
     root.set("variableNamingConvention", "structured" if all(map(_is_structured, variables)) else "flat")
-    if is_2 and "model exchange" in kinds:
+    if is_2 and has_exchange:
         root.set("numberOfEventIndicators", str(len(model.g)))
     for kind, tag in KINDS.items():
         if kind in kinds:
-            element = ElementTree.SubElement(root, tag, {"modelIdentifier": model.name} | _capabilities(kind, fmi))
+            element = _element(root, tag, modelIdentifier=model.name, **_capabilities(kind, fmi))
             if is_2 and has_sources:
-                files = ElementTree.SubElement(element, "SourceFiles")
-                ElementTree.SubElement(files, "File", name=f"{model.name}.c")
+                _element(_element(element, "SourceFiles"), "File", name=f"{model.name}.c")
     _units(root, variables)
-    ElementTree.SubElement(root, "DefaultExperiment", startTime="0", stepSize=_number(model.step))
-    listed = ElementTree.SubElement(root, "ModelVariables")
+    _element(root, "DefaultExperiment", startTime="0", stepSize=_number(model.step))
+    listed = _element(root, "ModelVariables")
     states = {x.derivative for x in variables} if any(model.events.stages) else set()
     for i, x in enumerate(variables):
         _variable(listed, i, x, fmi, can_jump=i in states)
-    _structure(ElementTree.SubElement(root, "ModelStructure"), variables, fmi, "model exchange" in kinds)
+    _structure(_element(root, "ModelStructure"), variables, fmi, has_exchange)
     return _text(root)
 
 
 def build_description(model: FMUModel) -> str:
     """The text of sources/buildDescription.xml of FMI 3.0."""
     root = ElementTree.Element("fmiBuildDescription", fmiVersion="3.0")
-    configuration = ElementTree.SubElement(root, "BuildConfiguration", modelIdentifier=model.name)
-    files = ElementTree.SubElement(configuration, "SourceFileSet", language="C99")
-    ElementTree.SubElement(files, "SourceFile", name=f"{model.name}.c")
+    configuration = _element(root, "BuildConfiguration", modelIdentifier=model.name)
+    _element(_element(configuration, "SourceFileSet", language="C99"), "SourceFile", name=f"{model.name}.c")
     return _text(root)
 
 
 def _text(root: ElementTree.Element) -> str:
     ElementTree.indent(root)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
-
-
-def _first_line(model: FMUModel) -> str:
-    """The first line of the docstring. Python gives a dataclass without one its signature."""
-    text = (type(model.formulas.system).__doc__ or "").strip()
-    return "" if text.startswith(f"{model.formulas.name}(") else " ".join(text.partition("\n\n")[0].split())
 
 
 def _capabilities(kind: str, fmi: str) -> dict[str, str]:
@@ -80,21 +75,32 @@ def _capabilities(kind: str, fmi: str) -> dict[str, str]:
     return dict.fromkeys(names, "true")
 
 
+def _element(parent: ElementTree.Element, tag: str, **attributes: Any) -> ElementTree.Element:
+    """A new element. Attributes that are None or empty are omitted, except for a list of dependencies."""
+    texts = {name: str(x) for name, x in attributes.items() if name == "dependencies" or x not in (None, "")}
+    return ElementTree.SubElement(parent, tag, texts)
+
+
 def _variable(parent: ElementTree.Element, place: int, x: Variable, fmi: str, can_jump: bool) -> None:
-    common = {"name": x.name, "valueReference": str(place)}
-    common |= {"causality": x.role.causality, "variability": x.role.variability}
-    common |= {"initial": x.role.initial} if x.role.initial else {}
-    common |= {"description": x.description} if x.description else {}
-    of_number = {"unit": x.unit} if x.unit else {}
-    of_number |= {"start": _number(x.start)} if x.start is not None else {}
-    of_number |= {key: _number(b) for key, b in zip(("min", "max"), x.bounds, strict=True) if np.isfinite(b)}
-    of_number |= {"reinit": "true"} if can_jump else {}
-    if fmi == "2.0":  # places are counted from 1
-        of_number |= {"derivative": str(x.derivative + 1)} if x.derivative is not None else {}
-        ElementTree.SubElement(ElementTree.SubElement(parent, "ScalarVariable", common), "Real", of_number)
+    first = int(fmi == "2.0")  # places are counted from 1
+    lower, upper = (_number(bound) if np.isfinite(bound) else None for bound in x.bounds)
+    common = {"name": x.name, "valueReference": place, **x.role._asdict(), "description": x.description}
+    of_number = {
+        "unit": x.unit,
+        "start": None if x.start is None else _number(x.start),
+        "min": lower,
+        "max": upper,
+        "reinit": "true" if can_jump else None,
+        "derivative": None if x.derivative is None else x.derivative + first,
+    }
+    if fmi == "2.0":
+        _element(_element(parent, "ScalarVariable", **common), "Real", **of_number)
     else:
-        of_number |= {"derivative": str(x.derivative)} if x.derivative is not None else {}
-        ElementTree.SubElement(parent, "Float64", common | of_number)
+        _element(parent, "Float64", **common, **of_number)
+
+
+# Lists of unknowns in FMI 2.0, by the elements of FMI 3.0. FMI 2.0 does not list event indicators.
+_LISTS = {"Output": "Outputs", "ContinuousStateDerivative": "Derivatives", "InitialUnknown": "InitialUnknowns"}
 
 
 def _structure(parent: ElementTree.Element, variables: Sequence[Variable], fmi: str, has_indicators: bool) -> None:
@@ -108,26 +114,22 @@ def _structure(parent: ElementTree.Element, variables: Sequence[Variable], fmi: 
         "InitialUnknown": [i for i in sorted(outputs + rates) if variables[i].role.initial != "exact"],
         "EventIndicator": [i for i in places if variables[i].role == LOCAL and i not in rates and has_indicators],
     }
-    if fmi == "2.0":  # it has lists of unknowns, with places that are counted from 1, and none of event indicators
-        names = {"Output": "Outputs", "ContinuousStateDerivative": "Derivatives", "InitialUnknown": "InitialUnknowns"}
-        for tag, name in names.items():
-            if groups[tag]:
-                element = ElementTree.SubElement(parent, name)
-                for i in groups[tag]:
-                    read = {} if tag == "InitialUnknown" else _dependencies(variables[i], i, first=1)
-                    ElementTree.SubElement(element, "Unknown", {"index": str(i + 1)} | read)
-        return
     for tag, group in groups.items():
-        for i in group:
-            # At the start, unknowns also depend on parameters and start values. Without a list, they depend on all.
-            read = {} if tag == "InitialUnknown" else _dependencies(variables[i], i, first=0)
-            ElementTree.SubElement(parent, tag, {"valueReference": str(i)} | read)
+        if fmi == "3.0":
+            for i in group:
+                _element(parent, tag, valueReference=i, **_dependencies(tag, variables[i], i))
+        elif group and tag in _LISTS:  # places are counted from 1
+            unknowns = _element(parent, _LISTS[tag])
+            for i in group:
+                _element(unknowns, "Unknown", index=i + 1, **_dependencies(tag, variables[i], i, first=1))
 
 
-def _dependencies(x: Variable, place: int, first: int) -> dict[str, str]:
-    """The attribute with the places of the variables that determine a variable. A state determines itself."""
+def _dependencies(tag: str, x: Variable, place: int, first: int = 0) -> dict[str, str]:
+    """The attribute with the places of the variables that determine a variable. A state determines itself. At the
+    start, unknowns also depend on parameters and start values. Without a list, they depend on all."""
     places = (place,) if x.dependencies is None else x.dependencies
-    return {"dependencies": " ".join(str(i + first) for i in places)}
+    text = " ".join(str(i + first) for i in places)
+    return {} if tag == "InitialUnknown" else {"dependencies": text}
 
 
 # Units of one letter or name as powers of SI base units.
@@ -172,12 +174,11 @@ def base_units(unit: str) -> dict[str, int] | None:
 
 def _units(root: ElementTree.Element, variables: Sequence[Variable]) -> None:
     """The definitions of units. A unit that is not understood has a name only."""
-    names = sorted({x.unit for x in variables if x.unit})
-    definitions = ElementTree.SubElement(root, "UnitDefinitions")
-    for name in names:
-        element, powers = ElementTree.SubElement(definitions, "Unit", name=name), base_units(name)
+    definitions = _element(root, "UnitDefinitions")
+    for name in sorted({x.unit for x in variables if x.unit}):
+        element, powers = _element(definitions, "Unit", name=name), base_units(name)
         if powers is not None:
-            ElementTree.SubElement(element, "BaseUnit", {k: str(n) for k, n in powers.items() if n})
+            _element(element, "BaseUnit", **{k: n for k, n in powers.items() if n})
 
 
 def _number(x: float) -> str:

@@ -7,9 +7,9 @@ interface (`fmu_2_template.c`, `fmu_3_template.c`).
 
 from __future__ import annotations
 
+import functools
 import re
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from string import Template
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ from .._scalarjit.graph import needed
 from .._system.system import State, System, packed, unit_of
 from .._version import __version__
 from ._filter import all_rates
-from ._source import CText, in_comment, six_a_line, variable_units
+from ._source import CText, in_comment, sections_of, six_a_line, variable_units
 
 
 class Role(NamedTuple):
@@ -207,7 +207,7 @@ class FMUModel(CText):
 
     def source(self, fmi: str, token: str) -> str:
         """The C source for a version of FMI. `token` identifies the FMU."""
-        name, (head, state, variables) = self.formulas.name, _sections("fmu_template.c")
+        name, (_, head, state, variables) = self.formulas.name, sections_of("fmu_template.c").values()
         title = f"{name}: a functional mock-up unit of Kane's equations, written by jaxkane {__version__}."
         text = Template(head).substitute(
             title=in_comment(title),
@@ -224,7 +224,7 @@ class FMUModel(CText):
             moved=len(self.moved),
             singular=self.singular,
         )
-        steps, interface = _file("fmu_steps_template.c"), _file(f"fmu_{fmi[0]}_template.c")
+        steps, interface = (sections_of(f"fmu_{x}_template.c")[""] for x in ("steps", fmi[0]))
         return "\n".join([text, self._arrays(), self._equations(), state, steps, variables, interface])
 
     def _arrays(self) -> str:
@@ -265,18 +265,15 @@ class FMUModel(CText):
         for i in jumps:
             functions[f"jump_{i}"] = self.formulas.nodes(_jump_name(self.events.names[i]))
         texts = self.helpers([nodes for outputs in functions.values() for nodes in outputs.values()])
-        point = "double t, const double *y, const double *w, const double *p"
+        point = ["double t", "const double *y", "const double *w", "const double *p"]
+        direction = ["double dt", "const double *dy", "const double *dw", "const double *dp"]
         for function, outputs in functions.items():
-            arguments, read = point, ["t", "y", "w", "p"]
-            if function == "derivatives_of":
-                arguments += ", double dt, const double *dy, const double *dw, const double *dp"
-                read += ["dt", "dy", "dw", "dp"]
-            arguments += "".join(f", double *{output}" for output in outputs)
-            texts.append(f"static void {function}({arguments}) {self.body(read, outputs, self.input_words)}")
+            arguments = [*point, *(direction if function == "derivatives_of" else ())]
+            texts.append(f"static {self.function(function, arguments, outputs, self.input_words)}")
         lines = ["(void)event, (void)t, (void)w, (void)p;", "memcpy(after, y, N_Y * sizeof(double));"]
         lines += [f"if (event == {i}) jump_{i}(t, y, w, p, after);" for i in jumps]
         body = "\n    ".join(lines)
-        texts.append(f"static void jump_of(int event, {point}, double *after) {{\n    {body}\n}}\n")
+        texts.append(f"static void jump_of(int event, {', '.join(point)}, double *after) {{\n    {body}\n}}\n")
         return "\n".join(texts)
 
 
@@ -289,18 +286,18 @@ def _functions_of(system: System, events: Events, outputs: Sequence[str]) -> dic
         u_dep = dependent_speeds(system, t, q, u) if system.dependent_speeds else ()
         return (jnp.stack([*u_dep, *(values[name] for name in outputs)]),)
 
-    def after_event(event: int) -> Callable[..., Any]:
-        return lambda system, t, q, u, w, _: (after_stages(system, t, _packed(system, q, u, w), event, which)[0],)
+    def after(event: int, system: System, t: Any, q: Any, u: Any, w: Any, _: Any) -> tuple[Any, ...]:
+        return (after_stages(system, t, _packed(system, q, u, w), event, which)[0],)
 
     functions = {"motion": Function(("rate",), all_rates)}
     if outputs or system.dependent_speeds:
         functions["outputs"] = Function(("sensed",), sensed)
     if events.names or system.dependent_speeds:
         functions["events"] = Function(("g", "g_dot", "condition"), _events)
-        functions["event functions"] = Function(("g",), _event_functions)
+        functions["event functions"] = Function(("g",), lambda *args: _events(*args)[:1])
     for i, name in enumerate(events.names):
         if events.stages[i]:
-            functions[_jump_name(name)] = Function(("after",), after_event(i))
+            functions[_jump_name(name)] = Function(("after",), functools.partial(after, i))
     return functions
 
 
@@ -315,12 +312,6 @@ def _events(system, t, q, u, w, _):
         return values.values, values.rates, values.conditions
     rates = jnp.append(values.rates, jnp.zeros((), values.rates.dtype))
     return jnp.append(values.values, values.bound), rates, values.conditions
-
-
-def _event_functions(system, t, q, u, w, _):
-    """Event functions and det C_dep, to be differentiated."""
-    values = event_values(system, t, _packed(system, q, u, w), None)
-    return (jnp.append(values.values, values.bound) if system.dependent_speeds else values.values,)
 
 
 def _jump_name(event: str) -> str:
@@ -355,12 +346,3 @@ def _strings(name: str, texts: Sequence[str]) -> str:
     # A question mark could begin a trigraph.
     literals = ['"' + re.sub(r'(["\\?])', r"\\\1", text) + '"' for text in texts]
     return f"static const char *const {name}[] = {{\n    {six_a_line(literals or ['0'])}\n}};"
-
-
-def _file(name: str) -> str:
-    return (Path(__file__).parent / name).read_text(encoding="utf-8")
-
-
-def _sections(name: str) -> list[str]:
-    """The sections of a template. Each section follows a line `// name`."""
-    return re.split(r"^// \w+\n", _file(name), flags=re.MULTILINE)[1:]

@@ -17,7 +17,7 @@ from .._kane.expression_graph import Formulas
 from .._scalarjit.backends.source import as_objects
 from .._scalarjit.graph import OPERATORS, NotScalarError, needed
 from .._system.system import System
-from ._source import check_function, in_ascii
+from ._source import function_names, in_ascii
 
 
 def casadi(system: System, function: str = "rates", *, name: str | None = None) -> Any:
@@ -46,9 +46,7 @@ def casadi(system: System, function: str = "rates", *, name: str | None = None) 
         import casadi as ca
     except ImportError as error:
         raise ImportError('jaxkane.export.casadi needs CasADi: pip install "jaxkane[casadi]".') from error
-    warn_of_jumps(system, "jaxkane.export.casadi")
-    formulas = Formulas(system)
-    check_function(formulas, function, "casadi")
+    formulas = _checked_formulas(system, "float64", function, "casadi")
     by_output = formulas.nodes(function)
     columns: dict[str, list[Any]] = {kind: [] for kind in ("t", "q", "u", "inputs", "parameters")}
     symbols = {}
@@ -69,6 +67,16 @@ def casadi(system: System, function: str = "rates", *, name: str | None = None) 
     # the form of names that CasADi accepts
     label = re.sub(r"_+", "_", in_ascii(name or f"{formulas.name}_{function}")).strip("_")
     return ca.Function(label, [ca.vertcat(*x) for x in columns.values()], outputs, [*columns], [*by_output])
+
+
+def _checked_formulas(system: System, dtype: str, function: Any, exporter: str) -> Formulas:
+    """The formulas of a system. A value that is not the name of one function is refused."""
+    warn_of_jumps(system, f"jaxkane.export.{exporter}")
+    formulas = Formulas(system, dtype)
+    if not isinstance(function, str):
+        raise TypeError(f"{exporter} exports one function; `function` must be its name, got {function!r}.")
+    function_names(formulas, (function,))
+    return formulas
 
 
 def _matrix(ca: ModuleType, nodes: np.ndarray, objects: dict[int, Any]) -> Any:
@@ -150,14 +158,10 @@ def stablehlo(
             raise ImportError(
                 'To save a program, JAX needs flatbuffers: pip install "jaxkane[stablehlo]". Or omit `path`.'
             ) from error
-    warn_of_jumps(system, "jaxkane.export.stablehlo")
-    formulas = Formulas(system, dtype)
-    check_function(formulas, function, "stablehlo")
-    if isinstance(platforms, str):
-        raise TypeError(f"`platforms` must be a sequence of names, e.g. ({platforms!r},).")
-    unknown = [platform for platform in platforms if platform not in _PLATFORMS]
-    if unknown or not platforms:
-        raise ValueError(f"`platforms` must contain some of {', '.join(_PLATFORMS)}; got {platforms!r}.")
+    formulas = _checked_formulas(system, dtype, function, "stablehlo")
+    if isinstance(platforms, str) or not platforms or not set(_PLATFORMS).issuperset(platforms):
+        kind = TypeError if isinstance(platforms, str) else ValueError
+        raise kind(f"`platforms` must be a sequence of some of {', '.join(_PLATFORMS)}; got {platforms!r}.")
     u_dep = np.zeros(len(formulas.names("u_dep")), formulas.dtype)  # the functions of `OFFERED` do not use them
 
     def of_one_state(t, q, u, inputs, parameters):

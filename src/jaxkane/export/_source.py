@@ -38,13 +38,14 @@ from .._scalarjit.graph import DTYPES, LIBRARY, needed
 from .._system.system import System, unit_of, units_of
 from .._version import __version__
 
+_VECTORS = ("q", "u", "inputs")  # kinds of arguments that are arrays of variables
 _USUAL = ("rates", "equations", "dependent_speeds", *JACOBIANS)
 
 
 def function_names(
     formulas: Formulas, functions: Sequence[str] | None, usual: Sequence[str] = _USUAL
 ) -> tuple[str, ...]:
-    """Check names of functions. Default: the usual ones that the system has."""
+    """Names of functions, after a check. Default: the usual ones that the system has."""
     if functions is None:
         needs = {"dependent_speeds": "u_dep", "input_jacobian": "inputs", "parameter_jacobian": "parameters"}
         available = tuple(name for name in usual if name not in needs or formulas.names(needs[name]))
@@ -56,13 +57,6 @@ def function_names(
         raise ValueError(f"{formulas.name}: `functions` is empty. Omit it for the usual functions.")
     refuse_unknown(functions, OFFERED, f"{formulas.name}: there is no function", "there are")
     return functions
-
-
-def check_function(formulas: Formulas, function: Any, exporter: str) -> None:
-    """Refuse a value that is not the name of one function."""
-    if not isinstance(function, str):
-        raise TypeError(f"{exporter} exports one function; `function` must be its name, got {function!r}.")
-    refuse_unknown([function], OFFERED, f"{formulas.name}: there is no function", "there are")
 
 
 def parameters(system: System) -> dict[str, np.ndarray]:
@@ -274,6 +268,13 @@ def c(
     return files
 
 
+def sections_of(template: str) -> dict[str, str]:
+    """The sections of a template by name. Each section follows a line `// name`; a section "" precedes them."""
+    text = (Path(__file__).parent / template).read_text(encoding="utf-8")
+    parts = ["", *re.split(r"^// (\w+)\n", text, flags=re.MULTILINE)]
+    return dict(zip(parts[::2], parts[1::2], strict=True))
+
+
 class CText:
     """Elements of all C sources of a system: its name, the struct of its parameters, numbers, and bodies of
     functions."""
@@ -328,15 +329,23 @@ class CText:
     def numbers(self, numbers: Any) -> str:
         return six_a_line([self.constant(x) for x in np.ravel(numbers)] or ["0"])
 
-    def body(self, read: Sequence[str], by_output: dict[str, np.ndarray], words: dict[int, str]) -> str:
-        """The body of a function with these arguments, in braces."""
+    def declaration(self, name: str, arguments: Iterable[str], by_output: Iterable[str]) -> str:
+        """The declaration of a function, e.g. `void name(double t, const double *q, double *q_dot)`."""
+        return f"void {name}({', '.join([*arguments, *(f'{self.type} *{output}' for output in by_output)])})"
+
+    def function(
+        self, name: str, arguments: Sequence[str], by_output: dict[str, np.ndarray], words: dict[int, str]
+    ) -> str:
+        """A function that computes these outputs from the declared arguments."""
         lines, outputs = as_source(self.formulas.graph, list(by_output.values()), words, C)
         for output, elements in zip(by_output, outputs, strict=True):
             lines += [f"{output}[{i}] = {text};" for i, text in enumerate(elements)]
         text = "\n    ".join(lines)
         # Without this use, compilers warn about an unused argument. All functions have the same arguments.
+        read = [re.split(r"[ *]", argument)[-1] for argument in arguments]
         unused = [f"(void){word};" for word in (*read, *by_output) if not _is_read(word, text)]
-        return "{\n    " + "\n    ".join([*unused, *lines]) + "\n}\n"
+        body = "\n    ".join([*unused, *lines])
+        return f"{self.declaration(name, arguments, by_output)} {{\n    {body}\n}}\n"
 
 
 class _CModule(CText):
@@ -345,23 +354,18 @@ class _CModule(CText):
     def __init__(self, formulas: Formulas, functions: tuple[str, ...], name: str):
         super().__init__(formulas, name)
         self.functions, self.nodes = functions, {function: formulas.nodes(function) for function in functions}
-
-    def _comment(self) -> str:
-        title = in_comment(_title(self.formulas))
-        return f"/* {title}\n   The results depend only on the arguments; all numbers are {self.type}. */\n"
-
-    def _signature(self, function: str) -> str:
-        read = f"{self.type} t, const {self.type} *q, const {self.type} *u, const {self.type} *inputs"
-        outputs = "".join(f", {self.type} *{output}" for output in self.nodes[function])
-        return f"void {self.name}_{function}({read}, const {self.name}_parameters *p{outputs})"
+        title, real = in_comment(_title(formulas)), self.type
+        self.comment = f"/* {title}\n   The results depend only on the arguments; all numbers are {real}. */\n"
+        self.arguments = [f"{real} t", *(f"const {real} *{kind}" for kind in ("q", "u", "inputs"))]
+        self.arguments.append(f"const {self.name}_parameters *p")
 
     def header(self) -> str:
         guard, unit_of = f"{self.name.upper()}_H", variable_units(self.formulas.system)
-        lines = [self._comment(), f"#ifndef {guard}", f"#define {guard}", "", "#ifdef __cplusplus"]
+        lines = [self.comment, f"#ifndef {guard}", f"#define {guard}", "", "#ifdef __cplusplus"]
         lines += ['extern "C" {', "#endif", "", *self.struct(), "", "/* The parameters that were exported. */"]
         lines += [f"extern const {self.name}_parameters {self.name}_default;", ""]
         lines += ["/* Arguments of the functions:", "", "   t: time [s]"]
-        for kind in ("q", "u", "inputs"):
+        for kind in _VECTORS:
             for i, name in enumerate(self.formulas.names(kind)):
                 unit = f" [{unit_of[name]}]" if unit_of.get(name) else ""
                 lines.append(in_comment(f"   {kind}[{i}]: {name}{unit}"))
@@ -374,35 +378,35 @@ class _CModule(CText):
                 for output, nodes in self.nodes[function].items()
             )
             lines.append(f"/* {shapes}{in_comment(_meaning(self.formulas, function))} */")
-            lines += [f"{self._signature(function)};", ""]
+            declaration = self.declaration(f"{self.name}_{function}", self.arguments, self.nodes[function])
+            lines += [f"{declaration};", ""]
         return "\n".join([*lines, "#ifdef __cplusplus", "}", "#endif", "", "#endif", ""])
 
     def source(self, header: str) -> str:
         outputs = [nodes for by_output in self.nodes.values() for nodes in by_output.values()]
         default = f"const {self.name}_parameters {self.name}_default = {{\n    {self.default()}\n}};\n"
-        parts = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n', default, *self.helpers(outputs)]
-        read = ("t", "q", "u", "inputs", "p")
-        bodies = (self.body(read, by_output, self.input_words) for by_output in self.nodes.values())
-        return "\n".join([*parts, *map("{} {}".format, map(self._signature, self.functions), bodies)])
+        parts = [self.comment, f'#include "{header}"\n\n#include <math.h>\n', default, *self.helpers(outputs)]
+        parts += [
+            self.function(f"{self.name}_{function}", self.arguments, by_output, self.input_words)
+            for function, by_output in self.nodes.items()
+        ]
+        return "\n".join(parts)
 
     def test(self, header: str) -> str:
         """A program that calls every function at one state, and compares with stored values."""
         state, expected, sizes = _state_and_outputs(self.formulas, self.functions)
-        lines = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n#include <stdio.h>\n']
-        lines += [self.array(kind, state[kind]) for kind in ("q", "u", "inputs")]
-        calls = []
+        lines = [self.comment, f'#include "{header}"\n\n#include <math.h>\n#include <stdio.h>\n']
+        lines += [self.array(kind, state[kind]) for kind in _VECTORS]
+        calls, t = [], self.constant(state["t"])
         for function in self.functions:
-            numbers_of = {f"{function}_{output}": numbers for output, numbers in expected[function].items()}
-            for name, numbers in numbers_of.items():
+            outputs = "".join(f", computed_{function}_{output}" for output in expected[function])
+            calls.append(f"    {self.name}_{function}({t}, q, u, inputs, &{self.name}_default{outputs});")
+            for output, numbers in expected[function].items():
+                name, size = f"{function}_{output}", sizes[function][output]
                 lines.append(self.array(name, numbers))
                 lines.append(f"static {self.type} computed_{name}[{max(1, numbers.size)}];")
-            outputs = "".join(f", computed_{name}" for name in numbers_of)
-            t = self.constant(state["t"])
-            calls.append(f"    {self.name}_{function}({t}, q, u, inputs, &{self.name}_default{outputs});")
-            for (name, numbers), size in zip(numbers_of.items(), sizes[function].values(), strict=True):
                 calls.append(f'    wrong += compare("{name}", {numbers.size}, computed_{name}, {name}, {size!r});')
-        tolerance = "1e-11" if self.formulas.dtype == "float64" else "1e-3"
-        lines.append(COMPARE.format(type=self.type, tolerance=tolerance))
+        lines.append(COMPARE.format(type=self.type, tolerance=1e-11 if self.type == "double" else 1e-3))
         return "\n".join([*lines, "int main(void) {", "    int wrong = 0;", *calls, "    return wrong;", "}", ""])
 
 
@@ -532,70 +536,53 @@ def _source(formulas: Formulas, functions: Sequence[str]) -> str:
     return "\n".join([*lines, "}", *bodies])
 
 
-class _Names:
-    """The names of variables, parameters and outputs of a function. A parameter may have the name of a coordinate."""
-
-    def __init__(self, formulas: Formulas, outputs: Iterable[str]):
-        kinds = ("q", "u", "inputs", "parameters")
-        named = [(kind, name) for kind in kinds for name in _names_of(formulas, kind)]
-        named += [("outputs", name) for name in outputs]
-        self.words = identifiers([name for _, name in named], _RESERVED, in_ascii_only=False)
-        self.of = dict(zip(named, self.words, strict=True))
-
-    def input_words(self, formulas: Formulas) -> dict[int, str]:
-        """The names of input nodes."""
-        words = {}
-        for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True):
-            for place, k in np.ndenumerate(nodes):
-                if a.kind == "parameters":
-                    index = f"[{', '.join(map(str, place))}]" if place else ""
-                    words[int(k)] = self.of["parameters", a.name] + index
-                elif a.kind != "u_dep":
-                    words[int(k)] = self.of[a.kind, a.elements[place[0]]] if place else "t"
-        return words
-
-    def temporary(self) -> str:
-        """The pattern of the names of intermediate results; no other name has this form."""
-        letters = ("x", "z", *(f"x{'_' * n}" for n in range(1, 10)))
-        return next(f"{x}{{}}" for x in letters if not any(re.fullmatch(rf"{x}\d+", word) for word in self.words))
-
-
-def _names_of(formulas: Formulas, kind: str) -> tuple[str, ...]:
-    """Names of whole arrays for parameters with axes, of every element for the other kinds."""
-    return tuple(a.name for a in formulas.of_kind(kind)) if kind == "parameters" else formulas.names(kind)
+def _words(formulas: Formulas, outputs: Iterable[str]) -> dict[tuple[str, str], str]:
+    """Identifiers of a function by kind and name: of every variable, of whole parameters, and of outputs. A parameter
+    may have the name of a coordinate."""
+    named = [(kind, name) for kind in _VECTORS for name in formulas.names(kind)]
+    named += [("parameters", a.name) for a in formulas.of_kind("parameters")]
+    named += [("outputs", name) for name in outputs]
+    return dict(zip(named, identifiers([name for _, name in named], _RESERVED, in_ascii_only=False), strict=True))
 
 
 def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str:
     by_output = formulas.nodes(function)
-    names = _Names(formulas, by_output)
-    body, outputs = as_source(
-        formulas.graph, list(by_output.values()), names.input_words(formulas), PYTHON, names.temporary()
-    )
+    words, of_node = _words(formulas, by_output), {}
+    for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True):
+        for place, k in np.ndenumerate(nodes):
+            if a.kind == "parameters":
+                of_node[int(k)] = words["parameters", a.name] + (f"[{', '.join(map(str, place))}]" if place else "")
+            elif a.kind != "u_dep":
+                of_node[int(k)] = words[a.kind, a.elements[place[0]]] if place else "t"
+    # No other name has the form of the names of intermediate results.
+    letters = ("x", "z", *(f"x{'_' * n}" for n in range(1, 10)))
+    letter = next(x for x in letters if not any(re.fullmatch(rf"{x}\d+", word) for word in words.values()))
+    body, outputs = as_source(formulas.graph, list(by_output.values()), of_node, PYTHON, f"{letter}{{}}")
     text = "\n".join([*body, *(e for elements in outputs for e in elements)])
     # `np.where` evaluates both branches, and the one that is not chosen may divide by zero.
     lines = ["", '@np.errstate(all="ignore")']
     lines.append(f"def {function}(t, q, u, inputs=(), parameters=PARAMETERS):")
     lines.append(f'    """{", ".join(by_output)}{_meaning(formulas, function)}."""')
-    for kind in ("q", "u", "inputs"):
-        words = [names.of[kind, name] for name in formulas.names(kind)]
-        if any(_is_read(word, text) for word in words):
+    for kind in _VECTORS:
+        names = [words[kind, name] for name in formulas.names(kind)]
+        if any(_is_read(word, text) for word in names):
             units = ", ".join(unit_of.get(name) or "-" for name in formulas.names(kind))
             right = f"np.asarray({kind}, np.{formulas.dtype})"
             if kind == "inputs":
-                right += f" if len(inputs) else np.zeros({len(words)}, np.{formulas.dtype})"
+                right += f" if len(inputs) else np.zeros({len(names)}, np.{formulas.dtype})"
             # A single name needs a comma, or it would be the whole array.
-            lines.append(f"    {', '.join(words)}{',' * (len(words) == 1)} = {right}  # [{units}]")
-    for name in _names_of(formulas, "parameters"):
-        word = names.of["parameters", name]
-        if _is_read(word, text):
-            lines.append(f"    {word} = np.{formulas.dtype}(parameters[{name!r}])")
+            lines.append(f"    {', '.join(names)}{',' * (len(names) == 1)} = {right}  # [{units}]")
+    lines += [
+        f"    {word} = np.{formulas.dtype}(parameters[{name!r}])"
+        for (kind, name), word in words.items()
+        if kind == "parameters" and _is_read(word, text)
+    ]
     lines += [f"    {line}" for line in body]
     for output, nodes, elements in zip(by_output, by_output.values(), outputs, strict=True):
         array = f"np.array({_nested(elements, nodes.shape)}, np.{formulas.dtype})"
         array += "" if nodes.size else f".reshape({nodes.shape})"
-        lines.append(f"    {names.of['outputs', output]} = {array}")
-    results = ", ".join(names.of["outputs", output] for output in by_output)
-    return "\n".join([*lines, f"    return {results}", ""])
+        lines.append(f"    {words['outputs', output]} = {array}")
+    return "\n".join([*lines, f"    return {', '.join(words['outputs', output] for output in by_output)}", ""])
 
 
 def _nested(elements: Sequence[str], shape: tuple[int, ...]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -171,21 +172,16 @@ class _FormulasAtMotion:
 
     def _value(self, name: str, x: Any) -> Expression:
         """A number, an expression, or a string in which declared names are the declared symbols."""
-        sp = import_sympy()
-        try:
+        sp, value = import_sympy(), None
+        # the last two for "f(", "1.x" and such
+        with contextlib.suppress(sp.SympifyError, TypeError, AttributeError):
             value = exact(x, "float64") if isinstance(x, float) else sp.sympify(x, locals=dict(self.symbols))
-        except (sp.SympifyError, TypeError, AttributeError) as error:  # the last two for "f(", "1.x" and such
-            raise ValueError(self._no_value(name, x)) from error
-        if not isinstance(value, sp.Expr):
-            raise ValueError(self._no_value(name, x))
-        own = {s: sp.Symbol(s.name, real=True) for s in value.free_symbols if s not in self.symbols.values()}
-        value = value.xreplace({s: new for s, new in own.items() if not s.is_real})
-        if value.has(sp.I, sp.nan, sp.oo, -sp.oo, sp.zoo) or value.is_real is False:
-            raise ValueError(self._no_value(name, x))
-        return value
-
-    def _no_value(self, name: str, x: Any) -> str:
-        return (
+        if isinstance(value, sp.Expr):
+            own = {s: sp.Symbol(s.name, real=True) for s in value.free_symbols if s not in self.symbols.values()}
+            value = value.xreplace({s: new for s, new in own.items() if not s.is_real})
+            if not value.has(sp.I, sp.nan, sp.oo, -sp.oo, sp.zoo) and value.is_real is not False:
+                return value
+        raise ValueError(
             f"{self.formulas.name}: `at` has {name} = {x!r}, which is neither a finite number nor an expression of "
             'SymPy. Example: {"%s": "-v/radius"}.' % name
         )

@@ -7,28 +7,24 @@ invalid pointers. Therefore `mismatch` compares their fields with the header of 
 from __future__ import annotations
 
 import re
+import types
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 
-
-class Layout(NamedTuple):
-    """Byte offsets in the structures of xla/ffi/api/c_api.h, major version 0, with addresses of eight bytes."""
-
-    frame_extension: int = 8
-    frame_arguments: int = 40
-    frame_results: int = 80
-    list_items: int = 32
-    buffer_data: int = 24
-    extension_type: int = 8
-    extension_metadata: int = 24
-    metadata_major: int = 24
-    metadata_minor: int = 28
-    metadata_traits: int = 32
-
-
-LAYOUT = Layout()
+# Byte offsets in the structures of xla/ffi/api/c_api.h, major version 0, with addresses of eight bytes.
+LAYOUT = types.SimpleNamespace(
+    frame_extension=8,
+    frame_arguments=40,
+    frame_results=80,
+    list_items=32,
+    buffer_data=24,
+    extension_type=8,
+    extension_metadata=24,
+    metadata_major=24,
+    metadata_minor=28,
+    metadata_traits=32,
+)
 
 # The fields of each structure that `LAYOUT` has an offset in. A later version may append fields to `_MAY_GROW`, which
 # no other structure contains. The wrapper does not read such fields.

@@ -59,34 +59,29 @@ def is_on() -> bool:
     """Whether programs become native kernels. Warns once if LLVM is installed but kernels cannot be called."""
     if not _wanted or without_llvm():
         return False
-    why = why_not()
-    if why:
-        tell(why)
+    if why := why_not():
+        warn_not_native(why)
     return why is None
 
 
+@functools.cache
 def why_not() -> str | None:
     """Why native kernels are not possible in this process; None if they are."""
-    return without_llvm() or _refused()
-
-
-@functools.cache
-def tell(why: str) -> None:
-    """Warn that XLA replaces native kernels; once for each reason."""
-    warnings.warn(
-        f"jaxkane does not use native kernels: {why}. XLA compiles the equations instead.", UserWarning, stacklevel=3
-    )
-
-
-@functools.cache
-def _refused() -> str | None:
-    if why := mismatch():
+    if why := without_llvm() or mismatch():
         return why
     try:
         llvm_compiler()
     except RuntimeError as error:  # llvmlite raises it if LLVM does not support the processor
         return f"LLVM does not work here: {error}"
     return None
+
+
+@functools.cache
+def warn_not_native(why: str) -> None:
+    """Warn that XLA replaces native kernels; once for each reason."""
+    warnings.warn(
+        f"jaxkane does not use native kernels: {why}. XLA compiles the equations instead.", UserWarning, stacklevel=3
+    )
 
 
 Groups = tuple[tuple[int, ...], ...]
