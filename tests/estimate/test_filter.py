@@ -366,6 +366,13 @@ def test_the_filter_runs_in_scan_vmap_and_grad():
     np.testing.assert_allclose(slopes, numbers, rtol=1e-6)
 
 
+def test_the_clock_of_a_filter_does_not_accumulate_rounding_errors():
+    filter = Filter(Pendulum(), {"rate": 0.05})
+    start = begin(filter, jk.State(jnp.array([0.8]), jnp.array([-0.3])), {"angle": 0.1}, t=1.7e9)
+    steps = lambda b: jax.lax.scan(lambda b, _: (predict(filter, b, 1e-3), None), b, None, length=2000)[0]  # noqa: E731
+    assert abs(jax.jit(steps)(start).t[0] - 1.7e9 - 2.0) < 2.4e-7  # the distance of numbers near 1.7e9
+
+
 @pytest.mark.slow
 def test_zero_time_steps_and_missing_measurements_change_nothing():
     filter = Filter(Pendulum(), {"rate": 0.05}, noise={"rate": 0.01}, lag=1)

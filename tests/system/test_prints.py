@@ -132,7 +132,7 @@ def test_filters_print_their_sensors_and_beliefs():
     belief = estimate.begin(filter, STATE, {"x": 0.1, "x_dot": 0.2, "mass": 0.5})
     assert repr(belief) == "Belief(t=0 s, mean=[0.25, -1.5, 2], deviation=[0.1, 0.2, 0.5])"
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), belief)
-    assert repr(batch) == "Belief(t=f64[2,1], mean=f64[2,1,3], root=f64[2,1,3,3])"
+    assert repr(batch) == "Belief(t=f64[2,1], mean=f64[2,1,3], root=f64[2,1,3,3], rounding=f64[2])"
 
 
 def test_tables_print_the_range_of_each_column():

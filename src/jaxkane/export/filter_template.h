@@ -49,6 +49,7 @@ typedef struct {
     $real t[$times]; /* [s] */
     $real mean[${name}_n_root];
     $real root[${name}_n_root * ${name}_n_root];
+    $real rounding; /* the present time minus t[0], which is rounded [s] */
 } ${name}_belief;
 
 /* `predicted`: what the sensors were expected to read. `difference`, `deviation`: measured less predicted, each after
@@ -68,7 +69,8 @@ static const ${name}_settings ${name}_default = {
 static const ${name}_belief ${name}_start = {
     {$start_t},
     {$start_mean},
-    {$start_root}
+    {$start_root},
+    0
 };
 
 $model
@@ -113,11 +115,13 @@ static inline void ${name}_polynomials($real x, $real dt, $real *value) {
 
 /* The states before move on by one place. */
 static inline void ${name}_shift(${name}_belief *b, $real dt, const $real *now) {
+    const $real before = b->t[0], step = dt + b->rounding;
     int i;
     for (i = ${name}_n_root - 1; i >= ${name}_n; i--) b->mean[i] = b->mean[i - ${name}_n];
     for (i = ${name}_n_times - 1; i > 0; i--) b->t[i] = b->t[i - 1];
     for (i = 0; i < ${name}_n; i++) b->mean[i] = now[i];
-    b->t[0] += dt;
+    b->t[0] = before + step; /* summation by Kahan */
+    b->rounding = step - (b->t[0] - before);
 }
 
 /* Measurements one after the other (Potter's form): S has `columns`, F (sensors, columns) is what S does to them. */
