@@ -34,7 +34,7 @@ def model_description(model: FMUModel, fmi: str, kinds: Sequence[str], token: st
     if text and not text.startswith(f"{model.formulas.name}("):
         root.set("description", " ".join(text.partition("\n\n")[0].split()))
     root.set("generationTool", f"jaxkane {__version__}")
-    root.set("variableNamingConvention", "structured" if all(map(_is_structured, variables)) else "flat")
+    root.set("variableNamingConvention", "structured" if all(_PATH.fullmatch(x.name) for x in variables) else "flat")
     if is_2 and has_exchange:
         root.set("numberOfEventIndicators", str(len(model.g)))
     for kind, tag in KINDS.items():
@@ -186,9 +186,6 @@ def _number(x: float) -> str:
     return repr(float(x)) if np.isfinite(x) else "NaN" if np.isnan(x) else "INF" if x > 0 else "-INF"
 
 
+# Names that importers can read as a path, such as "frame.moments[2]" or "der(angle)".
 _IDENTIFIER = r"[A-Za-z_]\w*(?:\[\d+\])?(?:\.[A-Za-z_]\w*(?:\[\d+\])?)*"
-
-
-def _is_structured(x: Variable) -> bool:
-    """Whether importers can read a name as a path, such as "frame.moments[2]" or "der(angle)"."""
-    return re.fullmatch(rf"{_IDENTIFIER}|der\({_IDENTIFIER}\)", x.name, flags=re.ASCII) is not None
+_PATH = re.compile(rf"{_IDENTIFIER}|der\({_IDENTIFIER}\)", re.ASCII)

@@ -233,7 +233,10 @@ class Writer:
         if node.operation != "constant":
             return f"%v{k}"
         number = self.graph.value(k)
-        return str(number).lower() if node.dtype == "bool" else _digits(number, node.dtype)
+        if node.dtype == "bool":
+            return str(number).lower()
+        # LLVM writes floats as the bits of a double, also those in single precision.
+        return f"0x{np.float64(np.dtype(node.dtype).type(number)).view(np.uint64):016X}"
 
     def _in_lanes(self, k: int) -> str:
         """The name of node k as a vector of all lanes."""
@@ -246,22 +249,18 @@ class Writer:
         if k not in self.splats:
             # LLVM would move an address that is computed outside the loop into it, which takes long.
             self.lines.append(f"%s{k} = load {kind}, ptr {self._kept(k, 'read')}")
-            self.splats[k] = self._splat(f"%s{k}", kind, lanes)
+            vector, self.splats[k] = f"<{lanes} x {kind}>", f"%s{k}"
+            if lanes > 1:
+                self.splats[k] = f"%s{k}.n"
+                self.lines += [
+                    f"%s{k}.1 = insertelement {vector} poison, {kind} %s{k}, i64 0",
+                    f"%s{k}.n = shufflevector {vector} %s{k}.1, {vector} poison, <{lanes} x i32> zeroinitializer",
+                ]
         return self.splats[k]
 
     def _kept(self, k: int, tag: str) -> str:
         self.lines.append(f"%{tag}{k} = getelementptr double, ptr %kept, i64 {self.places[k]}")
         return f"%{tag}{k}"
-
-    def _splat(self, scalar: str, kind: str, lanes: int) -> str:
-        if lanes == 1:
-            return scalar
-        self.lines.append(f"{scalar}.1 = insertelement <{lanes} x {kind}> poison, {kind} {scalar}, i64 0")
-        self.lines.append(
-            f"{scalar}.n = shufflevector <{lanes} x {kind}> {scalar}.1, <{lanes} x {kind}> poison, "
-            f"<{lanes} x i32> zeroinitializer"
-        )
-        return f"{scalar}.n"
 
     def _node(self, k: int, lanes: int) -> None:
         """Node k, as one value for all lanes or as a vector of all lanes."""
@@ -379,9 +378,3 @@ class Writer:
                 one = f"%{tag}.{lane}.v"
                 self.lines.append(f"{one} = extractelement <{lanes} x {kind}> {value}, i64 {lane}")
             self.lines.append(f"store {kind} {one}, ptr {at}")
-
-
-def _digits(value: Any, dtype: str) -> str:
-    """A float in LLVM's notation: the bits of a double, also for a float32."""
-    number = np.float64(value) if dtype == "float64" else np.float64(np.float32(value))
-    return f"0x{number.view(np.uint64):016X}"
