@@ -6,7 +6,6 @@ The wrapper reads and writes XLA's structures at fixed offsets (`ffi_layout`).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence, Set
-from typing import Any
 
 import numpy as np
 
