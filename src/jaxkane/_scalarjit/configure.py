@@ -77,11 +77,12 @@ def configure(
     are then not stored.
     """
     global _last
-    for what, flag in (("float64", float64), ("native", False if native is None else native)):
-        if not isinstance(flag, (bool, np.bool_)):
-            raise TypeError(f"configure: `{what}` must be True or False, got {flag!r}.")
-    if not isinstance(cache, (bool, str, os.PathLike)):
-        raise TypeError(f"configure: `cache` must be a folder, True or False, got {cache!r}.")
+    flag = bool, np.bool_
+    kinds = {"float64": flag, "native": (*flag, type(None)), "cache": (bool, str, os.PathLike)}
+    for (name, kind), value in zip(kinds.items(), (float64, native, cache), strict=True):
+        if not isinstance(value, kind):
+            folder = "a folder, " * (name == "cache")
+            raise TypeError(f"configure: `{name}` must be {folder}True or False, got {value!r}.")
     made = 0
     if float64 and not _jax.jax_enable_x64 and backends_are_initialized():  # `live_arrays` would start JAX
         made = sum(array.dtype == np.float32 for array in jax.live_arrays())

@@ -26,7 +26,7 @@ from .._scalarjit.graph import needed
 from .._system.system import State, System, packed, unit_of
 from .._version import __version__
 from ._filter import all_rates
-from ._source import CText, in_comment, sections_of, six_a_line, variable_units
+from ._source import CText, in_comment, listed, sections_of, six_a_line, variable_units
 
 
 class Role(NamedTuple):
@@ -231,9 +231,7 @@ class FMUModel(CText):
         """Start values, bounds and names, and the properties of the events."""
         parameters, events = self.parameters(), self.events
         groups = {"p": [x.name for x in parameters], "w": self.formulas.system.inputs, "y": self.states}
-        comments = [
-            in_comment(f"   {word}[{i}]: {name}") for word, names in groups.items() for i, name in enumerate(names)
-        ]
+        comments = [listed(word, names) for word, names in groups.items()]
         is_positive = [a.info.positive for a in self.formulas.of_kind("parameters") for _ in a.elements]
         lines = [
             *["/* Parameters, inputs and states:", "", *comments, "*/"],

@@ -193,6 +193,16 @@ def in_comment(text: str) -> str:
     return text.replace("*/", "* /").replace("\\", "/")
 
 
+def listed(array: str, names: Sequence[str], units: Sequence[str | None] | None = None) -> str:
+    """The elements of an array as lines of a comment in C."""
+    units = [None] * len(names) if units is None else units
+    lines = [
+        in_comment(f"   {array}[{i}]: {name}{f' [{unit}]' if unit else ''}")
+        for i, (name, unit) in enumerate(zip(names, units, strict=True))
+    ]
+    return "\n".join(lines or [f"   {array}: none; may be null"])
+
+
 COMPARE = """
 /* Prints the largest difference relative to `size`, or to the largest expected number if that is larger. */
 static int compare(const char *name, int n, const {type} *computed, const {type} *expected, double size) {{
@@ -366,11 +376,8 @@ class _CModule(CText):
         lines += [f"extern const {self.name}_parameters {self.name}_default;", ""]
         lines += ["/* Arguments of the functions:", "", "   t: time [s]"]
         for kind in _VECTORS:
-            for i, name in enumerate(self.formulas.names(kind)):
-                unit = f" [{unit_of[name]}]" if unit_of.get(name) else ""
-                lines.append(in_comment(f"   {kind}[{i}]: {name}{unit}"))
-            if not self.formulas.names(kind):
-                lines.append(f"   {kind}: none; may be null")
+            names = self.formulas.names(kind)
+            lines.append(listed(kind, names, [unit_of.get(name) for name in names]))
         lines += ["", "   Outputs, matrices row by row; they must not overlap the other arguments: */", ""]
         for function in self.functions:
             shapes = ", ".join(
