@@ -106,7 +106,7 @@ def configure(
         kernels.warn_not_native(why)
     done = Configuration(bool(float64), folder, devices, kernels.is_on())
     if verbose and done != _last:
-        print(_told(done))
+        print(_summary(done))
     _last = done
     return done
 
@@ -186,7 +186,7 @@ _KEPT = {
 }
 
 
-def _told(done: Configuration) -> str:
+def _summary(done: Configuration) -> str:
     text = f"jaxkane: {'float64' if done.float64 else 'float32'}"
     if done.devices is not None:
         text += f", {done.devices} CPU device{'s' if done.devices > 1 else ''}"

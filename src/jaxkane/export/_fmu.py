@@ -97,12 +97,12 @@ def fmu(
     contents = model.source(fmi, "") + model_description(model, fmi, kinds, "", sources)
     token = str(uuid.uuid5(uuid.NAMESPACE_URL, contents))
     source = model.source(fmi, token)
-    binary, why_not = _compiled(source, model.name)
+    binary, problem = _compiled(source, model.name)
     if binary is None:
         if not sources:
-            raise RuntimeError(f"fmu: {why_not} Install a C compiler, or pass sources=True to export the C source.")
+            raise RuntimeError(f"fmu: {problem} Install a C compiler, or pass sources=True to export the C source.")
         warnings.warn(
-            f"jaxkane.export.fmu: {why_not} {path.name} contains only C source, which not all programs can import. "
+            f"jaxkane.export.fmu: {problem} {path.name} contains only C source, which not all programs can import. "
             "Install a C compiler and export it again to add a binary.",
             stacklevel=2,
         )
