@@ -71,8 +71,8 @@ def main() -> int:
     print(", ".join(f"{package} {version_of(package)}" for package in PACKAGES))
     environment = sorted(f"{name}={value}" for name, value in os.environ.items() if name.startswith(SETTINGS))
     settings = jk.configure(verbose=False)
-    why_not = native.why_not()
-    print(f"native kernels: {'yes' if settings.native else f'no, {why_not}' if why_not else 'switched off'}")
+    reason = native.why_not()
+    print(f"native kernels: {'yes' if settings.native else f'no, {reason}' if reason else 'switched off'}")
     print(f"compiled programs: {f'saved in {settings.cache}' if settings.cache else 'not saved'}")
     print(f"devices: {', '.join(f'{each} ({each.device_kind})' for each in jax.devices())}")
     print("environment:", ", ".join(environment) or "no variable of JAX, XLA or jaxkane is set")
@@ -81,11 +81,11 @@ def main() -> int:
         started = time.perf_counter()
         try:
             error, tolerance = check()
-            holds, told = error <= tolerance, f"{error:.1e}, at most {tolerance:.0e}"
+            passed, result = error <= tolerance, f"{error:.1e}, at most {tolerance:.0e}"
         except Exception as raised:
-            holds, told = False, f"{type(raised).__name__}: {raised}"
-        failed += not holds
-        print(f"{'ok' if holds else 'FAILED'}: {what} ({told}; {time.perf_counter() - started:.1f} s)", flush=True)
+            passed, result = False, f"{type(raised).__name__}: {raised}"
+        failed += not passed
+        print(f"{'ok' if passed else 'FAILED'}: {what} ({result}; {time.perf_counter() - started:.1f} s)", flush=True)
     return int(failed > 0)
 
 

@@ -7,7 +7,7 @@ import pytest
 from mechanisms import Sled, SliderCrank
 
 import jaxkane as jk
-from jaxkane._scalarjit.sparsity import patterns
+from jaxkane._scalarjit.jaxpr import patterns
 from jaxkane.catalog import CATALOG
 from jaxkane.collocation import Phases, Problem, check_derivatives
 

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 import jaxkane as jk
 from jaxkane.catalog import CATALOG
-from jaxkane.export._fmu_description import base_units
+from jaxkane.export._fmu import base_units
 
 fmpy = pytest.importorskip("fmpy")
 validate_fmu = pytest.importorskip("fmpy.validation").validate_fmu

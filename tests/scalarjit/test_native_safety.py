@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jaxkane._scalarjit.backends import compiler as objects
-from jaxkane._scalarjit.backends import ffi_layout, native
+from jaxkane._scalarjit.backends import llvm, native
 from jaxkane._scalarjit.backends.compiler import LLVMCompiler
 from jaxkane._scalarjit.scalar_function import ScalarFunction
 
@@ -146,7 +146,7 @@ HEADER = Path(jax.ffi.include_dir(), "xla/ffi/api/c_api.h")
 def test_structures_agree_with_the_header_of_jaxlib():
     if not HEADER.exists():
         pytest.skip(f"this jaxlib ships no header: {HEADER}")
-    assert ffi_layout.mismatch() is None
+    assert llvm.mismatch() is None
 
 
 CHANGES = {
@@ -192,7 +192,7 @@ def test_with_a_different_header_xla_is_used(change, tmp_path, unknown, monkeypa
     assert old is None or old in text
     header = tmp_path / "c_api.h"
     header.write_text("" if old is None else text.replace(old, new))
-    why = ffi_layout.mismatch(header)
+    why = llvm.mismatch(header)
     assert words in (why or "")
     monkeypatch.setattr(native, "mismatch", lambda: why)
     f = ScalarFunction(lambda x: jnp.sin(x) * 1.25)
@@ -204,7 +204,7 @@ def test_with_a_different_header_xla_is_used(change, tmp_path, unknown, monkeypa
 
 
 def test_without_the_header_xla_is_used(tmp_path):
-    assert "cannot be read" in (ffi_layout.mismatch(tmp_path / "c_api.h") or "")
+    assert "cannot be read" in (llvm.mismatch(tmp_path / "c_api.h") or "")
 
 
 def test_fields_appended_to_a_structure_are_ignored(tmp_path):
@@ -213,7 +213,7 @@ def test_fields_appended_to_a_structure_are_ignored(tmp_path):
     (body,) = re.findall(r"struct XLA_FFI_Buffer \{[^}]*", text)
     header = tmp_path / "c_api.h"
     header.write_text(text.replace(body, f"{body}  void* more;\n"))
-    assert ffi_layout.mismatch(header) is None
+    assert llvm.mismatch(header) is None
 
 
 class Text:

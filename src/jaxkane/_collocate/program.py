@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from .._scalarjit.cache import Cache
 from .._scalarjit.cache_key import jit, kept
-from .._scalarjit.sparsity import patterns
+from .._scalarjit.jaxpr import patterns
 
 BlockFunction = Callable[[Any, Array], Array]
 

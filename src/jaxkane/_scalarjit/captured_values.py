@@ -17,7 +17,7 @@ import pickle
 import sys
 import sysconfig
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter, is_
 from typing import Any
 
@@ -80,7 +80,7 @@ def _inside(cell: types.CellType) -> tuple[Any, ...]:
 
 def _numbers_of(array: np.ndarray) -> tuple[Any, ...]:
     """The numbers of an array, and its mask if it has one."""
-    return array.dtype.str, array.shape, np.ma.getdata(array).tobytes(), np.ma.getmask(array).tobytes()
+    return array.dtype.str, str(array.shape), np.ma.getdata(array).tobytes(), np.ma.getmask(array).tobytes()
 
 
 class CapturedValues:
@@ -102,11 +102,16 @@ class CapturedValues:
         self.places: list[tuple[Callable[[Any], tuple[Any, ...]], Any, tuple[Any, ...]]] = []
         self.arrays: list[tuple[np.ndarray, tuple[Any, ...]]] = []
         self.tracers: list[Tracer] = []
-        self.depth = 0
         self.names: set[str] = set()  # in all the code; only attributes of modules with these names are read
         self.modules: list[types.ModuleType] = []
-        self.value(root)
-        self.into_modules()
+        self.walk(root)
+        # A function that receives `constants` as an argument may use `constants.gravity`.
+        n_seen = -1
+        while n_seen < len(self.seen):  # an attribute may be code with more names, or another module
+            n_seen = len(self.seen)
+            for module in tuple(self.modules):
+                for name in sorted(self.names & vars(module).keys()):
+                    self.walk(*self.place(vars(module), name))
         self.version = self.sha.digest()
         del self.root
 
@@ -143,108 +148,83 @@ class CapturedValues:
         self.places.append((read, _ROOT if thing is self.root else thing, values))
         return values
 
-    def value(self, value: Any) -> None:
-        kind = type(value)
-        if kind in NUMBERS:
-            self.add(kind.__name__, value if kind is bytes else repr(value))
-        elif isinstance(value, types.ModuleType):
-            self.add("module", value.__name__)
-            if not _is_library(value.__name__) and self.is_new(id(value), value):
-                self.modules.append(value)
-        elif self.is_new(id(value), value):
-            if self.depth > 100 or len(self.seen) > _MOST_PLACES:
-                return self.opaque(value)
-            self.depth += 1
-            self.composite(value)
-            self.depth -= 1
+    def walk(self, *values: Any) -> None:
+        """Visit values and everything that they contain, in the order of a recursion."""
+        waiting = [*reversed(values)]
+        while waiting:
+            value = waiting.pop()
+            kind = type(value)
+            if kind in NUMBERS:
+                self.add(kind.__name__, value if kind is bytes else repr(value))
+            elif isinstance(value, types.ModuleType):
+                self.add("module", value.__name__)
+                if not _is_library(value.__name__) and self.is_new(id(value), value):
+                    self.modules.append(value)
+            elif self.is_new(id(value), value):
+                parts = self.parts(value) if len(self.seen) <= _MOST_PLACES else self.opaque(value)
+                self.add(kind.__qualname__, len(parts))
+                waiting += reversed(parts)
 
-    def composite(self, value: Any) -> None:
-        kind = type(value)
-        self.add(kind.__qualname__)
+    def parts(self, value: Any) -> Sequence[Any]:
+        """The values that an object contains or uses, and what identifies it."""
         if isinstance(value, types.FunctionType):
-            self.function(value)
-        elif isinstance(value, type):
-            self.a_class(value)
-        elif isinstance(value, Tracer):
+            return self.function(value)
+        if isinstance(value, type):
+            return self.a_class(value)
+        if isinstance(value, Tracer):
             self.tracers.append(value)
-            self.opaque(value)
-        elif isinstance(value, _WRAPPERS):
-            self.parts((getattr(value, "__name__", ""), *(getattr(value, name, None) for name in _WRAPPED)))
-        elif isinstance(value, np.ndarray) and value.nbytes <= _LARGEST_ARRAY and not value.dtype.hasobject:
+            return self.opaque(value)
+        if isinstance(value, _WRAPPERS):
+            return getattr(value, "__name__", ""), *(getattr(value, name, None) for name in _WRAPPED)
+        if isinstance(value, np.ndarray) and value.nbytes <= _LARGEST_ARRAY and not value.dtype.hasobject:
             self.arrays.append((value, numbers := _numbers_of(value)))
-            self.add(*numbers)
-        elif isinstance(value, np.generic):
-            self.add(value.dtype.str, value.tobytes())
-        elif isinstance(value, (list, tuple, set, frozenset, dict)):
-            self.container(value)
-            self.attributes(value)
-        elif _has_attributes(value):
-            self.attributes(value)
-        elif callable(wrapped := getattr(value, "__dict__", {}).get("__wrapped__")):  # `jax.jit(f)`
-            self.value(wrapped)
-        else:
-            self.opaque(value)
+            return numbers
+        if isinstance(value, np.generic):
+            return value.dtype.str, value.tobytes()
+        if isinstance(value, (list, tuple, set, frozenset, dict)):
+            return *self.items(value), *self.attributes(value)
+        if _has_attributes(value):
+            return self.attributes(value)
+        if callable(wrapped := getattr(value, "__dict__", {}).get("__wrapped__")):  # `jax.jit(f)`
+            return (wrapped,)
+        return self.opaque(value)
 
-    def parts(self, parts: Iterable[Any]) -> None:
-        parts = tuple(parts)
-        self.add(len(parts))
-        for part in parts:
-            self.value(part)
-
-    def container(self, container: Any) -> None:
+    def items(self, container: Any) -> Sequence[Any]:
         if isinstance(container, (tuple, frozenset)):
             items = tuple(container)
         else:
             items = self.read(_items_of if isinstance(container, dict) else tuple, container)
         # the order of a set differs between processes
-        self.parts(sorted(items, key=repr) if isinstance(container, (set, frozenset)) else items)
+        return sorted(items, key=repr) if isinstance(container, (set, frozenset)) else items
 
-    def attributes(self, thing: Any) -> None:
+    def attributes(self, thing: Any) -> Sequence[Any]:
         """The class of an object of the user, and its attributes."""
-        if not is_of_library(type(thing)):
-            self.value(type(thing))
-        if _has_attributes(thing):
-            self.container(vars(thing))
+        kind = () if is_of_library(type(thing)) else (type(thing),)
+        return *kind, *(self.items(vars(thing)) if _has_attributes(thing) else ())
 
-    def into_modules(self) -> None:
-        """The attributes of the user's modules that are named anywhere in the code. A function that receives
-        `constants` as an argument may use `constants.gravity`."""
-        self.depth = 0
-        n_seen = -1
-        while n_seen < len(self.seen):  # an attribute may be code with more names, or another module
-            n_seen = len(self.seen)
-            for module in tuple(self.modules):
-                for name in sorted(self.names & vars(module).keys()):
-                    self.place(vars(module), name)
+    def place(self, namespace: dict[str, Any], name: str) -> tuple[Any, ...]:
+        """A name in a dict of globals, or of modules, with its value; nothing if it was visited."""
+        if not self.is_new((id(namespace), name), None):
+            return ()
+        self.named.append((namespace, name, value := namespace.get(name, _MISSING)))
+        return name, value
 
-    def place(self, namespace: dict[str, Any], name: str) -> None:
-        """The value of a name in a dict of globals, or of modules."""
-        if self.is_new((id(namespace), name), None):
-            value = namespace.get(name, _MISSING)
-            self.named.append((namespace, name, value))
-            self.add(name)
-            self.value(value)
-
-    def function(self, f: types.FunctionType) -> None:
-        self.add(f.__qualname__)
+    def function(self, f: types.FunctionType) -> Sequence[Any]:
         inside = [x for cell in f.__closure__ or () for x in self.read(_inside, cell)]
         if _is_library(f.__globals__.get("__name__") or "__main__"):
             # Follow a library's decorator to the decorated function. IPython's autoreload changes the attribute, not
             # the closure.
-            self.place(vars(f), "__wrapped__")
-            return self.parts(filter(callable, inside))
+            return f.__qualname__, *self.place(vars(f), "__wrapped__"), *filter(callable, inside)
         code, *defaults = self.read(_definition_of, f)
         self.code(code)
         of_globals, imported, names = _names_of(code)
         self.names |= names
-        for name in of_globals:
-            self.place(f.__globals__, name)
-        for name in imported:
-            if not (name in sys.modules and _is_library(name)):
-                self.place(sys.modules, name)
-        self.parts((*inside, *defaults))
-        if vars(f):
-            self.container(vars(f))
+        places = [self.place(f.__globals__, name) for name in of_globals]
+        places += [
+            self.place(sys.modules, name) for name in imported if not (name in sys.modules and _is_library(name))
+        ]
+        own = self.items(vars(f)) if vars(f) else ()
+        return f.__qualname__, *itertools.chain(*places), *inside, *defaults, *own
 
     def code(self, code: types.CodeType) -> None:
         self.add(code.co_code, *code.co_names, "|", *code.co_varnames, "|", *code.co_freevars)
@@ -255,8 +235,8 @@ class CapturedValues:
                 is_set = isinstance(constant, frozenset)
                 self.add(type(constant).__name__, sorted(map(repr, constant)) if is_set else repr(constant))
 
-    def a_class(self, cls: type) -> None:
-        self.add(cls.__module__, cls.__qualname__)
+    def a_class(self, cls: type) -> Sequence[Any]:
+        parts: list[Any] = [cls.__module__, cls.__qualname__]
         for base in cls.__mro__:
             if is_of_library(base):
                 continue
@@ -264,18 +244,17 @@ class CapturedValues:
             for name, value in tuple(vars(base).items()):
                 plain = not (name.startswith("__") and name.endswith("__")) and name != "_abc_impl"
                 if plain or (isinstance(value, types.FunctionType) and value.__code__.co_filename != "<string>"):
-                    self.add(name)
-                    self.value(value)
+                    parts += name, value
+        return parts
 
-    def opaque(self, thing: Any) -> None:
-        """An object whose contents are not compared."""
+    def opaque(self, thing: Any) -> Sequence[Any]:
+        """What identifies an object whose contents are not compared."""
         if not self.lasting:
-            self.add(_serial(thing))
-            return
+            return (_serial(thing),)
         try:
-            self.add(pickle.dumps(thing))
+            return (pickle.dumps(thing),)
         except Exception:  # a lock or a stream, which contains no numbers
-            self.add("not pickled")
+            return ("not pickled",)
 
 
 def _has_attributes(thing: Any) -> bool:

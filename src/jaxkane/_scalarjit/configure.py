@@ -77,11 +77,12 @@ def configure(
     are then not stored.
     """
     global _last
-    for what, flag in (("float64", float64), ("native", False if native is None else native)):
-        if not isinstance(flag, (bool, np.bool_)):
-            raise TypeError(f"configure: `{what}` must be True or False, got {flag!r}.")
-    if not isinstance(cache, (bool, str, os.PathLike)):
-        raise TypeError(f"configure: `cache` must be a folder, True or False, got {cache!r}.")
+    flag = bool, np.bool_
+    kinds = {"float64": flag, "native": (*flag, type(None)), "cache": (bool, str, os.PathLike)}
+    for (name, kind), value in zip(kinds.items(), (float64, native, cache), strict=True):
+        if not isinstance(value, kind):
+            folder = "a folder, " * (name == "cache")
+            raise TypeError(f"configure: `{name}` must be {folder}True or False, got {value!r}.")
     made = 0
     if float64 and not _jax.jax_enable_x64 and backends_are_initialized():  # `live_arrays` would start JAX
         made = sum(array.dtype == np.float32 for array in jax.live_arrays())
@@ -105,7 +106,7 @@ def configure(
         kernels.warn_not_native(why)
     done = Configuration(bool(float64), folder, devices, kernels.is_on())
     if verbose and done != _last:
-        print(_told(done))
+        print(_summary(done))
     _last = done
     return done
 
@@ -185,7 +186,7 @@ _KEPT = {
 }
 
 
-def _told(done: Configuration) -> str:
+def _summary(done: Configuration) -> str:
     text = f"jaxkane: {'float64' if done.float64 else 'float32'}"
     if done.devices is not None:
         text += f", {done.devices} CPU device{'s' if done.devices > 1 else ''}"

@@ -101,37 +101,30 @@ class Graph:
         return graph
 
     def apply(self, operation: str, operands: tuple[int, ...], dtype: str) -> int:
-        known = self._folded(operation, operands, dtype) if operation in ARITHMETIC else None
-        if known is None:
-            known = self._signed(operation, operands, dtype) if operation in ("neg", "add", "sub") else None
+        known = self._simplified(operation, operands, dtype) if operation in OPERATORS else None
         return self.add(operation, operands, dtype) if known is None else known
 
-    def _signed(self, operation: str, operands: tuple[int, ...], dtype: str) -> int | None:
-        last = operands[-1]
-        if self.nodes[last].operation == "neg":
-            opposite = self.nodes[last].operands[0]
-            if operation == "neg":
-                return opposite
-            return self.apply("sub" if operation == "add" else "add", (operands[0], opposite), dtype)
-        if operation == "add" and self.nodes[operands[0]].operation == "neg":
-            return self.apply("sub", (last, self.nodes[operands[0]].operands[0]), dtype)
-        value = self.value(last) if operation == "neg" else None
-        return None if value is None else self.constant(-value, dtype)
-
-    def _folded(self, operation: str, operands: tuple[int, ...], dtype: str) -> int | None:
-        a, b = operands
+    def _simplified(self, operation: str, operands: tuple[int, ...], dtype: str) -> int | None:
+        a, b = operands[0], operands[-1]
         x, y = self.value(a), self.value(b)
         match operation:
-            case "add":
-                return b if x == 0 else a if y == 0 else None
-            case "sub":
-                return a if y == 0 else None
-            case "mul":
-                if x in (1, -1) or y in (1, -1):
-                    other, unit = (b, x) if x in (1, -1) else (a, y)
-                    return other if unit == 1 else self.add("neg", (other,), dtype)
-            case "div":
-                return a if y == 1 else None
+            case "add" if x == 0:
+                return b
+            case "add" | "sub" if y == 0:
+                return a
+            case "mul" if x in (1, -1) or y in (1, -1):
+                other, unit = (b, x) if x in (1, -1) else (a, y)
+                return other if unit == 1 else self.add("neg", (other,), dtype)
+            case "div" if y == 1:
+                return a
+            case "neg" if y is not None:
+                return self.constant(-y, dtype)
+            case "neg" | "add" | "sub" if self.nodes[b].operation == "neg":
+                (opposite,) = self.nodes[b].operands
+                opposed = "sub" if operation == "add" else "add"
+                return opposite if operation == "neg" else self.apply(opposed, (a, opposite), dtype)
+            case "add" if self.nodes[a].operation == "neg":
+                return self.apply("sub", (b, *self.nodes[a].operands), dtype)
         return None
 
 

@@ -8,7 +8,6 @@ compile or run C code.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from string import Template
 from typing import NamedTuple
@@ -29,7 +28,7 @@ from .._version import __version__
 from ..estimate import Belief, Filter, predict, update
 from ..estimate._filter import sensed
 from ..estimate._process_noise import MODES
-from ._source import COMPARE, C, CText, in_comment, sections_of, variable_units
+from ._source import COMPARE, C, CText, in_comment, listed, sections_of, variable_units
 
 
 class ExportedFilter(NamedTuple):
@@ -191,14 +190,6 @@ class _FilterText(CText):
         units, eps = variable_units(filter.system), float(np.finfo(formulas.dtype).eps)
         of_parameter = {a.name: a.info.unit for a in formulas.of_kind("parameters")}
         in_mean = [*(units.get(name) for name in self.rows), *(of_parameter[name] for name in filter.parameters)]
-
-        def listed(array: str, names: Sequence[str], units: Sequence[str | None] | None = None) -> str:
-            units = [""] * len(names) if units is None else units
-            lines = [
-                in_comment(f"   {array}[{i}]: {name}{f' [{unit}]' if unit else ''}")
-                for i, (name, unit) in enumerate(zip(names, units, strict=True))
-            ]
-            return "\n".join(lines or [f"   {array}: none; may be null"])
 
         return text.substitute(
             title=in_comment(f"{formulas.name}: a Kalman filter, {filter.method}, written by jaxkane {__version__}"),

@@ -26,7 +26,7 @@ from .._scalarjit.graph import needed
 from .._system.system import State, System, packed, unit_of
 from .._version import __version__
 from ._filter import all_rates
-from ._source import CText, in_comment, sections_of, six_a_line, variable_units
+from ._source import CText, in_comment, listed, sections_of, six_a_line, variable_units, words_by_node
 
 
 class Role(NamedTuple):
@@ -103,17 +103,13 @@ class FMUModel(CText):
             "inputs": inputs + [f"y[{n_motion + i}]" for i in range(len(system.states))],
             "parameters": [f"p[{i}]" for i in range(len(formulas.names("parameters")))],
         }
-        in_order, by_node = {kind: iter(texts) for kind, texts in words.items()}, {}
+        by_node, n = words_by_node(formulas, words), len(formulas.arguments)
         for i, (a, nodes) in enumerate(zip(formulas.arguments, formulas.inputs, strict=True)):
-            if a.kind not in words:  # dependent speeds, which these functions compute
-                continue
-            self.directions[i] = np.empty(nodes.shape, np.int64)
-            for e, k in enumerate(nodes.flat):
-                place = (len(formulas.arguments) + i, e, len(a.elements))
-                direction = formulas.graph.add("input", place, formulas.dtype)
-                self.directions[i].flat[e] = direction
-                by_node[int(k)] = next(in_order[a.kind])
-                by_node[direction] = f"d{by_node[int(k)]}"
+            if a.kind in words:  # not the dependent speeds, which these functions compute
+                places = [(n + i, e, nodes.size) for e in range(nodes.size)]
+                directions = [formulas.graph.add("input", place, formulas.dtype) for place in places]
+                self.directions[i] = np.array(directions, np.int64).reshape(nodes.shape)
+                by_node |= {d: f"d{by_node[int(k)]}" for d, k in zip(directions, nodes.flat, strict=True)}
         return by_node
 
     def _write_formulas(self) -> None:
@@ -231,9 +227,7 @@ class FMUModel(CText):
         """Start values, bounds and names, and the properties of the events."""
         parameters, events = self.parameters(), self.events
         groups = {"p": [x.name for x in parameters], "w": self.formulas.system.inputs, "y": self.states}
-        comments = [
-            in_comment(f"   {word}[{i}]: {name}") for word, names in groups.items() for i, name in enumerate(names)
-        ]
+        comments = [listed(word, names) for word, names in groups.items()]
         is_positive = [a.info.positive for a in self.formulas.of_kind("parameters") for _ in a.elements]
         lines = [
             *["/* Parameters, inputs and states:", "", *comments, "*/"],

@@ -159,7 +159,7 @@ def stablehlo(
                 'To save a program, JAX needs flatbuffers: pip install "jaxkane[stablehlo]". Or omit `path`.'
             ) from error
     formulas = _checked_formulas(system, dtype, function, "stablehlo")
-    if isinstance(platforms, str) or not platforms or not set(_PLATFORMS).issuperset(platforms):
+    if isinstance(platforms, str) or not platforms or not all(x in _PLATFORMS for x in platforms):
         kind = TypeError if isinstance(platforms, str) else ValueError
         raise kind(f"`platforms` must be a sequence of some of {', '.join(_PLATFORMS)}; got {platforms!r}.")
     u_dep = np.zeros(len(formulas.names("u_dep")), formulas.dtype)  # the functions of `OFFERED` do not use them

@@ -9,7 +9,7 @@ import builtins
 import keyword
 import re
 import unicodedata
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -116,6 +116,13 @@ def _meaning(formulas: Formulas, function: str) -> str:
     return f": {', '.join(formulas.names('u_dep'))}" if function == "dependent_speeds" else ""
 
 
+def words_by_node(formulas: Formulas, words: Mapping[str, Iterable[str]]) -> dict[int, str]:
+    """The expressions of input nodes, from those of all elements of each kind of argument, in order."""
+    remaining = {kind: iter(of_kind) for kind, of_kind in words.items()}
+    pairs = [(a, nodes) for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True) if a.kind in remaining]
+    return {int(k): next(remaining[a.kind]) for a, nodes in pairs for k in nodes.flat}
+
+
 def _is_read(word: str, text: str) -> bool:
     """Whether source code uses a variable; members of other objects may have the same name."""
     return re.search(rf"(?<![\w.>]){re.escape(word)}(?!\w)", text) is not None
@@ -191,6 +198,16 @@ def six_a_line(texts: Sequence[str]) -> str:
 def in_comment(text: str) -> str:
     """A text that cannot end the comment that contains it."""
     return text.replace("*/", "* /").replace("\\", "/")
+
+
+def listed(array: str, names: Sequence[str], units: Sequence[str | None] | None = None) -> str:
+    """The elements of an array as lines of a comment in C."""
+    units = [None] * len(names) if units is None else units
+    lines = [
+        in_comment(f"   {array}[{i}]: {name}{f' [{unit}]' if unit else ''}")
+        for i, (name, unit) in enumerate(zip(names, units, strict=True))
+    ]
+    return "\n".join(lines or [f"   {array}: none; may be null"])
 
 
 COMPARE = """
@@ -285,11 +302,13 @@ class CText:
         self.type = TYPES[formulas.dtype]
         parameters = [a.name for a in formulas.of_kind("parameters")]
         self.members = dict(zip(parameters, identifiers(parameters, C_WORDS), strict=True))
-        self.input_words = {
-            int(k): (f"p->{self.members[a.name]}" if a.kind == "parameters" else a.kind) + f"[{i}]" * bool(a.shape)
-            for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True)
-            for i, k in enumerate(nodes.flat)
-        }
+        texts = {kind: [f"{kind}[{i}]" for i in range(len(formulas.names(kind)))] for kind in (*_VECTORS, "u_dep")}
+        of_parameters = [
+            f"p->{self.members[a.name]}" + f"[{i}]" * bool(a.shape)
+            for a in formulas.of_kind("parameters")
+            for i in range(len(a.elements))
+        ]
+        self.input_words = words_by_node(formulas, {"t": ["t"], **texts, "parameters": of_parameters})
 
     def constant(self, x: Any) -> str:
         return C.constant(x, self.formulas.dtype)
@@ -366,11 +385,8 @@ class _CModule(CText):
         lines += [f"extern const {self.name}_parameters {self.name}_default;", ""]
         lines += ["/* Arguments of the functions:", "", "   t: time [s]"]
         for kind in _VECTORS:
-            for i, name in enumerate(self.formulas.names(kind)):
-                unit = f" [{unit_of[name]}]" if unit_of.get(name) else ""
-                lines.append(in_comment(f"   {kind}[{i}]: {name}{unit}"))
-            if not self.formulas.names(kind):
-                lines.append(f"   {kind}: none; may be null")
+            names = self.formulas.names(kind)
+            lines.append(listed(kind, names, [unit_of.get(name) for name in names]))
         lines += ["", "   Outputs, matrices row by row; they must not overlap the other arguments: */", ""]
         for function in self.functions:
             shapes = ", ".join(
@@ -547,13 +563,14 @@ def _words(formulas: Formulas, outputs: Iterable[str]) -> dict[tuple[str, str], 
 
 def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str:
     by_output = formulas.nodes(function)
-    words, of_node = _words(formulas, by_output), {}
-    for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True):
-        for place, k in np.ndenumerate(nodes):
-            if a.kind == "parameters":
-                of_node[int(k)] = words["parameters", a.name] + (f"[{', '.join(map(str, place))}]" if place else "")
-            elif a.kind != "u_dep":
-                of_node[int(k)] = words[a.kind, a.elements[place[0]]] if place else "t"
+    words = _words(formulas, by_output)
+    of_kind = {"t": ["t"], **{kind: [words[kind, name] for name in formulas.names(kind)] for kind in _VECTORS}}
+    of_kind["parameters"] = [
+        words["parameters", a.name] + (f"[{', '.join(map(str, place))}]" if place else "")
+        for a in formulas.of_kind("parameters")
+        for place in np.ndindex(a.shape)
+    ]
+    of_node = words_by_node(formulas, of_kind)
     # No other name has the form of the names of intermediate results.
     letters = ("x", "z", *(f"x{'_' * n}" for n in range(1, 10)))
     letter = next(x for x in letters if not any(re.fullmatch(rf"{x}\d+", word) for word in words.values()))
@@ -564,7 +581,7 @@ def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str
     lines.append(f"def {function}(t, q, u, inputs=(), parameters=PARAMETERS):")
     lines.append(f'    """{", ".join(by_output)}{_meaning(formulas, function)}."""')
     for kind in _VECTORS:
-        names = [words[kind, name] for name in formulas.names(kind)]
+        names = of_kind[kind]
         if any(_is_read(word, text) for word in names):
             units = ", ".join(unit_of.get(name) or "-" for name in formulas.names(kind))
             right = f"np.asarray({kind}, np.{formulas.dtype})"

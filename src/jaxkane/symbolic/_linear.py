@@ -172,7 +172,8 @@ class _FormulasAtMotion:
 
     def _value(self, name: str, x: Any) -> Expression:
         """A number, an expression, or a string in which declared names are the declared symbols."""
-        sp, value = import_sympy(), None
+        sp = import_sympy()
+        value: Any = None
         # the last two for "f(", "1.x" and such
         with contextlib.suppress(sp.SympifyError, TypeError, AttributeError):
             value = exact(x, "float64") if isinstance(x, float) else sp.sympify(x, locals=dict(self.symbols))

@@ -1,17 +1,79 @@
 """Graphs of scalars as LLVM text, and the wrapper by which XLA calls a kernel. Does not compile.
 
-The wrapper reads and writes XLA's structures at fixed offsets (`ffi_layout`).
+The wrapper reads and writes XLA's structures at fixed byte offsets. With wrong offsets it would use invalid pointers.
+Therefore `mismatch` compares their fields with the header of jaxlib before any kernel is compiled.
 """
 
 from __future__ import annotations
 
+import re
+import types
 from collections.abc import Callable, Iterator, Sequence, Set
-from typing import Any
+from pathlib import Path
 
+import jax
 import numpy as np
 
 from ..graph import LIBRARY, Graph, NotScalarError, depth_first, needed, symbol
-from .ffi_layout import LAYOUT
+
+# Byte offsets in the structures of xla/ffi/api/c_api.h, major version 0, with addresses of eight bytes.
+LAYOUT = types.SimpleNamespace(
+    frame_extension=8,
+    frame_arguments=40,
+    frame_results=80,
+    list_items=32,
+    buffer_data=24,
+    extension_type=8,
+    extension_metadata=24,
+    metadata_major=24,
+    metadata_minor=28,
+    metadata_traits=32,
+)
+
+# The fields of each structure that `LAYOUT` has an offset in. A later version may append fields to `_MAY_GROW`, which
+# no other structure contains. The wrapper does not read such fields.
+_MAY_GROW = ("CallFrame", "Buffer", "Metadata")
+_STRUCTURES = {
+    "InternalExtension": "size_t struct_size; InternalExtension_Type type; struct InternalExtension* next;",
+    "Args": "size_t struct_size; InternalExtension* extension_start; int64_t size; ArgType* types; void** args;",
+    "Rets": "size_t struct_size; InternalExtension* extension_start; int64_t size; RetType* types; void** rets;",
+    "Buffer": "size_t struct_size; InternalExtension* extension_start; DataType dtype; void* data; int64_t rank; "
+    "int64_t* dims;",
+    "CallFrame": "size_t struct_size; InternalExtension* extension_start; const Api* api; InvokeContext* ctx; "
+    "ExecutionStage stage; Args args; Rets rets; Attrs attrs;",
+    "Metadata_Extension": "InternalExtension extension_base; Metadata* metadata;",
+    "Metadata": "size_t struct_size; Api_Version api_version; Handler_Traits traits;",
+    "Api_Version": "size_t struct_size; InternalExtension* extension_start; int major_version; int minor_version;",
+}
+# Names in jaxlib 0.10, and those of later versions.
+_RENAMED = {
+    "Extension_Base": "InternalExtension",
+    " Extension_Type ": " InternalExtension_Type ",
+    "ExecutionContext": "InvokeContext",
+}
+
+
+def mismatch(header: Path | None = None) -> str | None:
+    """The reason why kernels cannot be called with `LAYOUT`; None if they can.
+
+    `header`: the file to read, by default the one that jaxlib contains.
+    """
+    header = header or Path(jax.ffi.include_dir(), "xla/ffi/api/c_api.h")
+    try:
+        text = header.read_text(encoding="utf-8")
+    except OSError as error:
+        return f"the header of jaxlib, which states how kernels are called, cannot be read: {error}"
+    text = re.sub(r"//[^\n]*", "", text).replace("XLA_FFI_", "")
+    for old, new in _RENAMED.items():
+        text = text.replace(old, new)
+    found = {name: " ".join(fields.split()) for name, fields in re.findall(r"struct (\w+) \{([^{}]*)\}", text)}
+    for name in _MAY_GROW:
+        found[name] = found.get(name, "")[: len(_STRUCTURES[name])]
+    changed = [f"struct XLA_FFI_{name}" for name, fields in _STRUCTURES.items() if found.get(name) != fields]
+    if not re.search(r"#define API_MAJOR 0\b", text):
+        changed.append("XLA_FFI_API_MAJOR")
+    return f"jaxlib calls kernels in another way ({header}: {', '.join(changed)} has changed)" if changed else None
+
 
 _METADATA = 1
 _API_VERSION = (0, 1)
@@ -43,12 +105,12 @@ def wrapper_text(
         f"%out = alloca ptr, i64 {max(n_out, 1)}",
         *_load("extension", "ptr", "frame", LAYOUT.frame_extension),
         "%plain = icmp eq ptr %extension, null",
-        "br i1 %plain, label %run, label %asked",
-        "asked:",
+        "br i1 %plain, label %run, label %extended",
+        "extended:",
         *_load("type", "i32", "extension", LAYOUT.extension_type),
         f"%is.metadata = icmp eq i32 %type, {_METADATA}",
-        "br i1 %is.metadata, label %tell, label %run",
-        "tell:",
+        "br i1 %is.metadata, label %describe, label %run",
+        "describe:",
         *_load("metadata", "ptr", "extension", LAYOUT.extension_metadata),
         *_store("major", f"i32 {_API_VERSION[0]}", "metadata", LAYOUT.metadata_major),
         *_store("minor", f"i32 {_API_VERSION[1]}", "metadata", LAYOUT.metadata_minor),
@@ -233,7 +295,10 @@ class Writer:
         if node.operation != "constant":
             return f"%v{k}"
         number = self.graph.value(k)
-        return str(number).lower() if node.dtype == "bool" else _digits(number, node.dtype)
+        if node.dtype == "bool":
+            return str(number).lower()
+        # LLVM writes floats as the bits of a double, also those in single precision.
+        return f"0x{np.float64(np.dtype(node.dtype).type(number)).view(np.uint64):016X}"
 
     def _in_lanes(self, k: int) -> str:
         """The name of node k as a vector of all lanes."""
@@ -246,22 +311,18 @@ class Writer:
         if k not in self.splats:
             # LLVM would move an address that is computed outside the loop into it, which takes long.
             self.lines.append(f"%s{k} = load {kind}, ptr {self._kept(k, 'read')}")
-            self.splats[k] = self._splat(f"%s{k}", kind, lanes)
+            vector, self.splats[k] = f"<{lanes} x {kind}>", f"%s{k}"
+            if lanes > 1:
+                self.splats[k] = f"%s{k}.n"
+                self.lines += [
+                    f"%s{k}.1 = insertelement {vector} poison, {kind} %s{k}, i64 0",
+                    f"%s{k}.n = shufflevector {vector} %s{k}.1, {vector} poison, <{lanes} x i32> zeroinitializer",
+                ]
         return self.splats[k]
 
     def _kept(self, k: int, tag: str) -> str:
         self.lines.append(f"%{tag}{k} = getelementptr double, ptr %kept, i64 {self.places[k]}")
         return f"%{tag}{k}"
-
-    def _splat(self, scalar: str, kind: str, lanes: int) -> str:
-        if lanes == 1:
-            return scalar
-        self.lines.append(f"{scalar}.1 = insertelement <{lanes} x {kind}> poison, {kind} {scalar}, i64 0")
-        self.lines.append(
-            f"{scalar}.n = shufflevector <{lanes} x {kind}> {scalar}.1, <{lanes} x {kind}> poison, "
-            f"<{lanes} x i32> zeroinitializer"
-        )
-        return f"{scalar}.n"
 
     def _node(self, k: int, lanes: int) -> None:
         """Node k, as one value for all lanes or as a vector of all lanes."""
@@ -379,9 +440,3 @@ class Writer:
                 one = f"%{tag}.{lane}.v"
                 self.lines.append(f"{one} = extractelement <{lanes} x {kind}> {value}, i64 {lane}")
             self.lines.append(f"store {kind} {one}, ptr {at}")
-
-
-def _digits(value: Any, dtype: str) -> str:
-    """A float in LLVM's notation: the bits of a double, also for a float32."""
-    number = np.float64(value) if dtype == "float64" else np.float64(np.float32(value))
-    return f"0x{number.view(np.uint64):016X}"

@@ -15,8 +15,7 @@ import numpy as np
 from ..compat import ClosedJaxpr, types_of
 from ..graph import LIBRARY, Graph, NotScalarError, graph_of, symbol
 from .compiler import LLVMCompiler, ObjectCache, cache_folder, without_llvm
-from .ffi_layout import mismatch
-from .llvm import Writer, wrapper_text
+from .llvm import Writer, mismatch, wrapper_text
 
 _ON, _OFF = ("", "1", "true", "yes", "on"), ("0", "false", "no", "off")
 
