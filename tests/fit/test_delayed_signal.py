@@ -8,9 +8,9 @@ import scipy.integrate
 from systems import Track
 
 from jaxkane.fit import Delay, Gain, LowPass, Offset, Simulation, Trial, fit, forward_selection
-from jaxkane.fit.problem import sensor_dynamics
+from jaxkane.fit.problem import model
 
-delayed_signal, low_passed = jax.jit(sensor_dynamics.delayed_signal), jax.jit(sensor_dynamics.low_passed)
+delayed_signal, low_passed = jax.jit(model.delayed_signal), jax.jit(model.low_passed)
 T = jnp.linspace(0.0, 1.0, 41)
 
 

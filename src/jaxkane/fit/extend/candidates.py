@@ -57,7 +57,6 @@ class Candidate:
         return self.system is None and not self.unknown
 
     def names(self, system: System) -> tuple[str, ...]:
-        """Names of its parameters."""
         return _names_of(self.system or system, *self.items)
 
 
@@ -163,7 +162,6 @@ def _unbounded(system: System, item: Declaration, always: bool = False) -> tuple
 
 
 def _names_of(system: System, *items: Declaration) -> tuple[str, ...]:
-    """Names of the parameters that the items free."""
     return parameters_of(system, [item for item in items if not item.is_eliminated]).names
 
 
@@ -191,25 +189,18 @@ def compatible_groups(fit: Fit, candidates: Sequence[Candidate]) -> list[list[Ca
     A delay of an input under a zero-order hold has a group of its own. The delay replaces discontinuities of the input
     by ramps of two steps, so the trajectories differ slightly even for a zero delay.
     """
-    groups: list[list[Candidate]] = []
+    groups: list[tuple[Any, list[Candidate]]] = []
     for candidate in candidates:
-        group = next((group for group in groups if _are_compatible(fit, group[0], candidate)), None)
+        delayed = {name for item in candidate.items if isinstance(item, Delay) for name in item.channels}
+        delayed &= {*fit.problem.model.zero_order_hold}
+        kind = candidate.system or fit.problem.system, deviations_by_name(candidate.unknown), delayed
+        group = next(
+            (group for other, group in groups if other[1:] == kind[1:] and eqx.tree_equal(other[0], kind[0])), None
+        )
         if group is None:
-            groups.append([candidate])
-        else:
-            group.append(candidate)
-    return groups
-
-
-def _are_compatible(fit: Fit, a: Candidate, b: Candidate) -> bool:
-    same = deviations_by_name(a.unknown) == deviations_by_name(b.unknown) and _delayed(fit, a) == _delayed(fit, b)
-    return same and bool(eqx.tree_equal(*(c.system or fit.problem.system for c in (a, b))))
-
-
-def _delayed(fit: Fit, candidate: Candidate) -> set[str]:
-    """Inputs under a zero-order hold that a candidate delays."""
-    delayed = {name for item in candidate.items if isinstance(item, Delay) for name in item.channels}
-    return delayed & {*fit.problem.model.zero_order_hold}
+            groups.append((kind, group := []))
+        group.append(candidate)
+    return [group for _, group in groups]
 
 
 def extended_specification(base: ProblemSpec, candidates: Sequence[Candidate]) -> ProblemSpec:
@@ -217,7 +208,7 @@ def extended_specification(base: ProblemSpec, candidates: Sequence[Candidate]) -
 
     **Raises:** `ValueError` if two of them free the same parameter differently, or have incompatible systems.
     """
-    system = base.system
+    system, free = base.system, [*base.free]
     for candidate in candidates:
         other = candidate.system
         if other is None or bool(eqx.tree_equal(other, system)):
@@ -230,20 +221,20 @@ def extended_specification(base: ProblemSpec, candidates: Sequence[Candidate]) -
                 f"{type(system).__name__}, the `system` of another candidate. Derive one class from the other."
             )
         system = other
-    items: list[tuple[Any, tuple[str, ...]]] = []
-    for item in (item for candidate in candidates for item in candidate.items):
-        names = _names_of(system, item)
-        same = [other for other, other_names in items if set(other_names) & set(names)]
-        if any(other is not item and not bool(other == item) for other in same):
-            raise ValueError(
-                f"Two candidates free {', '.join(names)} with different options. Use the same declaration in both."
-            )
-        if not same:
-            items.append((item, names))
-    unknown = deviations_by_name(base.unknown)
+    unknown, items = deviations_by_name(base.unknown), {}
     for candidate in candidates:
         unknown |= deviations_by_name(candidate.unknown)
-    return dataclasses.replace(base, system=system, free=[*base.free, *(item for item, _ in items)], unknown=unknown)
+        for item in candidate.items:
+            names = _names_of(system, item)
+            same = [other for name, other in items.items() if name in names]
+            if any(other is not item and not bool(other == item) for other in same):
+                raise ValueError(
+                    f"Two candidates free {', '.join(names)} with different options. Use the same declaration in both."
+                )
+            if not same:
+                free.append(item)
+                items |= dict.fromkeys(names, item)
+    return dataclasses.replace(base, system=system, free=free, unknown=unknown)
 
 
 def augmented_problem(
@@ -268,23 +259,18 @@ def augmented_problem(
     return problem, mapped_point(source, point, problem, names)
 
 
-def with_scales(candidate: Candidate, problem: Problem, norms: np.ndarray, size: float) -> Candidate:
+def with_scales(candidate: Candidate, problem: Problem, norms: np.ndarray) -> Candidate:
     """The candidate with a scale for each parameter that starts at zero and has no scale.
 
-    The scale is the value that changes the residuals by `size`, if the columns of the linearized problem have these
-    `norms` (p,). The default scale of 1 depends on the units: with masses of 1e-12 kg, the data seem to be insensitive
-    to all other parameters.
+    `norms` (p,): the change of the residuals by each parameter, as a fraction of their size.
     """
-    names, starts = problem.parameters.names, np.asarray(problem.parameters.start)
-
-    def scaled(item: Declaration) -> Declaration:
+    names, starts, free = problem.parameters.names, np.asarray(problem.parameters.start), []
+    for item in candidate.items:
         places = [names.index(name) for name in _names_of(problem.system, item)]
-        norm = np.linalg.norm(norms[places])
-        if not isinstance(item, (Free, CalibrationTerm)) or item.scale is not None or starts[places].any() or not norm:
-            return item
-        return dataclasses.replace(item, scale=float(size / norm))
-
-    return dataclasses.replace(candidate, free=tuple(map(scaled, candidate.items)))
+        norm = float(np.linalg.norm(norms[places]))
+        unscaled = isinstance(item, (Free, CalibrationTerm)) and item.scale is None and not starts[places].any()
+        free.append(dataclasses.replace(item, scale=1.0 / norm) if unscaled and norm else item)
+    return dataclasses.replace(candidate, free=tuple(free))
 
 
 def mapped_point(source: Problem, at: Unknowns, problem: Problem, names: Sequence[str]) -> Unknowns:

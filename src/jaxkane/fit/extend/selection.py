@@ -80,8 +80,7 @@ class ForwardSelection:
             rows = [("also accepted", "cost", "held-out cost", "compared with the selection")]
             for one in self.alternatives:
                 held_out = "" if math.isnan(one.held_out_cost) else f"{one.held_out_cost:.5g}"
-                told = "predicts as well" if one.is_as_good else ""
-                rows.append((", ".join(one.names), f"{one.cost:.5g}", held_out, told))
+                rows.append((", ".join(one.names), f"{one.cost:.5g}", held_out, "predicts as well" * one.is_as_good))
             tables.append(("Alternatives.", rows))
         return tables
 
@@ -200,7 +199,7 @@ def forward_selection(
     after = fit
     if best.changes:  # refit in the specification that a user would write
         problem = fit.problem.with_specification(extended_specification(terms.base, best.model.terms))
-        start = mapped_point(best.model.problem, best.model.point, problem, best.model.names)
+        start = mapped_point(best.model.fit.problem, best.model.fit.point, problem, best.model.fit.names)
         after = solve(problem, LeastSquares(), start=start)
     # A subset of the selected model is an earlier stage of it, not an alternative.
     others = {branch.model.key: branch for branch in accepted if not branch.model.key <= best.model.key}
@@ -209,12 +208,12 @@ def forward_selection(
     return ForwardSelection(
         before=fit,
         rounds=tuple(round.extensions for round in best.rounds),
-        costs=tuple(round.model.cost for round in best.rounds),
+        costs=tuple(round.model.fit.cost for round in best.rounds),
         held_out_costs=tuple(round.model.held_out_cost for round in best.rounds),
         selected=selected,
         removed=tuple(c.name for c in terms.removable if c not in best.model.terms),
         held_out=kind,
-        alternatives=tuple(branch.model.beside(best.model) for branch in others),
+        alternatives=tuple(branch.model.compared_with(best.model) for branch in others),
         level=level,
         bound_violations=tuple({**energy_sources(after), **best.model.bound_violations}.values()),
         fit=after,

@@ -96,7 +96,6 @@ class Free(Declaration):
     each: str | None = None
 
     def parts(self, system: System, noise: Any = None, channels: Sequence[str] = ()) -> list[Part]:
-        """One part per entry of the selected leaves."""
         if not isinstance(self.tied, Mapping):
             raise TypeError(f"`tied` must be a dict from names to factors, such as {{'rF': 1.0}}, got {self.tied!r}.")
         chosen, leaves = find_leaves(system, self.where)
@@ -181,7 +180,6 @@ class CalibrationTerm(Named):
     def parts(
         self, system: System, noise: Mapping[str, float] | None = None, channels: Sequence[str] = ()
     ) -> list[Part]:
-        """One value, with a role for each name."""
         kind, wheres = self.kind, [self._where(system, name) for name in self.channels]
         if noise is not None and "sensor" in wheres and isinstance(self, (Delay, LowPass)):
             state = "delayed" if isinstance(self, Delay) else "low_pass"
@@ -319,7 +317,6 @@ class NoiseTerm(Named):
     def parts(
         self, system: System, noise: Mapping[str, float] | None = None, channels: Sequence[str] = ()
     ) -> list[Part]:
-        """One positive value."""
         title, is_density = f"{type(self).__name__}({self.what!r})", isinstance(self, SpectralDensity)
         if noise is None:
             raise ValueError(

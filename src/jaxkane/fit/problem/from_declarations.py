@@ -66,7 +66,6 @@ class Linear:
 
     @property
     def text(self) -> str:
-        """The sum as text."""
         parts = [name if c == 1 else f"{c:g} {name}" for name, c in self.factors.items()]
         return " + ".join(parts)
 
@@ -180,7 +179,6 @@ class JointRow(NamedTuple):
 
 
 def _joint_priors(names: Sequence[str], rows: Sequence[JointRow]) -> dict[str, Any]:
-    """The fields of `Parameters` for joint priors."""
     n, matrix = len(names), np.zeros((len(rows), 2 * len(names)))
     for k, row in enumerate(rows):
         for name, factor in row.factors.items():

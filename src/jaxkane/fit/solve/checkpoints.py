@@ -110,7 +110,12 @@ def described(problem: Problem) -> dict[str, Any]:
         return jax.tree.map(lambda x: np.asarray(x)[0], tree)
 
     window, point = first(problem.windows), problem.start
-    fixed, guessed = _fixed_and_guessed(problem)
+    changed = {number for entry in problem.parameters.entries for number, *_ in entry.targets}
+    leaves = [
+        (i, leaf_name(path), x) for i, (path, x) in enumerate(jax.tree_util.tree_leaves_with_path(problem.system))
+    ]
+    fixed = {name: x for i, name, x in leaves if eqx.is_array(x) and i not in changed}
+    guessed = [x for i, _, x in leaves if eqx.is_array(x) and i in changed]
 
     def residuals(numbers, window, z, b, x):
         model = eqx.combine(numbers, rest)
@@ -142,11 +147,3 @@ def described(problem: Problem) -> dict[str, Any]:
             )
         ),
     }
-
-
-def _fixed_and_guessed(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
-    """The arrays of the system that the fit does not change, by name, and those that contain its initial guesses."""
-    moved = {number for entry in problem.parameters.entries for number, *_ in entry.targets}
-    leaves = jax.tree_util.tree_leaves_with_path(problem.system)
-    arrays = [(i, leaf_name(path), x) for i, (path, x) in enumerate(leaves) if eqx.is_array(x)]
-    return {name: x for i, name, x in arrays if i not in moved}, [x for i, _, x in arrays if i in moved]

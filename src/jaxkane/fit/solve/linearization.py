@@ -80,13 +80,12 @@ def blocks_of(
     # If there are few windows, they are divided, because cluster-robust errors need the scores of several parts.
     n_parts = -(-PARTS // windows.t.shape[0]) if model.noise is None and not n_next else 1
 
+    # The transcription gives residuals, derivatives and a prediction. All else is the same for every transcription.
+    rows_of = jacobian_of if model.noise is None else information_of
+
     def window_block(arguments):
         window, z, z_next, b, start, start_dot = arguments
-        if model.noise is None:
-            r, J, prediction = jacobian_of(model, window, start, start_dot, z, b, point.parameters)
-        else:
-            J, r, value, result = information_of(model, window, start, start_dot, z, b, point.parameters)
-            prediction = Prediction(result.predicted, result.status, result.deviation, value, result.unknowns)
+        r, J, prediction = rows_of(model, window, start, start_dot, z, b, point.parameters)
         links = by_next(model, window, r.shape[0])[:, :n_next]
         A = jnp.column_stack([J[:, :n_z], links, J[:, n_z:], r + links @ z_next[:n_next]])
         # For least squares, the triangle is equivalent to the (m, k) matrix. Invalid rows are masked before and set to
