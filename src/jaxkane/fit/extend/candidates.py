@@ -18,6 +18,7 @@ from ..problem.model import Simulation, Unknowns
 from ..problem.parameters import Interval, with_entries
 from ..problem.problem import Problem
 from ..problem.specification import Names, ProblemSpec, deviations_by_name
+from ..problem.trial import refuse
 from ..result.fit_result import Fit
 
 Bounds = tuple[float | None, float | None]
@@ -102,19 +103,37 @@ def checked_terms(fit: Fit, candidates: Candidates, remove: str | Sequence[str] 
             item = dataclasses.replace(item, start=type(item).start if isinstance(item, CalibrationTerm) else None)
         free, bounds = _unbounded(system, item, always=True)
         removable.append(Candidate(", ".join(names), free=(free,), plausible=bounds))
-    if not (candidates or removable):
-        raise ValueError(
-            "forward_selection: `candidates` is empty. Pass names of parameters, `Gain`, `Offset`, `Delay` or "
-            "`Candidate`."
-        )
     names = [candidate.name for candidate in (*removable, *candidates)]
     twice = sorted({name for name in names if names.count(name) > 1} - {c.name for c in removable})
-    if twice:
-        raise ValueError(
-            f"Two candidates have the name {', '.join(twice)}. Give each candidate its own name: Candidate(name, ...)."
-        )
+    refuse(
+        (
+            not names,
+            "forward_selection: `candidates` is empty. Pass names of parameters, `Gain`, `Offset`, `Delay` or "
+            "`Candidate`.",
+        ),
+        (
+            twice,
+            f"Two candidates have the name {', '.join(twice)}. Give each candidate its own name: Candidate(name, ...).",
+        ),
+    )
+    known = deviations_by_name(fit.problem.specification.unknown)
     for candidate in candidates:
-        _refuse_nothing_new(fit, candidate)
+        names = candidate.names(fit.problem.system)
+        free = ", ".join(name for name in names if name in fit.names)
+        starts = ", ".join(name for name in deviations_by_name(candidate.unknown) if name in known)
+        refuse(
+            (free, f"{candidate.name}: the fit already estimates {free}. Omit this candidate."),
+            (
+                starts,
+                f"{candidate.name}: the initial values of {starts} are already `unknown` in the fit. Omit them from "
+                "the candidate.",
+            ),
+            (
+                not names and candidate.has_parameters_only,
+                f"{candidate.name}: the candidate adds no parameter and no unknown initial value. Pass `free` or "
+                "`unknown`.",
+            ),
+        )
     specification = dataclasses.replace(fit.problem.specification, free=tuple(base) or ())
     for group in compatible_groups(fit, candidates):
         extended_specification(specification, group)  # rejects inconsistent candidates
@@ -163,24 +182,6 @@ def _unbounded(system: System, item: Declaration, always: bool = False) -> tuple
 
 def _names_of(system: System, *items: Declaration) -> tuple[str, ...]:
     return parameters_of(system, [item for item in items if not item.is_eliminated]).names
-
-
-def _refuse_nothing_new(fit: Fit, candidate: Candidate) -> None:
-    names = candidate.names(fit.problem.system)
-    free = [name for name in names if name in fit.names]
-    if free:
-        raise ValueError(f"{candidate.name}: the fit already estimates {', '.join(free)}. Omit this candidate.")
-    known = deviations_by_name(fit.problem.specification.unknown)
-    starts = [name for name in deviations_by_name(candidate.unknown) if name in known]
-    if starts:
-        raise ValueError(
-            f"{candidate.name}: the initial values of {', '.join(starts)} are already `unknown` in the fit. Omit them "
-            "from the candidate."
-        )
-    if not names and candidate.has_parameters_only:
-        raise ValueError(
-            f"{candidate.name}: the candidate adds no parameter and no unknown initial value. Pass `free` or `unknown`."
-        )
 
 
 def compatible_groups(fit: Fit, candidates: Sequence[Candidate]) -> list[list[Candidate]]:

@@ -311,12 +311,12 @@ class Search:
             return (), {}
         share = 0.5 if pairs else 1.0  # split the level, so that pairs do not increase false positives
         groups, lost = self._groups(model, rest)
-        extensions, models = self._tried(model, groups, single, share * self.level / max(len(single), 1))
-        others, more = self._tried(model, groups, exchanges, self.level)
-        extensions, models = extensions + others, models | more
-        if pairs and not any(one.accepted for one in extensions):
-            others, more = self._tried(model, groups, pairs, share * self.level / len(pairs))
-            extensions, models = extensions + others, models | more
+        kinds = (single, share * self.level), (exchanges, self.level * len(exchanges)), (pairs, share * self.level)
+        extensions, models = [], {}
+        for moves, level in kinds:
+            if moves and not (moves is pairs and any(one.accepted for one in extensions)):
+                others, more = self._tried(model, groups, moves, level / len(moves))
+                extensions, models = extensions + others, models | more
         return tuple(sorted(extensions + lost, key=_order)), models
 
     def _groups(self, model: Model, rest: Sequence[Candidate]) -> tuple[dict[str, Group], list[Extension]]:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from ..._common.lookup import refuse_unknown
 from ..problem.from_declarations import parameters_of
 from ..problem.specification import refuse_other
+from ..problem.trial import refuse
 from ..result.comparison import Plausible, energy_sources, plausible_of
 from ..result.diagnostics import refuse_unless_at_a_minimum
 from ..result.fit_result import Fit
@@ -239,22 +240,24 @@ def _plausible_ranges(fit: Fit, terms: Terms, plausible: Mapping[str, Any]) -> P
 
 
 def _check_arguments(fit: Fit, depth: int, beam: int, refits: int | None, level: float) -> None:
-    if fit.problem.model.errors is not None:
-        raise ValueError(
+    refuse(
+        (
+            fit.problem.model.errors is not None,
             "forward_selection: the fit has error models, and the search compares sums of squares. Fit without "
-            "`errors`, or compare the `bic` of fits with each candidate."
-        )
-    if fit.problem.specification.noise is not None:
-        raise ValueError(
+            "`errors`, or compare the `bic` of fits with each candidate.",
+        ),
+        (
+            fit.problem.specification.noise is not None,
             "forward_selection: the fit has process noise, which can hide missing physics. Fit without `noise`, or "
-            "compare `fit.marginal_likelihood()` of fits with each candidate."
-        )
+            "compare `fit.marginal_likelihood()` of fits with each candidate.",
+        ),
+    )
     refuse_unless_at_a_minimum(fit.status, "forward_selection")  # a score test is only valid at a minimum
     for name, value, smallest in (
         ("depth", depth, 1),
         ("beam", beam, 1),
         ("refits", 0 if refits is None else refits, 0),
     ):
-        if not isinstance(value, int) or value < smallest:
-            raise ValueError(f"forward_selection: `{name}` must be an integer of at least {smallest}, got {value!r}.")
+        wrong = not isinstance(value, int) or value < smallest
+        refuse((wrong, f"forward_selection: `{name}` must be an integer of at least {smallest}, got {value!r}."))
     check_level(level)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..._common.lookup import real_number
+from ..._common.lookup import positive_number
 from ..._integrate.inputs import Samples, share_times, since
 from ..._integrate.integrate import solve
 from ..._integrate.settings import Settings, settings_for, with_array_tolerances
@@ -62,9 +62,8 @@ class Simulation:
 
     def __post_init__(self) -> None:
         for name in ("rtol", "atol", "step", "max_steps"):
-            value = getattr(self, name)
-            if value is not None and not 0 < real_number(value, f"`{name}`") < float("inf"):
-                raise ValueError(f"Simulation: `{name}` must be positive and finite, got {value}.")
+            if getattr(self, name) is not None:
+                positive_number(getattr(self, name), f"Simulation: `{name}`")
         if self.step is not None and (self.rtol is not None or self.atol is not None):
             raise ValueError(
                 "Simulation: `step` is given together with `rtol` or `atol`. Pass `step` for fixed steps, or `rtol` "

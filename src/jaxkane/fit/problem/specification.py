@@ -21,7 +21,7 @@ from .declarations import Delay
 from .from_declarations import JointPrior, Linear, as_items, parameters_of
 from .model import Nuisance, Simulation
 from .parameters import Parameters, Prior, floats
-from .trial import Trial
+from .trial import Trial, refuse
 from .windows import Reach, state_names
 
 Names = Sequence[str] | Mapping[str, float | None]
@@ -52,24 +52,35 @@ class ProblemSpec:
                 object.__setattr__(self, name, copy.copy(value))
         if self.simulation is not None:
             refuse_other(self.simulation, Simulation, "`simulation=`", "Simulation(step=0.01)")
-        if not isinstance(self.system, System):
-            raise TypeError(f"`system` must be a jaxkane.System, got {type(self.system).__name__}.")
-        for name in ("priors", "defect_std"):
-            if not isinstance(getattr(self, name), (Mapping, type(None))):
-                raise TypeError(f"`{name}` must be a dict by name, got {getattr(self, name)!r}.")
-        if self.window is not None and not real_number(self.window, "`window`") > 0:
-            raise ValueError(f"`window` must be a positive duration [s], got {self.window}.")
-        if self.defect_std is not None and self.window is None:
-            raise ValueError(
+        dicts = {"priors": self.priors, "defect_std": self.defect_std}
+        refuse(
+            (
+                not isinstance(self.system, System),
+                f"`system` must be a jaxkane.System, got {type(self.system).__name__}.",
+            ),
+            *(
+                (not isinstance(x, (Mapping, type(None))), f"`{n}` must be a dict, got {x!r}.")
+                for n, x in dicts.items()
+            ),
+            error=TypeError,
+        )
+        other = "noise" if self.noise is not None else "defect_std"
+        refuse(
+            (
+                self.window is not None and not real_number(self.window, "`window`") > 0,
+                f"`window` must be a positive duration [s], got {self.window}.",
+            ),
+            (
+                self.defect_std is not None and self.window is None,
                 "`defect_std` is given without `window`. Pass the length of a window [s]: `defect_std` links the "
-                "windows of a trial."
-            )
-        if self.errors is not None and (self.noise is not None or self.defect_std is not None):
-            other = "noise" if self.noise is not None else "defect_std"
-            raise ValueError(
+                "windows of a trial.",
+            ),
+            (
+                self.errors is not None and getattr(self, other) is not None,
                 f"Pass either `errors` or `{other}`, not both. Error models require a motion without process noise. "
-                "With `noise`, `NoiseScale` in `free` estimates the standard deviation of a channel."
-            )
+                "With `noise`, `NoiseScale` in `free` estimates the standard deviation of a channel.",
+            ),
+        )
 
 
 F = TypeVar("F", bound=Callable[..., Any])
