@@ -72,18 +72,13 @@ class Extension:
 
     @property
     def cells(self) -> tuple[str, ...]:
-
-        def number(x, form=".5g"):
-            return "" if math.isnan(x) else f"{x:{form}}"
-
         known = [name for name in self.parameters if not math.isnan(self.errors[name])]
         estimates = ", ".join(f"{self.values[name]:.4g}" for name in known)
         errors = ", ".join(f"{self.errors[name]:.2g}" for name in known)
-        costs, decision = (number(self.predicted_cost), number(self.cost)), self.reason or "accepted"
-        return (
-            *(self.name, estimates, errors, *costs),
-            *(number(self.p, ".2g"), self.criterion, number(self.held_out_cost), decision),
-        )
+        numbers = (self.predicted_cost, ".5g"), (self.cost, ".5g"), (self.p, ".2g"), (self.held_out_cost, ".5g")
+        predicted, cost, p, held_out = ("" if math.isnan(x) else f"{x:{form}}" for x, form in numbers)
+        decision = self.reason or "accepted"
+        return self.name, estimates, errors, predicted, cost, p, self.criterion, held_out, decision
 
 
 @dataclasses.dataclass(frozen=True)

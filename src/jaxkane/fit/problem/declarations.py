@@ -34,6 +34,7 @@ class Part(NamedTuple):
     priors: list[tuple[float, float] | None]
 
 
+@dataclasses.dataclass(frozen=True)
 class Declaration(abc.ABC):
     """An element of the argument `free` of a fit. Subclasses are frozen dataclasses."""
 

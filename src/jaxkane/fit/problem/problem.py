@@ -215,14 +215,11 @@ class Problem:
     def start(self) -> Unknowns:
         """The initial guess: parameters of the system, unknowns of trials at their prior means (or initial guesses),
         and windows that start at their first measurements."""
-        p, T, W, nuisance = len(self.parameters.entries), len(self.trials), len(self.slices), self.model.nuisance
-
-        def zeros(*shape):
-            return on_device(np.zeros(shape, self.windows.t.dtype))
-
+        nuisance, T, W = self.model.nuisance, len(self.trials), len(self.slices)
+        shapes = (self.parameters.size,), (T, len(nuisance.trial)), (W, len(nuisance.window_names))
         names = self.parameters.names, nuisance.trial_names, nuisance.window_names
         meaning = (*names, *(np.asarray(x).tobytes() for x in (self.parameters.start, self.parameters.scale)))
-        return Unknowns(zeros(p), zeros(T, len(nuisance.trial)), zeros(W, len(nuisance.window_names)), meaning)
+        return Unknowns(*(on_device(np.zeros(shape, self.windows.t.dtype)) for shape in shapes), meaning=meaning)
 
     def at(self, values: Mapping[str, float], point: Unknowns | None = None) -> Unknowns:
         """The point with given values of parameters.
@@ -286,20 +283,14 @@ class Problem:
     @property
     def size(self) -> tuple[int, int]:
         """The number of residuals, including priors and defects, and the number of unknowns."""
-        n, active, T = self.model.nuisance, self.active_windows, self.clusters
-
-        def finite(x):
-            return int(np.isfinite(np.asarray(x)).sum())
-
-        residuals = int(np.sum(np.asarray(self.windows.weight) > 0)) + finite(self.parameters.prior_terms[2])
-        residuals += (T if n.has_defects else int(active.sum())) * finite(n.start_deviation) + T * finite(
-            n.trial_deviation
-        )
-        residuals += int(np.asarray(self.windows.linked)[active].sum()) * finite(n.defect_std)
-        residuals += int(active.sum()) * len(self.model.norms)
-        unknowns = len(self.parameters.entries) + T * len(n.trial) + int(active.sum()) * len(n.window_names)
-        unknowns += 0 if self.model.errors is None else self.model.errors.n_estimated
-        return residuals, unknowns
+        n, own, T = self.model.nuisance, self.active_windows, self.clusters
+        W, p = int(own.sum()), len(self.parameters.entries)
+        deviations = self.parameters.prior_terms[2], n.start_deviation, n.trial_deviation, n.defect_std
+        of_x, of_z, of_b, of_defect = (int(np.isfinite(np.asarray(x)).sum()) for x in deviations)
+        residuals = int(np.sum(np.asarray(self.windows.weight) > 0)) + of_x + (T if n.has_defects else W) * of_z
+        residuals += T * of_b + int(np.asarray(self.windows.linked)[own].sum()) * of_defect + W * len(self.model.norms)
+        of_errors = 0 if self.model.errors is None else self.model.errors.n_estimated
+        return residuals, p + T * len(n.trial) + W * len(n.window_names) + of_errors
 
     def log_density(self) -> Callable[[Unknowns], Array]:
         """The log posterior density, up to a constant, as a function of `Unknowns`.

@@ -222,19 +222,10 @@ class Trial:
             f"fewer than two samples are between {start:g} and {stop:g} s. The trial lasts from {self.t[0]:g} to "
             f"{self.t[-1]:g} s. Choose a longer part of it.",
         )
-
-        def cut(group):
-            return {key: value[inside] for key, value in group.items()}
-
-        return Trial(
-            self.t[inside],
-            cut(self.measured),
-            cut(self.inputs),
-            sigma=cut(self.sigma),
-            initial=cut(self.initial),
-            name=self.name,
-            labels=self.labels,
-        )
+        groups = self.measured, self.inputs, self.sigma, self.initial
+        measured, inputs, sigma, initial = ({key: x[inside] for key, x in group.items()} for group in groups)
+        kept: dict[str, Any] = {"name": self.name, "labels": self.labels}
+        return Trial(self.t[inside], measured, inputs, sigma=sigma, initial=initial, **kept)
 
     def with_initial_state(self, initial: Mapping[str, ArrayLike]) -> Trial:
         """A copy of the trial with other initial values, `initial` as in `Trial`."""

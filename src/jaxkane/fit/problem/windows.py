@@ -97,11 +97,8 @@ class Windows(eqx.Module):
             return times, self.inputs
         # One step before the window, because a ramp (`Ramps`) begins one step before its discontinuity.
         first = jnp.maximum(jnp.searchsorted(times, self.t[0] - self.step, side="right") - 1, 0)
-
-        def chosen(x):
-            return jax.lax.dynamic_slice_in_dim(x, first, self.n_acting, axis=-1)
-
-        return chosen(times), chosen(self.inputs)
+        chosen = (jax.lax.dynamic_slice_in_dim(x, first, self.n_acting, axis=-1) for x in (times, self.inputs))
+        return tuple(chosen)  # type: ignore[return-value]
 
     @property
     def shape(self) -> Shape:

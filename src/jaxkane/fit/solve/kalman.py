@@ -237,13 +237,9 @@ class _Motion:
 
 def _given_deviations(model: Model, n: int) -> Array:
     """Standard deviations of v (n + n_b,) at the start, from the priors; zero without a prior."""
-    nuisance = model.nuisance
-
-    def finite(x):
-        return jnp.where(jnp.isfinite(x), x, 0.0)
-
-    y = jnp.zeros(n, nuisance.start_deviation.dtype).at[model.unknown_places].set(finite(nuisance.start_deviation))
-    return jnp.concatenate([y, finite(nuisance.trial_deviation)])
+    deviations = model.nuisance.start_deviation, model.nuisance.trial_deviation
+    z, b = (jnp.where(jnp.isfinite(x), x, 0.0) for x in deviations)
+    return jnp.concatenate([jnp.zeros(n, z.dtype).at[model.unknown_places].set(z), b])
 
 
 def information_of(model: Model, window: Windows, start: Array, start_dot: Array, z: Array, b: Array, x: Array):

@@ -212,7 +212,9 @@ class Linearization(eqx.Module):
 
     @property
     def _own(self) -> np.ndarray:
-        return self._squares if self.prediction.cost is None else np.asarray(self.prediction.cost)
+        """The contribution of every window (W,) to the cost."""
+        cost = self.prediction.cost
+        return np.sum(np.asarray(self.blocks.R)[:, :, -1] ** 2, axis=1) if cost is None else np.asarray(cost)
 
     @property
     def prior_squares(self) -> float:
@@ -226,12 +228,7 @@ class Linearization(eqx.Module):
         In ordinary least squares it equals the cost. With process noise, it is about twice the number of measurements,
         whereas the cost may be negative.
         """
-        return float(np.sum(self._squares)) + self.prior_squares
-
-    @property
-    def _squares(self) -> np.ndarray:
-        """The sum of squares of every window (W,)."""
-        return np.sum(np.asarray(self.blocks.R)[:, :, -1] ** 2, axis=1)
+        return float(np.sum(np.sum(np.asarray(self.blocks.R)[:, :, -1] ** 2, axis=1))) + self.prior_squares
 
     @property
     def good(self) -> np.ndarray:

@@ -20,12 +20,9 @@ def moved(point: Unknowns, x: Any, eliminated: Eliminated) -> Unknowns:
     """The point after a step x of the parameters and the corresponding step of the nuisance values."""
     x = np.asarray(x)
     z, b = eliminated.back_substitute(x)
-
-    def after(before, step):
-        return on_device(np.asarray(before) + step)
-
-    numbers = zip((point.parameters, point.trial_unknowns, point.window_starts), (x, b, z), strict=True)
-    return Unknowns(*(after(*pair) for pair in numbers), meaning=point.meaning)
+    before = point.parameters, point.trial_unknowns, point.window_starts
+    after = (on_device(np.asarray(old) + step) for old, step in zip(before, (x, b, z), strict=True))
+    return Unknowns(*after, meaning=point.meaning)
 
 
 def usable(at: Linearization | None) -> bool:
