@@ -172,12 +172,10 @@ class Round(NamedTuple):
 
 
 class Branch(NamedTuple):
+    """A model, and the rounds of the search that led to it."""
+
     model: Model
     rounds: tuple[Round, ...]
-
-    @property
-    def changes(self) -> bool:
-        return any(round.extensions and round.extensions[0].accepted for round in self.rounds)
 
 
 class Move(NamedTuple):

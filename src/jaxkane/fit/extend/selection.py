@@ -198,7 +198,8 @@ def forward_selection(
         ended, accepted = search.run(beam)
     best = min([*ended, *accepted], key=lambda branch: branch.model.rank)
     after = fit
-    if best.changes:  # refit in the specification that a user would write
+    changes = [extensions for _, extensions in best.rounds if extensions and extensions[0].accepted]
+    if changes:  # refit in the specification that a user would write
         problem = fit.problem.with_specification(extended_specification(terms.base, best.model.terms))
         start = mapped_point(best.model.fit.problem, best.model.fit.point, problem, best.model.fit.names)
         after = solve(problem, LeastSquares(), start=start)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
-from ..._common.lookup import counted
+from ..._common.lookup import counted, refuse_unknown
 from ..._integrate.jumps import refuse_jumps
 from ..._integrate.trajectory import Trajectory
 from ..._kane.arguments import refuse_multipliers
@@ -45,7 +45,7 @@ from .specification import (
     start_assembly,
     with_options,
 )
-from .trial import Trial, as_trials
+from .trial import Trial, as_trials, refuse
 from .windows import Shape, Windows, WindowSlice, check_starts, cut, state_names, state_sizes
 
 MOST_SPARE_DERIVATIVES = 100_000
@@ -111,36 +111,38 @@ class Problem:
         channels = checked_trials(system, trials)
         sampled = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
         nuisance = nuisance_of(spec, channels, sampled)
-        noise = None
+        noise, common = None, [item for item in spec.free if not item.is_eliminated]
+        given = [item for item in spec.free if isinstance(getattr(item, "prior", None), str)]
+        adaptive = simulation.rtol is not None or simulation.atol is not None
+        refuse(
+            (
+                not common,
+                "`free` contains no parameter, or only terms with each='trial' or 'window'. Add the name of a "
+                "parameter, such as 'IBxx'.",
+            ),
+            (
+                spec.noise is not None and adaptive,
+                "A fit with `noise` uses a filter with fixed steps, so `rtol` and `atol` cannot be used. Pass "
+                "Simulation(step=...), or omit these options: the step is then halved until the result does not "
+                "change.",
+            ),
+            (
+                spec.noise is not None and given and parameters is None,
+                f"{given}: distributions over groups are not supported together with `noise`. Pass "
+                "prior=(mean, standard deviation).",
+            ),
+        )
         if spec.noise is not None:
-            if simulation.rtol is not None or simulation.atol is not None:
-                raise ValueError(
-                    "A fit with `noise` uses a filter with fixed steps, so `rtol` and `atol` cannot be used. Pass "
-                    "Simulation(step=...), or omit these options: the step is then halved until the result does not "
-                    "change."
-                )
             refuse_multipliers(system)
             refuse_jumps(system, "Fit with `noise`", "The filter cannot represent jumps. Omit `noise`.")
             deviations = jnp.concatenate([nuisance.start_deviation, nuisance.trial_deviation])
             noise = noise_of(system, spec.noise, deviations, spec.window)
         starts = start_assembly(system, trials, nuisance.start)
-        common = [item for item in spec.free if not item.is_eliminated]
-        if not common:
-            raise ValueError(
-                "`free` contains no parameter, or only terms with each='trial' or 'window'. Add the name of a "
-                "parameter, such as 'IBxx'."
-            )
         # Delays and time constants of data range from microseconds to hours, so their scale is two sample intervals.
         scale = 2.0 * min(float(np.median(np.diff(trial.t))) for trial in trials)
         unscaled = [isinstance(item, (Delay, LowPass)) and item.scale is None for item in common]
         common = [dataclasses.replace(x, scale=scale) if n else x for x, n in zip(common, unscaled, strict=True)]
         if parameters is None:
-            given = spec.noise is not None and [i for i in spec.free if isinstance(getattr(i, "prior", None), str)]
-            if given:
-                raise ValueError(
-                    f"{given[0]!r}: distributions over groups are not supported together with `noise`. Pass "
-                    "prior=(mean, standard deviation)."
-                )
             parameters = parameters_of(system, common, spec.noise, channels, trials, spec.constraints)
             parameters = parameters.with_priors(spec.priors or {})
         windows, slices = cut(
@@ -235,22 +237,14 @@ class Problem:
         physically possible.
         """
         point = self.start if point is None else point
-        wrong = sorted(set(values) - set(self.parameters.names))
-        if wrong:
-            raise ValueError(
-                f"{', '.join(wrong)} is not a free parameter. The free parameters are "
-                f"{', '.join(self.parameters.names)}."
-            )
+        refuse_unknown(values, self.parameters.names, "Not a free parameter:", "the free parameters are")
         now = self.parameters.values(point.parameters)
         for name, value in values.items():
             now = now.at[self.parameters.names.index(name)].set(float(value))
         x = self.parameters.inverse(now)
-        if not bool(jnp.all(jnp.isfinite(x))):
-            bad = [n for n, ok in zip(self.parameters.names, np.isfinite(np.asarray(x)), strict=True) if not ok]
-            raise ValueError(
-                f"{', '.join(bad)}: the values are outside their bounds, or the inertia is not physically possible. "
-                "Pass other values."
-            )
+        bad = [n for n, ok in zip(self.parameters.names, np.isfinite(np.asarray(x)), strict=True) if not ok]
+        words = "the values are outside their bounds, or the inertia is not physically possible. Pass other values."
+        refuse((bad, f"{', '.join(bad)}: {words}"))
         return eqx.tree_at(lambda p: p.parameters, point, x)
 
     @property
