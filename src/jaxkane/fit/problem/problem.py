@@ -39,9 +39,9 @@ from .specification import (
     ProblemSpec,
     checked_names,
     checked_trials,
+    delay_range_of,
     delayed_inputs,
     nuisance_of,
-    reach_of,
     start_assembly,
     with_options,
 )
@@ -83,7 +83,7 @@ class Problem:
     trials: tuple[Trial, ...]
     slices: tuple[WindowSlice, ...]
     specification: ProblemSpec
-    room: Shape | None = None
+    program_shape: Shape | None = None
     """The shape of the windows of another problem. Its compiled program is reused if the own windows fit into it."""
 
     @classmethod
@@ -152,10 +152,10 @@ class Problem:
             channels,
             parameters.applies(trials),
             has_defects=nuisance.has_defects,
-            reach=reach_of(trials, parameters, nuisance),
+            delay_range=delay_range_of(trials, parameters, nuisance),
             step=simulation.step,
             guess=starts.guess,
-            **dict(zip(("late", "before"), delayed_inputs(spec), strict=True)),
+            **dict(zip(("longest_delays", "before"), delayed_inputs(spec), strict=True)),
         )
         independent = (name for name in state_names(system) if name not in system.dependent_coordinates)
         check_starts(trials, slices, [name for name in independent if name not in nuisance.start])
@@ -163,8 +163,8 @@ class Problem:
             longest = np.max(np.diff(np.asarray(windows.t), axis=1), axis=1)
             windows = eqx.tree_at(lambda w: w.step, windows, on_device(np.minimum(windows.step, longest)))
             bound = (*nuisance.start, *system.dependent_coordinates, *(starts.moved or ()))
-            held = [name for name in state_names(system) if name not in bound]
-            windows = windows.starting_at_samples(trials, channels, held)
+            sampled_starts = [name for name in state_names(system) if name not in bound]
+            windows = windows.starting_at_samples(trials, channels, sampled_starts)
             noise = dataclasses.replace(noise, starts_at_samples=bool(np.any(np.asarray(windows.start_weight) > 0)))
         varying = any(np.ptp(x) > 0 for trial in trials for x in trial.inputs.values())
         model = Model(
@@ -328,14 +328,15 @@ class Problem:
     def _arguments(self, point: Unknowns) -> tuple[Model, Windows, Unknowns]:
         """The arguments of compiled programs, which depend only on the shape of the windows.
 
-        Each window gets the unknowns of its trial. With `room`, the windows are padded to the shape of another problem,
-        to reuse its compiled program. A subset of parameters uses the program of all parameters if compiling a smaller
+        Each window gets the unknowns of its trial. With `program_shape`, the windows are padded to the shape of another
+        problem, to reuse its compiled program. A subset of parameters uses the program of all parameters if compiling a smaller
         one would take longer than computing the superfluous derivatives.
         """
         model, windows, x, owner = self.model, self.windows, point.parameters, np.asarray(self.windows.trial)
         b, z = np.asarray(point.trial_unknowns)[owner], point.window_starts
-        if self.room is not None and self.room != windows.shape and self.room.holds(windows.shape):
-            windows, rows = windows.padded(self.room), np.minimum(np.arange(self.room.windows), len(owner) - 1)
+        shape = self.program_shape
+        if shape is not None and shape != windows.shape and shape.holds(windows.shape):
+            windows, rows = windows.padded(shape), np.minimum(np.arange(shape.windows), len(owner) - 1)
             b, z = b[rows], on_device(np.asarray(z)[rows])
         windows = dataclasses.replace(windows, trial=on_device(np.arange(len(b)), np.int32))
         spare = self.parameters.rest.size - self.parameters.size
@@ -404,12 +405,12 @@ class Problem:
         b, z = (on_device(np.asarray(x)[i]) for x, i in ((point.trial_unknowns, [*trials]), (point.window_starts, own)))
         return dataclasses.replace(point, trial_unknowns=b, window_starts=z)
 
-    def parts(self, room: Shape | None, most_added: int) -> list[tuple[Problem, list[int]]]:
+    def parts(self, program_shape: Shape | None, most_added: int) -> list[tuple[Problem, list[int]]]:
         """Split this problem into parts of successive trials that can reuse the compiled program of another problem.
 
         **Arguments:**
 
-        - `room`: the shape of the windows of the other problem. Each part fits into it.
+        - `program_shape`: the shape of the windows of the other problem. Each part fits into it.
         - `most_added`: the maximum number of samples that padding may add.
 
         **Returns:** parts with the indices of their trials. The whole problem is one part if a trial does not fit, or
@@ -417,22 +418,22 @@ class Problem:
         """
         owner, own, T = np.asarray(self.windows.trial), self.windows.shape, len(self.trials)
         counts = np.bincount(owner)
-        if room is None or not room.holds(own._replace(windows=int(counts.max()))):
+        if program_shape is None or not program_shape.holds(own._replace(windows=int(counts.max()))):
             return [(self, [*range(T)])]
         groups: list[list[int]] = [[]]
         for k in range(T):
-            if counts[[*groups[-1], k]].sum() > room.windows:
+            if counts[[*groups[-1], k]].sum() > program_shape.windows:
                 groups.append([])
             groups[-1].append(k)
-        if (len(groups) * room.windows - own.windows) * room.samples > most_added:
+        if (len(groups) * program_shape.windows - own.windows) * program_shape.samples > most_added:
             return [(self, [*range(T)])]
         parts = []
         for group in groups:
             rows = np.flatnonzero(np.isin(owner, group))
             windows, trials = self.windows.of_rows(rows), tuple(self.trials[k] for k in group)
             slices = tuple((k - group[0], *rest) for k, *rest in (self.slices[i] for i in rows))
-            part = {"windows": windows, "by_trial": windows.by_trial, "trials": trials, "slices": slices, "room": room}
-            parts.append((dataclasses.replace(self, **part), group))
+            part = dataclasses.replace(self, windows=windows, by_trial=windows.by_trial, trials=trials, slices=slices)
+            parts.append((dataclasses.replace(part, program_shape=program_shape), group))
         return parts
 
     def with_specification(self, spec: ProblemSpec) -> Problem:

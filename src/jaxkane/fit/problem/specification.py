@@ -22,7 +22,7 @@ from .from_declarations import JointPrior, Linear, as_items, parameters_of
 from .model import Nuisance, Simulation
 from .parameters import Parameters, Prior, floats
 from .trial import Trial, refuse
-from .windows import Reach, state_names
+from .windows import DelayRange, state_names
 
 Names = Sequence[str] | Mapping[str, float | None]
 """Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""
@@ -226,7 +226,7 @@ def nuisance_of(spec: ProblemSpec, channels: Sequence[str], sampled: Sequence[st
     )
 
 
-def reach_of(trials: Sequence[Trial], parameters: Parameters, nuisance: Nuisance) -> Reach | None:
+def delay_range_of(trials: Sequence[Trial], parameters: Parameters, nuisance: Nuisance) -> DelayRange | None:
     """The largest delay and the largest advance of inputs [s], from the bounds; None if no input has a delay.
 
     **Raises:** `ValueError` if a delay may be longer than a trial.
@@ -235,7 +235,7 @@ def reach_of(trials: Sequence[Trial], parameters: Parameters, nuisance: Nuisance
         # A delay of each trial has no bounds (`is_eliminated`), so all input samples of the trial are kept.
         return np.inf, np.inf
     shortest = min(trials, key=lambda trial: np.ptp(trial.t))
-    reaches = [(0.0, 0.0)]
+    ranges = [(0.0, 0.0)]
     for entry, start, (lower, upper) in zip(
         parameters.entries, np.asarray(parameters.start), parameters.bounds.tolist(), strict=True
     ):
@@ -247,20 +247,20 @@ def reach_of(trials: Sequence[Trial], parameters: Parameters, nuisance: Nuisance
                     f"The bounds of {entry.name} allow {delay:g} s, but {shortest.name} lasts only "
                     f"{np.ptp(shortest.t):.6g} s. Pass narrower `bounds`, or omit short trials."
                 )
-        reaches.append((upper, -lower))
-    late, early = map(max, zip(*reaches, strict=True))
-    return (late, early) if len(reaches) > 1 else None
+        ranges.append((upper, -lower))
+    latest, earliest = map(max, zip(*ranges, strict=True))
+    return (latest, earliest) if len(ranges) > 1 else None
 
 
 def delayed_inputs(spec: ProblemSpec) -> tuple[dict[str, float], dict[str, float]]:
     """By input, the longest delay [s] of inputs with an upper bound and without `before`; and by input, the value of
     `before`."""
-    late, before = {}, {}
+    longest_delays, before = {}, {}
     for item in (item for item in spec.free if isinstance(item, Delay) and item.of != "sensor"):
         upper = (item.bounds or (None, None))[1]
         for name in {*item.channels} & {*spec.system.inputs}:
             if item.before is not None:
                 before[name] = real_number(item.before, f"Delay({name!r}): `before`")
             elif upper is not None:
-                late[name] = max(upper, 0.0)
-    return late, before
+                longest_delays[name] = max(upper, 0.0)
+    return longest_delays, before

@@ -20,7 +20,7 @@ from ..._system.system import System
 from .parameters import floats
 from .trial import Trial
 
-Reach = tuple[float, float]
+DelayRange = tuple[float, float]
 """The largest delay and the largest advance of inputs [s]."""
 
 WindowSlice = tuple[int, int, int]
@@ -174,10 +174,10 @@ def cut(
     applies: np.ndarray,
     *,
     has_defects: bool = False,
-    reach: Reach | None = None,
+    delay_range: DelayRange | None = None,
     step: float | None = None,
     guess: Mapping[str, float] | None = None,
-    late: Mapping[str, float] | None = None,
+    longest_delays: Mapping[str, float] | None = None,
     before: Mapping[str, float] | None = None,
 ) -> tuple[Windows, tuple[WindowSlice, ...]]:
     """Cut trials into windows.
@@ -193,16 +193,16 @@ def cut(
     - `channels`: names of the measured channels.
     - `applies`: whether each parameter applies to each trial (T, p).
     - `has_defects`: whether defects link the windows of a trial.
-    - `reach`: the largest delay and advance of inputs [s]; None without delays.
+    - `delay_range`: the largest delay and advance of inputs [s]; None without delays.
     - `step`: the integration step [s]; by default the sample interval.
     - `guess`: by name, initial guesses other than zero for coordinates without data.
-    - `late`: by input, its longest delay [s]; a trial starts after it.
+    - `longest_delays`: by input, its longest delay [s]; a trial starts after it.
     - `before`: by input, its value before the first sample.
 
     **Returns:** the windows, and the slice of each.
     """
-    late, before = late or {}, before or {}
-    firsts = [first_after(trial, late) for trial in trials]
+    longest_delays, before = longest_delays or {}, before or {}
+    firsts = [first_after(trial, longest_delays) for trial in trials]
     places = [(k, i, n) for k, trial in enumerate(trials) for i, n in _pieces(trial, window, has_defects, firsts[k])]
     if not has_defects:  # a window without measurements would only add unknowns
         places = [place for place in places if any(np.isfinite(_take(trials, place, c)).any() for c in channels)]
@@ -220,9 +220,9 @@ def cut(
         # Not longer than the window, so that halving the step has an effect.
         h = h if step is None else min(step, t[last] - t[i])
         begin, stop = i, last + 1
-        if reach is not None:
-            begin = max(int(np.searchsorted(t, t[i] - reach[0] - h, side="right")) - 1, 0)
-            stop = min(int(np.searchsorted(t, t[last] + reach[1] + h)) + 1, len(t))
+        if delay_range is not None:
+            begin = max(int(np.searchsorted(t, t[i] - delay_range[0] - h, side="right")) - 1, 0)
+            stop = min(int(np.searchsorted(t, t[last] + delay_range[1] + h)) + 1, len(t))
         columns["step"].append(h)
         spans.append((begin - bool(before and begin == 0), stop))
         y = np.stack([_take(trials, (k, i, n), c) for c in channels])  # (n_c, n)
@@ -310,12 +310,12 @@ def state_sizes(system: System, trials: Sequence[Trial]) -> np.ndarray:
     return np.array([size or min(known, default=1.0) for size in sizes])
 
 
-def first_after(trial: Trial, late: Mapping[str, float]) -> int:
-    """The index of the first sample at which all varying inputs are recorded, if they are delayed by `late` [s].
+def first_after(trial: Trial, longest_delays: Mapping[str, float]) -> int:
+    """The index of the first sample at which all varying inputs are recorded, with their `longest_delays` [s].
 
     **Raises:** `ValueError` if fewer than two samples remain.
     """
-    longest = max((lag for name, lag in late.items() if np.ptp(trial.inputs.get(name, 0.0)) > 0), default=0.0)
+    longest = max((lag for name, lag in longest_delays.items() if np.ptp(trial.inputs.get(name, 0.0)) > 0), default=0.0)
     # Without the tolerance, rounding would exclude a sample that is exactly `longest` after the first one.
     first = int(np.searchsorted(trial.t, trial.t[0] + longest * (1 - 1e-9)))
     if first > len(trial.t) - 2:
