@@ -329,8 +329,8 @@ class Problem:
         """The arguments of compiled programs, which depend only on the shape of the windows.
 
         Each window gets the unknowns of its trial. With `program_shape`, the windows are padded to the shape of another
-        problem, to reuse its compiled program. A subset of parameters uses the program of all parameters if compiling a smaller
-        one would take longer than computing the superfluous derivatives.
+        problem, to reuse its compiled program. A subset of parameters uses the program of all parameters if compiling a
+        smaller one would take longer than computing the superfluous derivatives.
         """
         model, windows, x, owner = self.model, self.windows, point.parameters, np.asarray(self.windows.trial)
         b, z = np.asarray(point.trial_unknowns)[owner], point.window_starts
