@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -20,6 +21,7 @@ from ..problem.problem import Problem
 from ..problem.specification import Names, ProblemSpec, deviations_by_name
 from ..problem.trial import refuse
 from ..result.fit_result import Fit
+from ..solve.local_unknowns import usable
 
 Bounds = tuple[float | None, float | None]
 
@@ -260,18 +262,33 @@ def augmented_problem(
     return problem, mapped_point(source, point, problem, names)
 
 
-def with_scales(candidate: Candidate, problem: Problem, norms: np.ndarray) -> Candidate:
-    """The candidate with a scale for each parameter that starts at zero and has no scale.
+def scaled_terms(fit: Fit, terms: Terms) -> Terms:
+    """The terms with a scale, derived from the units of the data, for each parameter that starts at zero.
 
-    `norms` (p,): the change of the residuals by each parameter, as a fraction of their size.
+    The scale is the value that changes the residuals by as much as their size. The default scale of 1 depends on the
+    units: with masses of 1e-12 kg, the data seem to be insensitive to all other parameters.
     """
-    names, starts, free = problem.parameters.names, np.asarray(problem.parameters.start), []
-    for item in candidate.items:
-        places = [names.index(name) for name in _names_of(problem.system, item)]
-        norm = float(np.linalg.norm(norms[places]))
-        unscaled = isinstance(item, (Free, CalibrationTerm)) and item.scale is None and not starts[places].any()
-        free.append(dataclasses.replace(item, scale=1.0 / norm) if unscaled and norm else item)
-    return dataclasses.replace(candidate, free=tuple(free))
+    scaled: dict[str, Candidate] = {}
+    for members in compatible_groups(fit, terms.candidates) or [[]]:
+        both = (*terms.removable, *members)
+        with contextlib.suppress(ValueError):  # the search states the reason
+            problem, point = augmented_problem(terms.base, (fit.problem, fit.point, fit.names), both)
+            at = problem.linearize(point)
+            if at is None or not usable(at):
+                continue
+            names, starts = problem.parameters.names, np.asarray(problem.parameters.start)
+            norms = at.blocks.column_norms / max(fit.cost, 1e-300) ** 0.5
+            for candidate in both:
+                free = []
+                for item in candidate.items:
+                    places = [names.index(name) for name in _names_of(problem.system, item)]
+                    norm = float(np.linalg.norm(norms[places]))
+                    unscaled = isinstance(item, (Free, CalibrationTerm)) and item.scale is None
+                    at_zero = unscaled and norm > 0 and not starts[places].any()
+                    free.append(dataclasses.replace(item, scale=1.0 / norm) if at_zero else item)
+                scaled[candidate.name] = dataclasses.replace(candidate, free=tuple(free))
+    removable, candidates = (tuple(scaled.get(c.name, c) for c in part) for part in (terms.removable, terms.candidates))
+    return Terms(terms.base, removable, candidates)
 
 
 def mapped_point(source: Problem, at: Unknowns, problem: Problem, names: Sequence[str]) -> Unknowns:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import math
@@ -28,7 +27,6 @@ from .candidates import (
     Terms,
     augmented_problem,
     compatible_groups,
-    with_scales,
 )
 
 NESTED = 1e-6
@@ -241,27 +239,6 @@ class Search:
     plausible: Plausible
     folds: Sequence[Sequence[int]] | None
     bar: Any
-
-    def scaled(self) -> tuple[Search, Terms]:
-        """The search with a scale, derived from the units of the data, for each candidate that starts at zero.
-
-        The scale is the value that changes the residuals by as much as their size. The default scale of 1 depends on
-        the units: with masses of 1e-12 kg, the data seem to be insensitive to all other parameters.
-        """
-        fit, scales = self.fit, {}
-        for members in compatible_groups(fit, self.terms.candidates) or [[]]:
-            both = (*self.terms.removable, *members)
-            with contextlib.suppress(ValueError):  # `_groups` states the reason
-                problem, point = augmented_problem(self.terms.base, (fit.problem, fit.point, fit.names), both)
-                at = problem.linearize(point)
-                if at is not None and usable(at):
-                    norms = at.blocks.column_norms / max(fit.cost, 1e-300) ** 0.5
-                    scales |= {c.name: with_scales(c, problem, norms) for c in both}
-        removable, candidates = (
-            tuple(scales.get(c.name, c) for c in part) for part in (self.terms.removable, self.terms.candidates)
-        )
-        terms = dataclasses.replace(self.terms, removable=removable, candidates=candidates)
-        return dataclasses.replace(self, terms=terms), terms
 
     def run(self, beam: int) -> tuple[list[Branch], list[Branch]]:
         """Branches that could not be extended further, and all models that were accepted during the search."""

@@ -28,6 +28,7 @@ from .candidates import (
     checked_terms,
     extended_specification,
     mapped_point,
+    scaled_terms,
 )
 from .search import Alternative, Extension, Search
 
@@ -193,9 +194,8 @@ def forward_selection(
             "trial with `Trial.between`, or omit `folds` and `exchange`."
         )
     with tqdm(disable=not progress, desc="forward selection", unit=" step") as bar:
-        search = Search(fit, terms, exchange, depth, refits, level, ranges, groups, bar)
-        search, terms = search.scaled()
-        ended, accepted = search.run(beam)
+        terms = scaled_terms(fit, terms)
+        ended, accepted = Search(fit, terms, exchange, depth, refits, level, ranges, groups, bar).run(beam)
     best = min([*ended, *accepted], key=lambda branch: branch.model.rank)
     after = fit
     changes = [extensions for _, extensions in best.rounds if extensions and extensions[0].accepted]
