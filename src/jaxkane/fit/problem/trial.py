@@ -315,7 +315,8 @@ def check_records(trials: Sequence[Trial] | Trial) -> tuple[str, ...]:
     for trial in trials:
         key = b"".join([trial.t.tobytes(), *(c.encode() + y.tobytes() for c, y in sorted(trial.measured.items()))])
         if key in first:
-            notes.append(f"{trial.name} has the same samples as {first[key]}, so these are counted twice. Omit one.")
+            twice = f"{trial.name} has the same samples as {first[key]}"
+            notes.append(f"{twice}, so these are counted twice. Omit one trial.")
         first.setdefault(key, trial.name)
     return tuple(notes)
 
