@@ -347,7 +347,11 @@ class Search:
                 tried.append((move, group, self._predicted(model, move, group)))
         fitted = [item for item in tried if not item[2].reason]
         if self.refits is not None:
-            nested = sorted((item for item in fitted if item[2].nested), key=_promise)[: self.refits]
+            # Plausible ones first, then by predicted cost, or for exchanges and removals by held-out cost.
+            nested = sorted(
+                (item for item in fitted if item[2].nested),
+                key=lambda x: (bool(x[2].bound_violations), x[2].held_out_cost if x[0].drop else x[2].predicted_cost),
+            )[: self.refits]
             fitted = nested + [item for item in fitted if not item[2].nested] * bool(self.refits)
         extensions, models = {move.name: extension for move, _, extension in tried}, {}
         for move, group, extension in fitted:
@@ -472,12 +476,6 @@ def _order(extension: Extension) -> tuple[bool, float]:
         return False, extension.held_out_cost
     costs = [x for x in (extension.cost, extension.predicted_cost) if not math.isnan(x)]
     return not extension.accepted, costs[0] if costs else math.inf
-
-
-def _promise(item: tuple[Move, Group, Extension]) -> tuple[bool, float]:
-    """Sort key: plausible ones first, then by predicted cost, or for exchanges and removals by held-out cost."""
-    move, _, extension = item
-    return bool(extension.bound_violations), extension.held_out_cost if move.drop else extension.predicted_cost
 
 
 def _moved(linearized: LinearizedProblem, places: Sequence[int], step: np.ndarray) -> LinearizedProblem:

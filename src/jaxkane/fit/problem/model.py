@@ -212,10 +212,6 @@ class Prediction(eqx.Module):
     cost: Float[Array, " W"] | None = None
     unknowns: Float[Array, "W n_b"] | None = None
 
-    def until(self, n_t: int) -> Prediction:
-        """The first `n_t` samples."""
-        return jax.tree.map(lambda x: np.asarray(x)[..., :n_t] if x.ndim == 3 else x, self)
-
     @property
     def with_deviations(self) -> np.ndarray:
         """Simulated measurements, with process noise followed by their standard deviations: (W, n_c or 2 n_c, n_t)."""

@@ -319,7 +319,9 @@ class Problem:
         R, prediction = blocks_of(model, windows, at, *starts)
         if windows.shape != self.windows.shape:
             W, n_t = self.windows.t.shape
-            R, prediction = jax.tree.map(lambda x: on_device(np.asarray(x)[:W]), (R, prediction.until(n_t)))
+            R, prediction = jax.tree.map(lambda x: np.asarray(x)[:W], (R, prediction))
+            prediction = jax.tree.map(lambda x: on_device(x[..., :n_t] if x.ndim == 3 else x), prediction)
+            R = on_device(R)
         blocks = Blocks.of(self.model, R, self.by_trial, point.parameters)
         if self.parameters.size < at.parameters.size:
             blocks = blocks.of_x(self.parameters.places)
@@ -392,7 +394,10 @@ class Problem:
 
     def only(self, trials: Collection[int]) -> Problem:
         """The same problem in which only these trials (by index) have weight. Nothing is recompiled."""
-        windows = self.windows.where(np.isin(np.asarray(self.windows.trial), sorted(trials)))
+        windows = self.windows
+        own = np.isin(np.asarray(windows.trial), sorted(trials))
+        weight, linked = own[:, None, None] * np.asarray(windows.weight), own * np.asarray(windows.linked)
+        windows = dataclasses.replace(windows, weight=on_device(weight), linked=on_device(linked))
         return dataclasses.replace(self, windows=windows)
 
     def with_trials(self, trials: Sequence[Trial] | Trial) -> Problem:

@@ -105,12 +105,6 @@ class Windows(eqx.Module):
         (W, n_t), n_in = self.t.shape, self.t_input.shape[1]
         return Shape(W, n_t, n_in, self.n_acting)
 
-    def where(self, counts: np.ndarray) -> Windows:
-        """The same windows, in which only those with `counts` (W,) have weight and links."""
-        weight = np.where(counts[:, None, None], np.asarray(self.weight), 0)
-        linked = np.where(counts, np.asarray(self.linked), 0)
-        return dataclasses.replace(self, weight=on_device(weight), linked=on_device(linked))
-
     def of_rows(self, rows: np.ndarray) -> Windows:
         """The windows with the indices `rows` (m,): all windows of some trials. The trials are renumbered from zero."""
         own = jax.tree.map(lambda x: on_device(np.asarray(x)[rows]), self)

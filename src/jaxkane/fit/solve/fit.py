@@ -18,7 +18,7 @@ from ..problem.declarations import Items
 from ..problem.model import Simulation, Unknowns
 from ..problem.problem import Problem, finer, residual_deviation
 from ..problem.specification import refuse_other, with_options
-from ..problem.trial import Trial
+from ..problem.trial import Trial, refuse
 from ..result.diagnostics import AT_A_MINIMUM
 from ..result.fit_result import Fit
 from ..result.statistics import trial_names
@@ -295,16 +295,18 @@ def _resting(result: Fit, place: int, method: Any, run: dict[str, Any]) -> Fit:
 def _refuse_start_of_another(problem: Problem, start: Any) -> None:
     refuse_other(start, Unknowns, "`start=`", "start=fit.point, or change the system's values")
     shapes, own = ([x.shape for x in (u.parameters, u.trial_unknowns, u.window_starts)] for u in (start, problem.start))
-    if shapes != own:
-        raise ValueError(
+    refuse(
+        (
+            shapes != own,
             "`start` belongs to another problem: its parameters, unknowns of trials and initial values of windows "
-            f"have the shapes {shapes}, but this problem has {own}. If a fit omitted trials, use `fit.problem`."
-        )
-    if start.meaning not in ((), problem.start.meaning):
-        raise ValueError(
+            f"have the shapes {shapes}, but this problem has {own}. If a fit omitted trials, use `fit.problem`.",
+        ),
+        (
+            start.meaning not in ((), problem.start.meaning),
             "`start` belongs to another problem, with other names, initial guesses or scales of its parameters. Pass "
-            "values by name: start=problem.at({name: fit.estimates[name], ...})."
-        )
+            "values by name: start=problem.at({name: fit.estimates[name], ...}).",
+        ),
+    )
 
 
 @dataclasses.dataclass

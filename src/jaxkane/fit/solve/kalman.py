@@ -97,7 +97,10 @@ def filtered(model: Model, window: Windows, start: Array, b: Array, x: Array, be
     system, calibration = model.parameters.apply(model.system, x, window.applies)
     y, weight, t = window.measured.T, window.weight.T, window.t  # (n_t, n_c), (n_t,)
     factor = jnp.stack([jnp.asarray(calibration.get(("noise scale", c), 1.0), x.dtype) for c in model.channels])
-    begin = _given_deviations(model, start.shape[0]) if begin is None else begin
+    if begin is None:
+        deviations = model.nuisance.start_deviation, model.nuisance.trial_deviation
+        of_z, of_b = (jnp.where(jnp.isfinite(s), s, 0.0) for s in deviations)
+        begin = jnp.concatenate([jnp.zeros_like(start).at[model.unknown_places].set(of_z), of_b])
     # The filter estimates unknowns of the trial with a prior, so they start at zero.
     b = jnp.where(jnp.isfinite(model.nuisance.trial_deviation), 0.0, b)
     v, system_at = jnp.concatenate([start, b]), lambda _: system
@@ -105,7 +108,11 @@ def filtered(model: Model, window: Windows, start: Array, b: Array, x: Array, be
     motion = _Motion(model, system, calibration, window)
     noise: Any = model.noise
     if noise.starts_at_samples:
-        begin = motion.unknown_before_samples(begin)
+        # If a sample gives the initial value, its prior is so wide that only the sample has an influence.
+        names, given = state_names(system), window.start_weight
+        wide = float(jnp.finfo(begin.dtype).eps) ** (-1 / 3)  # its error is then as small as rounding
+        for c, i in ((c, names.index(name)) for c, name in enumerate(model.channels) if name in names):
+            begin = begin.at[i].set(jnp.where(given[c] > 0, wide / jnp.where(given[c] > 0, given[c], 1.0), begin[i]))
     S = begun(system_at, t[0], v, jnp.diag(begin), moved)
 
     def corrected(v: Array, S: Array, t: Array, y: Array, weight: Array) -> Any:
@@ -170,15 +177,6 @@ class _Motion:
         valid = is_valid(self.system, y, t, self.signals(v[self.n :]))
         return Reached(t, y, jnp.where(valid, jnp.int32(Status.COMPLETED), jnp.int32(Status.INVALID)))
 
-    def unknown_before_samples(self, begin: Array) -> Array:
-        """Standard deviations (n,) at the start. If a sample gives the initial value, its prior is so wide that only
-        the sample has an influence."""
-        names, weight = state_names(self.system), self.window.start_weight
-        wide = float(jnp.finfo(begin.dtype).eps) ** (-1 / 3)  # its error is then as small as rounding
-        for c, i in ((c, names.index(name)) for c, name in enumerate(self.model.channels) if name in names):
-            begin = begin.at[i].set(jnp.where(weight[c] > 0, wide / jnp.where(weight[c] > 0, weight[c], 1.0), begin[i]))
-        return begin
-
     def predicted(self, v: Array, S: Array, t0: Array, t1: Array, reached: Reached):
         """The mean v and the root S at t1 from those at t0, and the rotation of the coordinates of S.
 
@@ -233,13 +231,6 @@ class _Motion:
         values = values_of(system, state.x, inputs_at(system, self.signals(b), t, state))
         calibration = model.nuisance.with_local(self.calibration, b)
         return model.as_read([*sensed(system, model.channels, t, state.q, state.u, values)], calibration)
-
-
-def _given_deviations(model: Model, n: int) -> Array:
-    """Standard deviations of v (n + n_b,) at the start, from the priors; zero without a prior."""
-    deviations = model.nuisance.start_deviation, model.nuisance.trial_deviation
-    z, b = (jnp.where(jnp.isfinite(x), x, 0.0) for x in deviations)
-    return jnp.concatenate([jnp.zeros(n, z.dtype).at[model.unknown_places].set(z), b])
 
 
 def information_of(model: Model, window: Windows, start: Array, start_dot: Array, z: Array, b: Array, x: Array):
