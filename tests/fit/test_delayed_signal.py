@@ -8,9 +8,9 @@ import scipy.integrate
 from systems import Track
 
 from jaxkane.fit import Delay, Gain, LowPass, Offset, Simulation, Trial, fit, forward_selection
-from jaxkane.fit.problem import sensor_dynamics
+from jaxkane.fit.problem import model
 
-delayed_signal, low_passed = jax.jit(sensor_dynamics.delayed_signal), jax.jit(sensor_dynamics.low_passed)
+delayed_signal, low_passed = jax.jit(model.delayed_signal), jax.jit(model.low_passed)
 T = jnp.linspace(0.0, 1.0, 41)
 
 
@@ -126,7 +126,7 @@ def test_excluded_samples_do_not_count_in_the_variance_accounted_for():
 def test_invalid_low_pass_filters_are_rejected():
     trials = tracks(1)[:1]
     for item, said in (
-        (LowPass("push"), "no channel 'push'"),
+        (LowPass("push"), "no channel push"),
         (LowPass("x", of="input"), "`of` must be 'sensor' or None"),
         (LowPass("x", order=3), "`order` must be 1 or 2"),
         ((LowPass("x"), LowPass("x")), "more than once"),

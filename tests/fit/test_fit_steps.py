@@ -15,7 +15,7 @@ from systems import Cart
 
 import jaxkane as jk
 from jaxkane.fit import Free, GradientDescent, LeastSquares, Problem, Simulation, Trial, fit, minimize
-from jaxkane.fit.solve.step_refinement import finer, step_errors, step_tolerance
+from jaxkane.fit.problem.problem import finer, step_errors, step_tolerance
 
 H, SIGMA = 0.25, 0.001
 t = np.arange(0.0, 10.0, H)

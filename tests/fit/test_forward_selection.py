@@ -299,8 +299,8 @@ def test_selection_with_one_trial(rubbing):
         (("dry",), {"depth": 0}, "`depth` must be an integer of at least 1"),
         (("dry",), {"beam": 0}, "`beam` must be an integer of at least 1"),
         (("dry",), {"refits": -1}, "`refits` must be an integer of at least 0"),
-        ((Offset("angel"),), {}, "no input or channel 'angel'; did you mean 'angle'"),
-        ((Gain("torque", of="start"),), {}, "no coordinate, independent speed or state 'torque'"),
+        ((Offset("angel"),), {}, "no input or channel angel; did you mean 'angle'"),
+        ((Gain("torque", of="start"),), {}, "no coordinate, independent speed or state torque"),
         ((Delay("angle", of="start"),), {}, "`of` must be 'input', 'sensor' or None"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,7 +19,9 @@ from ..problem.model import Simulation, Unknowns
 from ..problem.parameters import Interval, with_entries
 from ..problem.problem import Problem
 from ..problem.specification import Names, ProblemSpec, deviations_by_name
+from ..problem.trial import refuse
 from ..result.fit_result import Fit
+from ..solve.local_unknowns import usable
 
 Bounds = tuple[float | None, float | None]
 
@@ -57,7 +60,6 @@ class Candidate:
         return self.system is None and not self.unknown
 
     def names(self, system: System) -> tuple[str, ...]:
-        """Names of its parameters."""
         return _names_of(self.system or system, *self.items)
 
 
@@ -103,19 +105,37 @@ def checked_terms(fit: Fit, candidates: Candidates, remove: str | Sequence[str] 
             item = dataclasses.replace(item, start=type(item).start if isinstance(item, CalibrationTerm) else None)
         free, bounds = _unbounded(system, item, always=True)
         removable.append(Candidate(", ".join(names), free=(free,), plausible=bounds))
-    if not (candidates or removable):
-        raise ValueError(
-            "forward_selection: `candidates` is empty. Pass names of parameters, `Gain`, `Offset`, `Delay` or "
-            "`Candidate`."
-        )
     names = [candidate.name for candidate in (*removable, *candidates)]
     twice = sorted({name for name in names if names.count(name) > 1} - {c.name for c in removable})
-    if twice:
-        raise ValueError(
-            f"Two candidates have the name {', '.join(twice)}. Give each candidate its own name: Candidate(name, ...)."
-        )
+    refuse(
+        (
+            not names,
+            "forward_selection: `candidates` is empty. Pass names of parameters, `Gain`, `Offset`, `Delay` or "
+            "`Candidate`.",
+        ),
+        (
+            twice,
+            f"Two candidates have the name {', '.join(twice)}. Give each candidate its own name: Candidate(name, ...).",
+        ),
+    )
+    known = deviations_by_name(fit.problem.specification.unknown)
     for candidate in candidates:
-        _refuse_nothing_new(fit, candidate)
+        names = candidate.names(fit.problem.system)
+        free = ", ".join(name for name in names if name in fit.names)
+        starts = ", ".join(name for name in deviations_by_name(candidate.unknown) if name in known)
+        refuse(
+            (free, f"{candidate.name}: the fit already estimates {free}. Omit this candidate."),
+            (
+                starts,
+                f"{candidate.name}: the initial values of {starts} are already `unknown` in the fit. Omit them from "
+                "the candidate.",
+            ),
+            (
+                not names and candidate.has_parameters_only,
+                f"{candidate.name}: the candidate adds no parameter and no unknown initial value. Pass `free` or "
+                "`unknown`.",
+            ),
+        )
     specification = dataclasses.replace(fit.problem.specification, free=tuple(base) or ())
     for group in compatible_groups(fit, candidates):
         extended_specification(specification, group)  # rejects inconsistent candidates
@@ -163,26 +183,7 @@ def _unbounded(system: System, item: Declaration, always: bool = False) -> tuple
 
 
 def _names_of(system: System, *items: Declaration) -> tuple[str, ...]:
-    """Names of the parameters that the items free."""
     return parameters_of(system, [item for item in items if not item.is_eliminated]).names
-
-
-def _refuse_nothing_new(fit: Fit, candidate: Candidate) -> None:
-    names = candidate.names(fit.problem.system)
-    free = [name for name in names if name in fit.names]
-    if free:
-        raise ValueError(f"{candidate.name}: the fit already estimates {', '.join(free)}. Omit this candidate.")
-    known = deviations_by_name(fit.problem.specification.unknown)
-    starts = [name for name in deviations_by_name(candidate.unknown) if name in known]
-    if starts:
-        raise ValueError(
-            f"{candidate.name}: the initial values of {', '.join(starts)} are already `unknown` in the fit. Omit them "
-            "from the candidate."
-        )
-    if not names and candidate.has_parameters_only:
-        raise ValueError(
-            f"{candidate.name}: the candidate adds no parameter and no unknown initial value. Pass `free` or `unknown`."
-        )
 
 
 def compatible_groups(fit: Fit, candidates: Sequence[Candidate]) -> list[list[Candidate]]:
@@ -191,25 +192,18 @@ def compatible_groups(fit: Fit, candidates: Sequence[Candidate]) -> list[list[Ca
     A delay of an input under a zero-order hold has a group of its own. The delay replaces discontinuities of the input
     by ramps of two steps, so the trajectories differ slightly even for a zero delay.
     """
-    groups: list[list[Candidate]] = []
+    groups: list[tuple[Any, list[Candidate]]] = []
     for candidate in candidates:
-        group = next((group for group in groups if _are_compatible(fit, group[0], candidate)), None)
+        delayed = {name for item in candidate.items if isinstance(item, Delay) for name in item.channels}
+        delayed &= {*fit.problem.model.zero_order_hold}
+        kind = candidate.system or fit.problem.system, deviations_by_name(candidate.unknown), delayed
+        group = next(
+            (group for other, group in groups if other[1:] == kind[1:] and eqx.tree_equal(other[0], kind[0])), None
+        )
         if group is None:
-            groups.append([candidate])
-        else:
-            group.append(candidate)
-    return groups
-
-
-def _are_compatible(fit: Fit, a: Candidate, b: Candidate) -> bool:
-    same = deviations_by_name(a.unknown) == deviations_by_name(b.unknown) and _delayed(fit, a) == _delayed(fit, b)
-    return same and bool(eqx.tree_equal(*(c.system or fit.problem.system for c in (a, b))))
-
-
-def _delayed(fit: Fit, candidate: Candidate) -> set[str]:
-    """Inputs under a zero-order hold that a candidate delays."""
-    delayed = {name for item in candidate.items if isinstance(item, Delay) for name in item.channels}
-    return delayed & {*fit.problem.model.zero_order_hold}
+            groups.append((kind, group := []))
+        group.append(candidate)
+    return [group for _, group in groups]
 
 
 def extended_specification(base: ProblemSpec, candidates: Sequence[Candidate]) -> ProblemSpec:
@@ -217,7 +211,7 @@ def extended_specification(base: ProblemSpec, candidates: Sequence[Candidate]) -
 
     **Raises:** `ValueError` if two of them free the same parameter differently, or have incompatible systems.
     """
-    system = base.system
+    system, free = base.system, [*base.free]
     for candidate in candidates:
         other = candidate.system
         if other is None or bool(eqx.tree_equal(other, system)):
@@ -230,20 +224,20 @@ def extended_specification(base: ProblemSpec, candidates: Sequence[Candidate]) -
                 f"{type(system).__name__}, the `system` of another candidate. Derive one class from the other."
             )
         system = other
-    items: list[tuple[Any, tuple[str, ...]]] = []
-    for item in (item for candidate in candidates for item in candidate.items):
-        names = _names_of(system, item)
-        same = [other for other, other_names in items if set(other_names) & set(names)]
-        if any(other is not item and not bool(other == item) for other in same):
-            raise ValueError(
-                f"Two candidates free {', '.join(names)} with different options. Use the same declaration in both."
-            )
-        if not same:
-            items.append((item, names))
-    unknown = deviations_by_name(base.unknown)
+    unknown, items = deviations_by_name(base.unknown), {}
     for candidate in candidates:
         unknown |= deviations_by_name(candidate.unknown)
-    return dataclasses.replace(base, system=system, free=[*base.free, *(item for item, _ in items)], unknown=unknown)
+        for item in candidate.items:
+            names = _names_of(system, item)
+            same = [other for name, other in items.items() if name in names]
+            if any(other is not item and not bool(other == item) for other in same):
+                raise ValueError(
+                    f"Two candidates free {', '.join(names)} with different options. Use the same declaration in both."
+                )
+            if not same:
+                free.append(item)
+                items |= dict.fromkeys(names, item)
+    return dataclasses.replace(base, system=system, free=free, unknown=unknown)
 
 
 def augmented_problem(
@@ -268,23 +262,33 @@ def augmented_problem(
     return problem, mapped_point(source, point, problem, names)
 
 
-def with_scales(candidate: Candidate, problem: Problem, norms: np.ndarray, size: float) -> Candidate:
-    """The candidate with a scale for each parameter that starts at zero and has no scale.
+def scaled_terms(fit: Fit, terms: Terms) -> Terms:
+    """The terms with a scale, derived from the units of the data, for each parameter that starts at zero.
 
-    The scale is the value that changes the residuals by `size`, if the columns of the linearized problem have these
-    `norms` (p,). The default scale of 1 depends on the units: with masses of 1e-12 kg, the data seem to be insensitive
-    to all other parameters.
+    The scale is the value that changes the residuals by as much as their size. The default scale of 1 depends on the
+    units: with masses of 1e-12 kg, the data seem to be insensitive to all other parameters.
     """
-    names, starts = problem.parameters.names, np.asarray(problem.parameters.start)
-
-    def scaled(item: Declaration) -> Declaration:
-        places = [names.index(name) for name in _names_of(problem.system, item)]
-        norm = np.linalg.norm(norms[places])
-        if not isinstance(item, (Free, CalibrationTerm)) or item.scale is not None or starts[places].any() or not norm:
-            return item
-        return dataclasses.replace(item, scale=float(size / norm))
-
-    return dataclasses.replace(candidate, free=tuple(map(scaled, candidate.items)))
+    scaled: dict[str, Candidate] = {}
+    for members in compatible_groups(fit, terms.candidates) or [[]]:
+        both = (*terms.removable, *members)
+        with contextlib.suppress(ValueError):  # the search states the reason
+            problem, point = augmented_problem(terms.base, (fit.problem, fit.point, fit.names), both)
+            at = problem.linearize(point)
+            if at is None or not usable(at):
+                continue
+            names, starts = problem.parameters.names, np.asarray(problem.parameters.start)
+            norms = at.blocks.column_norms / max(fit.cost, 1e-300) ** 0.5
+            for candidate in both:
+                free = []
+                for item in candidate.items:
+                    places = [names.index(name) for name in _names_of(problem.system, item)]
+                    norm = float(np.linalg.norm(norms[places]))
+                    unscaled = isinstance(item, (Free, CalibrationTerm)) and item.scale is None
+                    at_zero = unscaled and norm > 0 and not starts[places].any()
+                    free.append(dataclasses.replace(item, scale=1.0 / norm) if at_zero else item)
+                scaled[candidate.name] = dataclasses.replace(candidate, free=tuple(free))
+    removable, candidates = (tuple(scaled.get(c.name, c) for c in part) for part in (terms.removable, terms.candidates))
+    return Terms(terms.base, removable, candidates)
 
 
 def mapped_point(source: Problem, at: Unknowns, problem: Problem, names: Sequence[str]) -> Unknowns:

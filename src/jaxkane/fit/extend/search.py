@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import math
@@ -28,7 +27,6 @@ from .candidates import (
     Terms,
     augmented_problem,
     compatible_groups,
-    with_scales,
 )
 
 NESTED = 1e-6
@@ -72,18 +70,13 @@ class Extension:
 
     @property
     def cells(self) -> tuple[str, ...]:
-
-        def number(x, form=".5g"):
-            return "" if math.isnan(x) else f"{x:{form}}"
-
         known = [name for name in self.parameters if not math.isnan(self.errors[name])]
         estimates = ", ".join(f"{self.values[name]:.4g}" for name in known)
         errors = ", ".join(f"{self.errors[name]:.2g}" for name in known)
-        costs, decision = (number(self.predicted_cost), number(self.cost)), self.reason or "accepted"
-        return (
-            *(self.name, estimates, errors, *costs),
-            *(number(self.p, ".2g"), self.criterion, number(self.held_out_cost), decision),
-        )
+        numbers = (self.predicted_cost, ".5g"), (self.cost, ".5g"), (self.p, ".2g"), (self.held_out_cost, ".5g")
+        predicted, cost, p, held_out = ("" if math.isnan(x) else f"{x:{form}}" for x, form in numbers)
+        decision = self.reason or "accepted"
+        return self.name, estimates, errors, predicted, cost, p, self.criterion, held_out, decision
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,10 +101,9 @@ class Model:
     """A fitted model of the search.
 
     - `terms`: its candidates.
-    - `problem`, `point`: the problem and its minimum.
-    - `names`: names of its free parameters.
-    - `cost`: sum of squares at the minimum.
-    - `correlation`: serial correlation of the residuals, see `serial_correlation`.
+    - `fit`: its fit.
+    - `correlation`: the largest serial correlation of the residuals of a channel, because a candidate may act on only
+        that channel.
     - `linearized`: linearization at the minimum, with one column per free parameter.
     - `held_out` (K,): linearized sums of squares of the folds. None without folds.
     - `at_bound`: names of parameters that rest at a bound. The linearization would move them beyond it, so they are
@@ -120,45 +112,37 @@ class Model:
     """
 
     terms: tuple[Candidate, ...]
-    problem: Problem
-    point: Unknowns
-    names: tuple[str, ...]
-    cost: float
+    fit: Fit
     correlation: float
     linearized: LinearizedProblem
     held_out: np.ndarray | None
     at_bound: tuple[str, ...]
-    bound_violations: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    bound_violations: Mapping[str, str]
 
     @classmethod
-    def of(cls, fit: Fit, terms: Sequence[Candidate], folds: Sequence[Sequence[int]] | None) -> Model:
+    def of(
+        cls, fit: Fit, terms: Sequence[Candidate], folds: Sequence[Sequence[int]] | None, plausible: Plausible
+    ) -> Model:
         """The model of a fit.
 
         **Raises:** `ValueError` if the residuals do not have finite derivatives at the minimum.
         """
         if not usable(fit.linearization):
             raise ValueError("the residuals have no finite derivatives at its minimum")
-        linearized, correlation = linearized_problem(fit.linearization), _correlation(fit)
-        at_bound = fit.identifiability.at_bound
+        linearized, at_bound = linearized_problem(fit.linearization), fit.identifiability.at_bound
         free = [i for i, name in enumerate(fit.names) if name not in at_bound]
         held_out = None if folds is None else linearized.costs_left_out(free, folds)
-        return cls(
-            tuple(terms), fit.problem, fit.point, fit.names, fit.cost, correlation, linearized, held_out, at_bound
-        )
+        correlation = max(serial_correlation(fit.residuals).values())
+        violations = plausible.bound_violations(fit.estimates)
+        return cls(tuple(terms), fit, correlation, linearized, held_out, at_bound, violations)
 
     @property
     def key(self) -> frozenset[str]:
         return frozenset(c.name for c in self.terms)
 
     @property
-    def values(self) -> dict[str, float]:
-        return dict(
-            zip(self.names, np.asarray(self.problem.parameters.values(self.point.parameters)).tolist(), strict=True)
-        )
-
-    @property
     def degrees_of_freedom(self) -> int:
-        residuals, unknowns = self.problem.size
+        residuals, unknowns = self.fit.problem.size
         return residuals - unknowns
 
     @property
@@ -168,26 +152,19 @@ class Model:
     @property
     def rank(self) -> float:
         """The cost by which models are ranked: that of held-out trials, with one trial the sum of squares."""
-        return self.cost if self.held_out is None else self.held_out_cost
+        return self.fit.cost if self.held_out is None else self.held_out_cost
 
-    def beside(self, best: Model) -> Alternative:
+    def compared_with(self, best: Model) -> Alternative:
         is_as_good = False
         if self.held_out is not None and best.held_out is not None:
             difference = self.held_out - best.held_out
             error = np.std(difference, ddof=1) * math.sqrt(len(difference))
             rounding = 1e-9 * best.held_out_cost  # equivalent models differ only by rounding errors
             is_as_good = bool(difference.sum() <= 2.0 * error + rounding)
-        return Alternative(tuple(c.name for c in self.terms), self.cost, self.held_out_cost, is_as_good)
-
-
-def _correlation(fit: Fit) -> float:
-    """The largest serial correlation of all channels, because a candidate may act on only that channel."""
-    return max(serial_correlation(fit.residuals).values())
+        return Alternative(tuple(c.name for c in self.terms), self.fit.cost, self.held_out_cost, is_as_good)
 
 
 class Round(NamedTuple):
-    """The model at the start of a round, and the extensions that were tried, the accepted one first."""
-
     model: Model
     extensions: tuple[Extension, ...]
 
@@ -197,10 +174,6 @@ class Branch(NamedTuple):
 
     model: Model
     rounds: tuple[Round, ...]
-
-    @property
-    def changes(self) -> bool:
-        return any(round.extensions and round.extensions[0].accepted for round in self.rounds)
 
 
 class Move(NamedTuple):
@@ -242,6 +215,12 @@ class Group(NamedTuple):
     def places(self, terms: Sequence[Candidate]) -> list[int]:
         return list(dict.fromkeys([*self.base, *(i for c in terms for i in self.own[c.name])]))
 
+    def places_of(self, terms: Sequence[Candidate], move: Move) -> tuple[list[int], list[int], list[int]]:
+        """Places of the parameters that remain free, of these and the added ones, and of the dropped ones."""
+        kept = [c for c in terms if c not in move.drop]
+        base, both = self.places(kept), self.places([*kept, *move.add])
+        return base, both, [i for i in self.places(terms) if i not in base]
+
     def neutral(self, places: Sequence[int]) -> np.ndarray:
         """Unconstrained parameters (p,). Those at these places have the value at which they have no effect."""
         x = np.array(self.point.parameters)
@@ -251,8 +230,6 @@ class Group(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """The search of `forward_selection`. The fields are its arguments."""
-
     fit: Fit
     terms: Terms
     exchange: bool
@@ -263,28 +240,9 @@ class Search:
     folds: Sequence[Sequence[int]] | None
     bar: Any
 
-    def scaled(self) -> tuple[Search, Terms]:
-        """The search with a scale, derived from the units of the data, for each candidate that starts at zero."""
-        fit, scales = self.fit, {}
-        removable, size = self.terms.removable, max(fit.cost, 1e-300) ** 0.5
-        for members in compatible_groups(fit, self.terms.candidates) or [[]]:
-            both = (*removable, *members)
-            with contextlib.suppress(ValueError):  # `_groups` states the reason
-                problem, point = augmented_problem(self.terms.base, (fit.problem, fit.point, fit.names), both)
-                at = problem.linearize(point)
-                if at is not None and usable(at):
-                    norms = at.blocks.column_norms
-                    scales |= {c.name: with_scales(c, problem, norms, size) for c in both}
-        removable, candidates = (
-            tuple(scales.get(c.name, c) for c in part) for part in (removable, self.terms.candidates)
-        )
-        terms = dataclasses.replace(self.terms, removable=removable, candidates=candidates)
-        return dataclasses.replace(self, terms=terms), terms
-
     def run(self, beam: int) -> tuple[list[Branch], list[Branch]]:
         """Branches that could not be extended further, and all models that were accepted during the search."""
-        first = Model.of(self.fit, self.terms.removable, self.folds)
-        first = dataclasses.replace(first, bound_violations=self.plausible.bound_violations(first.values))
+        first = Model.of(self.fit, self.terms.removable, self.folds, self.plausible)
         branches, ended, accepted = [Branch(first, ())], [], {}
         while branches:
             longer: dict[frozenset[str], Branch] = {}
@@ -315,7 +273,7 @@ class Search:
         asked = self.terms.all if self.exchange else self.terms.removable * bool(self.folds)
         dropped = [c for c in model.terms if c.has_parameters_only and c in asked]
         parameters_only = [c for c in rest if c.has_parameters_only]
-        exchanges = [Move((), (d,)) for d in dropped if len(model.names) > 1]
+        exchanges = [Move((), (d,)) for d in dropped if len(model.fit.names) > 1]
         exchanges += [Move((c,), (d,)) for d in dropped for c in parameters_only]
         if self.exchange and len(added) + 2 <= self.depth:
             pairs = [Move(pair) for pair in itertools.combinations(parameters_only, 2)]
@@ -323,12 +281,12 @@ class Search:
             return (), {}
         share = 0.5 if pairs else 1.0  # split the level, so that pairs do not increase false positives
         groups, lost = self._groups(model, rest)
-        extensions, models = self._tried(model, groups, single, share * self.level / max(len(single), 1))
-        others, more = self._tried(model, groups, exchanges, self.level)
-        extensions, models = extensions + others, models | more
-        if pairs and not any(one.accepted for one in extensions):
-            others, more = self._tried(model, groups, pairs, share * self.level / len(pairs))
-            extensions, models = extensions + others, models | more
+        kinds = (single, share * self.level), (exchanges, self.level * len(exchanges)), (pairs, share * self.level)
+        extensions, models = [], {}
+        for moves, level in kinds:
+            if moves and not (moves is pairs and any(one.accepted for one in extensions)):
+                others, more = self._tried(model, groups, moves, level / len(moves))
+                extensions, models = extensions + others, models | more
         return tuple(sorted(extensions + lost, key=_order)), models
 
     def _groups(self, model: Model, rest: Sequence[Candidate]) -> tuple[dict[str, Group], list[Extension]]:
@@ -361,19 +319,19 @@ class Search:
         """
         order = [c.name for c in self.terms.all]  # a fixed order, so that all rounds share a compiled program
         both = sorted((*model.terms, *members), key=lambda c: order.index(c.name))
-        problem, point = augmented_problem(self.terms.base, (model.problem, model.point, model.names), both)
+        problem, point = augmented_problem(self.terms.base, (model.fit.problem, model.fit.point, model.fit.names), both)
         at = problem.linearize(point)
         if at is None or not usable(at):
             raise ValueError("the simulation fails at its initial guess")
         names, linearized = problem.parameters.names, linearized_problem(at)
         own = {c.name: [names.index(name) for name in c.names(problem.system)] for c in both}
         of_terms = {i for places in own.values() for i in places}
-        base = [i for i, name in enumerate(names) if name in model.names and i not in of_terms]
-        free = [names.index(name) for name in model.names]
+        base = [i for i, name in enumerate(names) if name in model.fit.names and i not in of_terms]
+        free = [names.index(name) for name in model.fit.names]
         of_priors = linearized.priors[[*free, *range(len(names), len(linearized.priors))], -1]
         cost = at.cost - at.prior_squares + float(np.sum(of_priors**2))
         # The absolute tolerance is for simulated measurements, whose cost is almost zero.
-        nested = abs(cost - model.cost) <= NESTED * model.cost + 1e-9
+        nested = abs(cost - model.fit.cost) <= NESTED * model.fit.cost + 1e-9
         at_bound = [names.index(name) for name in model.at_bound]
         return Group(problem, point, cost, linearized, base, own, at_bound, nested)
 
@@ -389,7 +347,11 @@ class Search:
                 tried.append((move, group, self._predicted(model, move, group)))
         fitted = [item for item in tried if not item[2].reason]
         if self.refits is not None:
-            nested = sorted((item for item in fitted if item[2].nested), key=_promise)[: self.refits]
+            # Plausible ones first, then by predicted cost, or for exchanges and removals by held-out cost.
+            nested = sorted(
+                (item for item in fitted if item[2].nested),
+                key=lambda x: (bool(x[2].bound_violations), x[2].held_out_cost if x[0].drop else x[2].predicted_cost),
+            )[: self.refits]
             fitted = nested + [item for item in fitted if not item[2].nested] * bool(self.refits)
         extensions, models = {move.name: extension for move, _, extension in tried}, {}
         for move, group, extension in fitted:
@@ -407,14 +369,13 @@ class Search:
 
     def _predicted(self, model: Model, move: Move, group: Group) -> Extension:
         """The extension as predicted by the linearization at the minimum of the model."""
-        kept = [c for c in model.terms if c not in move.drop]
-        base, both = group.places(kept), group.places([*kept, *move.add])
+        base, both, dropped = group.places_of(model.terms, move)
         new, names = both[len(base) :], group.problem.parameters.names
         steps, of_base = ([i for i in places if i not in group.at_bound] for places in (both, base))
-        dropped = [i for i in group.places(model.terms) if i not in base]
         x = np.asarray(group.point.parameters)
         linearized = _moved(group.linearized, dropped, -x[dropped])
-        score = _score(linearized, of_base, new, model.degrees_of_freedom + len(dropped), model.correlation)
+        freedom = model.degrees_of_freedom + len(dropped)
+        score = score_test(linearized, of_base, new, degrees_of_freedom=freedom, correlation=model.correlation)
         slopes, step = np.asarray(group.problem.parameters.slopes(group.point.parameters)), np.zeros(len(names))
         step[steps], cost = linearized.minimum(steps)
         values = np.asarray(group.problem.parameters.values(on_device(group.neutral(dropped)))) + slopes @ step
@@ -441,10 +402,7 @@ class Search:
 
     def _refitted(self, model: Model, move: Move, group: Group, extension: Extension) -> tuple[Extension, Model | None]:
         """The extension and the model after a fit of all parameters that are then free."""
-        kept = [c for c in model.terms if c not in move.drop]
-        terms = (*kept, *move.add)
-        base, both = group.places(kept), group.places(terms)
-        dropped = [i for i in group.places(model.terms) if i not in base]
+        base, both, dropped = group.places_of(model.terms, move)
         # A subset of the augmented problem, not a problem of its own, which would have to be compiled for each
         # candidate.
         parameters = group.problem.model.parameters.subset(both, on_device(group.neutral(dropped)))
@@ -456,7 +414,8 @@ class Search:
             fit = uninterrupted(search(problem, LeastSquares(), start=start))
             if fit.status not in AT_A_MINIMUM:
                 return dataclasses.replace(extension, reason=f"its fit has not converged ({fit.status})"), None
-            after = Model.of(fit, terms, self.folds)
+            kept = (c for c in model.terms if c not in move.drop)
+            after = Model.of(fit, (*kept, *move.add), self.folds, self.plausible)
         except ValueError as error:
             return dataclasses.replace(extension, reason=str(error)), None
         n = len(base)
@@ -464,13 +423,13 @@ class Search:
         x = np.asarray(fit.point.parameters)[n:]
         at_zero = _moved(after.linearized, new, -x)  # null hypothesis: no effect
         of_base = [i for i in range(n) if fit.names[i] not in after.at_bound]
-        score = _score(at_zero, of_base, new, after.degrees_of_freedom + len(new), after.correlation)
+        freedom = after.degrees_of_freedom + len(new)
+        score = score_test(at_zero, of_base, new, degrees_of_freedom=freedom, correlation=after.correlation)
         slopes = np.asarray(problem.parameters.slopes(fit.point.parameters))
-        after = dataclasses.replace(after, bound_violations=self.plausible.bound_violations(after.values))
         tested = bool(move.add) and extension.nested
         return dataclasses.replace(
             extension,
-            values=after.values,
+            values=fit.estimates,
             errors=_errors(names, slopes[n:, n:], score.covariance),
             cost=fit.cost,
             p=self._one_sided(score, names, group) if tested else math.nan,
@@ -502,7 +461,7 @@ class Search:
             (not is_fitted and extension.bound_violations, "predicted values not plausible, not fitted"),
             (not is_fitted, "promising, not fitted" if extension.nested else "not nested, not fitted"),
             (
-                is_fitted and np.isfinite(extension.p) and not extension.cost < model.cost,
+                is_fitted and np.isfinite(extension.p) and not extension.cost < model.fit.cost,
                 "its fit does not lower the cost",
             ),
             (extension.held_out_cost >= model.held_out_cost, f"does not predict held-out trials better: {held_out}"),
@@ -519,24 +478,12 @@ def _order(extension: Extension) -> tuple[bool, float]:
     return not extension.accepted, costs[0] if costs else math.inf
 
 
-def _promise(item: tuple[Move, Group, Extension]) -> tuple[bool, float]:
-    """Sort key: plausible ones first, then by predicted cost, or for exchanges and removals by held-out cost."""
-    move, _, extension = item
-    return bool(extension.bound_violations), extension.held_out_cost if move.drop else extension.predicted_cost
-
-
 def _moved(linearized: LinearizedProblem, places: Sequence[int], step: np.ndarray) -> LinearizedProblem:
     """The linearization expanded about another point, which is a `step` away in the columns at these places."""
     data, priors = linearized.data.copy(), linearized.priors.copy()
     for rows in (data, priors):
         rows[..., -1] += rows[..., list(places)] @ step
     return dataclasses.replace(linearized, data=data, priors=priors)
-
-
-def _score(
-    linearized: LinearizedProblem, base: Sequence[int], new: Sequence[int], degrees_of_freedom: int, correlation: float
-) -> Score:
-    return score_test(linearized, base, new, degrees_of_freedom=degrees_of_freedom, correlation=correlation)
 
 
 def _errors(names: Sequence[str], slopes: np.ndarray, covariance: np.ndarray) -> dict[str, float]:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from ..._common.lookup import refuse_unknown
 from ..problem.from_declarations import parameters_of
 from ..problem.specification import refuse_other
+from ..problem.trial import refuse
 from ..result.comparison import Plausible, energy_sources, plausible_of
 from ..result.diagnostics import refuse_unless_at_a_minimum
 from ..result.fit_result import Fit
@@ -27,6 +28,7 @@ from .candidates import (
     checked_terms,
     extended_specification,
     mapped_point,
+    scaled_terms,
 )
 from .search import Alternative, Extension, Search
 
@@ -80,8 +82,7 @@ class ForwardSelection:
             rows = [("also accepted", "cost", "held-out cost", "compared with the selection")]
             for one in self.alternatives:
                 held_out = "" if math.isnan(one.held_out_cost) else f"{one.held_out_cost:.5g}"
-                told = "predicts as well" if one.is_as_good else ""
-                rows.append((", ".join(one.names), f"{one.cost:.5g}", held_out, told))
+                rows.append((", ".join(one.names), f"{one.cost:.5g}", held_out, "predicts as well" * one.is_as_good))
             tables.append(("Alternatives.", rows))
         return tables
 
@@ -193,14 +194,14 @@ def forward_selection(
             "trial with `Trial.between`, or omit `folds` and `exchange`."
         )
     with tqdm(disable=not progress, desc="forward selection", unit=" step") as bar:
-        search = Search(fit, terms, exchange, depth, refits, level, ranges, groups, bar)
-        search, terms = search.scaled()
-        ended, accepted = search.run(beam)
+        terms = scaled_terms(fit, terms)
+        ended, accepted = Search(fit, terms, exchange, depth, refits, level, ranges, groups, bar).run(beam)
     best = min([*ended, *accepted], key=lambda branch: branch.model.rank)
     after = fit
-    if best.changes:  # refit in the specification that a user would write
+    changes = [extensions for _, extensions in best.rounds if extensions and extensions[0].accepted]
+    if changes:  # refit in the specification that a user would write
         problem = fit.problem.with_specification(extended_specification(terms.base, best.model.terms))
-        start = mapped_point(best.model.problem, best.model.point, problem, best.model.names)
+        start = mapped_point(best.model.fit.problem, best.model.fit.point, problem, best.model.fit.names)
         after = solve(problem, LeastSquares(), start=start)
     # A subset of the selected model is an earlier stage of it, not an alternative.
     others = {branch.model.key: branch for branch in accepted if not branch.model.key <= best.model.key}
@@ -209,12 +210,12 @@ def forward_selection(
     return ForwardSelection(
         before=fit,
         rounds=tuple(round.extensions for round in best.rounds),
-        costs=tuple(round.model.cost for round in best.rounds),
+        costs=tuple(round.model.fit.cost for round in best.rounds),
         held_out_costs=tuple(round.model.held_out_cost for round in best.rounds),
         selected=selected,
         removed=tuple(c.name for c in terms.removable if c not in best.model.terms),
         held_out=kind,
-        alternatives=tuple(branch.model.beside(best.model) for branch in others),
+        alternatives=tuple(branch.model.compared_with(best.model) for branch in others),
         level=level,
         bound_violations=tuple({**energy_sources(after), **best.model.bound_violations}.values()),
         fit=after,
@@ -240,22 +241,24 @@ def _plausible_ranges(fit: Fit, terms: Terms, plausible: Mapping[str, Any]) -> P
 
 
 def _check_arguments(fit: Fit, depth: int, beam: int, refits: int | None, level: float) -> None:
-    if fit.problem.model.errors is not None:
-        raise ValueError(
+    refuse(
+        (
+            fit.problem.model.errors is not None,
             "forward_selection: the fit has error models, and the search compares sums of squares. Fit without "
-            "`errors`, or compare the `bic` of fits with each candidate."
-        )
-    if fit.problem.specification.noise is not None:
-        raise ValueError(
+            "`errors`, or compare the `bic` of fits with each candidate.",
+        ),
+        (
+            fit.problem.specification.noise is not None,
             "forward_selection: the fit has process noise, which can hide missing physics. Fit without `noise`, or "
-            "compare `fit.marginal_likelihood()` of fits with each candidate."
-        )
+            "compare `fit.marginal_likelihood()` of fits with each candidate.",
+        ),
+    )
     refuse_unless_at_a_minimum(fit.status, "forward_selection")  # a score test is only valid at a minimum
     for name, value, smallest in (
         ("depth", depth, 1),
         ("beam", beam, 1),
         ("refits", 0 if refits is None else refits, 0),
     ):
-        if not isinstance(value, int) or value < smallest:
-            raise ValueError(f"forward_selection: `{name}` must be an integer of at least {smallest}, got {value!r}.")
+        wrong = not isinstance(value, int) or value < smallest
+        refuse((wrong, f"forward_selection: `{name}` must be an integer of at least {smallest}, got {value!r}."))
     check_level(level)

@@ -198,7 +198,6 @@ class Inertia(Declaration):
         return cls(moments, products, **kept, **more)  # type: ignore[arg-type]
 
     def parts(self, system: System, noise: Any = None, channels: Sequence[str] = ()) -> list[Part]:
-        """A `PossibleBody` and its entries."""
         if (self.matrix is None) == (self.moments is None):
             raise ValueError("Inertia: pass `moments` (and `products`) or `matrix`, but not both.")
         for what in ("center", "moments", "products"):

@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._common.lookup import as_names, hint, positive_number, real_number
+from ..._common.lookup import as_names, hint, positive_number, real_number, refuse_unknown
 from ..._kane.right_hand_side import output_names
 from ..._system.parameters import ANY, ParameterInfo, declared, leaf_name, learned_part, names_of_leaf
 from ..._system.system import System, unit_of, units_of
 from .parameters import LOW_PASSES, Bijection, Entry, Interval, Prior, checked_prior
+from .trial import refuse
 
 Bounds = tuple[float | None, float | None]
 Where = Literal["input", "sensor", "start"]
@@ -33,6 +34,7 @@ class Part(NamedTuple):
     priors: list[tuple[float, float] | None]
 
 
+@dataclasses.dataclass(frozen=True)
 class Declaration(abc.ABC):
     """An element of the argument `free` of a fit. Subclasses are frozen dataclasses."""
 
@@ -96,7 +98,6 @@ class Free(Declaration):
     each: str | None = None
 
     def parts(self, system: System, noise: Any = None, channels: Sequence[str] = ()) -> list[Part]:
-        """One part per entry of the selected leaves."""
         if not isinstance(self.tied, Mapping):
             raise TypeError(f"`tied` must be a dict from names to factors, such as {{'rF': 1.0}}, got {self.tied!r}.")
         chosen, leaves = find_leaves(system, self.where)
@@ -181,7 +182,6 @@ class CalibrationTerm(Named):
     def parts(
         self, system: System, noise: Mapping[str, float] | None = None, channels: Sequence[str] = ()
     ) -> list[Part]:
-        """One value, with a role for each name."""
         kind, wheres = self.kind, [self._where(system, name) for name in self.channels]
         if noise is not None and "sensor" in wheres and isinstance(self, (Delay, LowPass)):
             state = "delayed" if isinstance(self, Delay) else "low_pass"
@@ -210,8 +210,7 @@ class CalibrationTerm(Named):
             "sensor": (sensors, "channel"),
             "start": (starts, "coordinate, independent speed or state"),
         }[of]
-        if what not in among:
-            raise ValueError(f"{title} has no {named} {what!r}; {hint(what, among, 'it has')}")
+        refuse_unknown([what], among, f"{title} has no {named}", "it has")
         return of or "sensor"
 
 
@@ -319,7 +318,6 @@ class NoiseTerm(Named):
     def parts(
         self, system: System, noise: Mapping[str, float] | None = None, channels: Sequence[str] = ()
     ) -> list[Part]:
-        """One positive value."""
         title, is_density = f"{type(self).__name__}({self.what!r})", isinstance(self, SpectralDensity)
         if noise is None:
             raise ValueError(
@@ -327,8 +325,7 @@ class NoiseTerm(Named):
                 "densities of the disturbances by name, or {} without disturbances."
             )
         known, where = (noise, "`noise` has") if is_density else (channels, "the measured channels are")
-        if self.what not in known:
-            raise ValueError(f"{title}: unknown name; {hint(self.what, known, where)}")
+        refuse_unknown([self.what], known, f"{title}: unknown name", where)
         kind, unit = ("spectral density" if is_density else "noise scale"), ""
         label = f"{kind} of {self.what}"
         start = positive_number(noise[self.what] if self.start is None else self.start, f"{label}: `start`")
@@ -383,16 +380,17 @@ def scalar(
     """A single value, bounded by its own declaration and by those of the parameters tied to it."""
     name = entry.name
     start = real_number(start, f"{name}: `start`")
-    if not math.isfinite(start):
-        raise ValueError(f"{name}: the initial guess must be finite, got {start}. Pass another `start`.")
+    refuse((not math.isfinite(start), f"{name}: the initial guess must be finite, got {start}. Pass another `start`."))
     stated = lower, upper = _checked_bounds(name, item.bounds)
     if item.bounds is None or stated != (-math.inf, math.inf):  # (None, None): a search without bounds
         limits = [stated, _limits(info, 1.0), *tied_limits]
         lower, upper = max(low for low, _ in limits), min(high for _, high in limits)
-    if isinstance(item.prior, str) and item.prior not in ("normal", "lognormal"):
-        raise ValueError(
-            f"{name}: `prior` must be (mean, standard deviation), 'normal' or 'lognormal', got {item.prior!r}."
+    refuse(
+        (
+            isinstance(item.prior, str) and item.prior not in ("normal", "lognormal"),
+            f"{name}: `prior` must be (mean, standard deviation), 'normal' or 'lognormal', got {item.prior!r}.",
         )
+    )
     alone = item.prior is not None and not isinstance(item.prior, str) and not is_lognormal(item.prior)
     prior = checked_prior(name, item.prior) if alone else None
     scale = abs(start) or (prior[1] if prior is not None and math.isfinite(prior[1]) else 1.0)

@@ -323,7 +323,6 @@ class Errors(eqx.Module):
         return [d.named(n) for d, n in self._by_channel()]
 
     def described(self, channels: Sequence[str]) -> str:
-        """The parameters of all channels as text."""
         parts = []
         for channel, d, values in zip(channels, self.distributions, self.values, strict=True):
             numbers = ", ".join(f"{name} {value:.4g}" for name, value in values.items())

@@ -14,7 +14,7 @@ from ..._scalarjit.compat import on_device
 from ..._system.system import System
 from .declarations import Declaration, Free, Items, Part, is_lognormal, scalar
 from .parameters import Entry, Interval, Parameters, checked_prior, floats, places_of
-from .trial import Trial, groups_of
+from .trial import Trial, groups_of, refuse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,23 +50,22 @@ class Linear:
         numbers = {f"the factor of {name}": factor for name, factor in self.factors.items()}
         numbers |= {f"`{name}`": getattr(self, name) for name in ("equals", "std", "at_least", "at_most")}
         for name, value in numbers.items():
+            number, is_std, is_factor = 1.0, name == "`std`", name.startswith("the")
             number = 1.0 if value is None else real_number(value, f"Linear: {name}")
-            if not np.isfinite(number) or (name == "`std`" and number <= 0) or (name.startswith("the") and not number):
-                raise ValueError(
-                    f"Linear: {name} must be "
-                    f"finite{', and not zero' * name.startswith('the')}{' and positive' * (name == '`std`')}, got "
-                    f"{value}."
-                )
+            must = f"finite{', and not zero' * is_factor}{' and positive' * is_std}"
+            wrong = not np.isfinite(number) or (is_std and number <= 0) or (is_factor and not number)
+            refuse((wrong, f"Linear: {name} must be {must}, got {value}."))
         bounded = self.at_least is not None or self.at_most is not None
-        if (self.equals is None) != bounded or (self.std is not None and bounded):
-            raise ValueError(
+        refuse(
+            (
+                (self.equals is None) != bounded or (self.std is not None and bounded),
                 f"Linear({self.text}): pass either `equals` (with or without `std`), or `at_least` or `at_most` or "
-                "both."
+                "both.",
             )
+        )
 
     @property
     def text(self) -> str:
-        """The sum as text."""
         parts = [name if c == 1 else f"{c:g} {name}" for name, c in self.factors.items()]
         return " + ".join(parts)
 
@@ -180,7 +179,6 @@ class JointRow(NamedTuple):
 
 
 def _joint_priors(names: Sequence[str], rows: Sequence[JointRow]) -> dict[str, Any]:
-    """The fields of `Parameters` for joint priors."""
     n, matrix = len(names), np.zeros((len(rows), 2 * len(names)))
     for k, row in enumerate(rows):
         for name, factor in row.factors.items():
@@ -202,16 +200,20 @@ def _with_groups(part: Part, item: Declaration, trials: Sequence[Trial], joint: 
     each, prior, entry = getattr(item, "each", None), getattr(item, "prior", None), part.entries[0]
     name = entry.name
     logarithmic = prior == "lognormal" or is_lognormal(prior)
-    if logarithmic and not part.bijection.bounds[0, 0] >= 0.0:
-        raise ValueError(f"{name}: a log-normal prior needs a positive parameter. Add bounds=(0.0, None).")
-    if each is None or item.is_eliminated:
-        if isinstance(prior, str):
-            raise ValueError(
-                f"{name}: prior={prior!r} is a distribution over groups, but the parameter has no groups. Add "
-                "each='trial' or the name of a label."
-            )
-        parts = [part]
-    else:
+    has_groups = each is not None and not item.is_eliminated
+    refuse(
+        (
+            logarithmic and not part.bijection.bounds[0, 0] >= 0.0,
+            f"{name}: a log-normal prior needs a positive parameter. Add bounds=(0.0, None).",
+        ),
+        (
+            isinstance(prior, str) and not has_groups,
+            f"{name}: prior={prior!r} is a distribution over groups, but the parameter has no groups. Add "
+            "each='trial' or the name of a label.",
+        ),
+    )
+    parts = [part]
+    if has_groups:
         if not isinstance(each, str) or not trials:
             raise TypeError(
                 f"{type(item).__name__} {name}: `each` must be 'trial' or a label of the trials of a fit, got {each!r}."

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..._common.lookup import real_number
+from ..._common.lookup import positive_number
 from ..._integrate.inputs import Samples, share_times, since
 from ..._integrate.integrate import solve
 from ..._integrate.settings import Settings, settings_for, with_array_tolerances
@@ -25,7 +25,6 @@ from ..._system.system import State, System, packed, packed_motion, unpacked
 from ...estimate._process_noise import Noise
 from .errors import Errors
 from .parameters import LOW_PASSES, Entry, Parameters
-from .sensor_dynamics import delayed_signal, low_passed
 from .windows import Windows, state_names
 
 
@@ -63,9 +62,8 @@ class Simulation:
 
     def __post_init__(self) -> None:
         for name in ("rtol", "atol", "step", "max_steps"):
-            value = getattr(self, name)
-            if value is not None and not 0 < real_number(value, f"`{name}`") < float("inf"):
-                raise ValueError(f"Simulation: `{name}` must be positive and finite, got {value}.")
+            if getattr(self, name) is not None:
+                positive_number(getattr(self, name), f"Simulation: `{name}`")
         if self.step is not None and (self.rtol is not None or self.atol is not None):
             raise ValueError(
                 "Simulation: `step` is given together with `rtol` or `atol`. Pass `step` for fixed steps, or `rtol` "
@@ -160,12 +158,10 @@ class Nuisance(eqx.Module):
 
     @property
     def window_names(self) -> tuple[str, ...]:
-        """Names of the unknowns of a window."""
         return (*self.start, *(entry.name for entry in self.window))
 
     @property
     def trial_names(self) -> tuple[str, ...]:
-        """Names of the unknowns of a trial."""
         return tuple(entry.name for entry in self.trial)
 
     def with_local(self, calibration: Calibration, b: Array, z: Array | None = None) -> Calibration:
@@ -215,10 +211,6 @@ class Prediction(eqx.Module):
     deviation: Float[Array, "W n_c n_t"] | None = None
     cost: Float[Array, " W"] | None = None
     unknowns: Float[Array, "W n_b"] | None = None
-
-    def until(self, n_t: int) -> Prediction:
-        """The first `n_t` samples."""
-        return jax.tree.map(lambda x: np.asarray(x)[..., :n_t] if x.ndim == 3 else x, self)
 
     @property
     def with_deviations(self) -> np.ndarray:
@@ -277,7 +269,6 @@ class Model(eqx.Module):
         return packed(self.start(window, z, x))
 
     def start(self, window: Windows, z: Array, x: Array) -> State:
-        """The initial state of one window as a `State`."""
         system, state = self._guessed(window, z, x)
         return assemble(system, state.q, state.u, state.x, t=window.t[0], free=self.assembled)
 
@@ -302,7 +293,6 @@ class Model(eqx.Module):
         return start
 
     def simulate(self, window: Windows, start: Array, z: Array, b: Array, x: Array) -> Trajectory:
-        """The trajectory of one window."""
         system, calibration = self.parameters.apply(self.system, x, window.applies)
         settings = self.settings if self.settings.step is None else dataclasses.replace(self.settings, step=window.step)
         origin, t = window.t[0], window.t
@@ -312,7 +302,6 @@ class Model(eqx.Module):
         return dataclasses.replace(solve(system, unpacked(system, start), origin, t - origin, signals, settings), t=t)
 
     def signals(self, window: Windows, calibration: Calibration) -> dict[str, Any]:
-        """The inputs of one window by name."""
         signals: dict[str, Any] = {}
         # All inputs without a delay share one array of times. Their common discontinuities then take no more computing
         # time than those of a single input.
@@ -388,6 +377,58 @@ class Model(eqx.Module):
 
 
 def _gain_and_offset(of: str, name: str, calibration: Calibration, dtype: Any) -> tuple[Array, Array]:
-    """The gain and the offset of an input or a sensor."""
     numbers = calibration.get((f"gain of {of}", name), 1.0), calibration.get((f"offset of {of}", name), 0.0)
     return jnp.asarray(numbers[0], dtype), jnp.asarray(numbers[1], dtype)
+
+
+def delayed_signal(t: Float[Array, " n"], y: Float[Array, " n"], delay: Array) -> Float[Array, " n"]:
+    """y(t - delay) for samples y, by cubic interpolation (Catmull and Rom).
+
+    The slopes are those of parabolas through three neighbouring samples. The extrapolation is linear. The last time may
+    be repeated, which occurs in padded windows.
+    """
+    h = jnp.diff(t)
+    # Replace the divisor too: masking only the quotient leaves NaN in its derivative.
+    lasting = jnp.where(h > 0, h, jnp.ones_like(h))
+    d = jnp.where(h > 0, jnp.diff(y) / lasting, 0.0)  # (n-1,)
+    d = jnp.where(h > 0, d, d[jnp.maximum(jnp.sum(h > 0) - 1, 0)])
+    if t.shape[0] > 2:
+        both = h[:-1] + h[1:]
+        inner = (d[:-1] * h[1:] + d[1:] * h[:-1]) / jnp.where(both > 0, both, 1.0)
+        before = jnp.concatenate([d[:1], inner[:-1]])
+        # The last interval of nonzero length is treated as the end.
+        inner = jnp.where(h[1:] > 0, inner, 2 * d[:-1] - before)
+        slopes = jnp.concatenate([2 * d[:1] - inner[:1], inner, 2 * d[-1:] - inner[-1:]])
+    else:
+        slopes = jnp.broadcast_to(d, t.shape)
+    at = t - delay
+    i = jnp.clip(jnp.searchsorted(t, at, side="right") - 1, 0, t.shape[0] - 2)
+    s, step = (at - t[i]) / lasting[i], lasting[i]
+    y0, y1, m0, m1 = y[i], y[i + 1], step * slopes[i], step * slopes[i + 1]
+    inside = y0 + s * (m0 + s * (3 * (y1 - y0) - 2 * m0 - m1 + s * (2 * (y0 - y1) + m0 + m1)))
+    before, after = y[0] + slopes[0] * (at - t[0]), y[-1] + slopes[-1] * (at - t[-1])
+    return jnp.where(at < t[0], before, jnp.where(at > t[-1], after, inside))
+
+
+def low_passed(t: Float[Array, " n"], y: Float[Array, " n"], time_constant: Array) -> Float[Array, " n"]:
+    """The solution x of time_constant dx/dt = y - x, for y linear between samples.
+
+        x_k+1 = y_k+1 - T s_k + a_k (x_k - y_k + T s_k),   s_k: slopes,   a_k = exp(-h_k / T)
+
+    The filter starts as if y had always had its initial slope. For T <= 0, the result is y - T s, so that it is
+    differentiable at T = 0. The last time may be repeated, which occurs in padded windows.
+    """
+    h, T = jnp.diff(t), time_constant
+    ramp = T * jnp.where(h > 0, jnp.diff(y) / jnp.where(h > 0, h, 1.0), 0.0)  # (n - 1,)
+    lasts = T > 0
+    a = jnp.where(lasts, jnp.exp(-h / jnp.where(lasts, T, 1.0)), 0.0)
+    # A repeated last time must not change x, which it would for T <= 0.
+    a = jnp.where(h > 0, a, 1.0)
+
+    def go_on(x: Array, now: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
+        a, ramp, y, y_next = now
+        x = y_next - ramp + a * (x - y + ramp)
+        return x, x
+
+    first = y[0] - ramp[0]
+    return jnp.concatenate([first[None], jax.lax.scan(go_on, first, (a, ramp, y[:-1], y[1:]))[1]])

@@ -37,7 +37,6 @@ class Bijection(eqx.Module):
 
     @property
     def size(self) -> int:
-        """The number of values."""
         return 1
 
     @property
@@ -281,7 +280,6 @@ class Parameters(eqx.Module):
 
     @property
     def size(self) -> int:
-        """The number of free parameters."""
         return self.places.size
 
     @property
@@ -307,7 +305,6 @@ class Parameters(eqx.Module):
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """The number of values of each bijection."""
         return tuple(f.size for f in self.bijections)
 
     @property

@@ -21,8 +21,8 @@ from .declarations import Delay
 from .from_declarations import JointPrior, Linear, as_items, parameters_of
 from .model import Nuisance, Simulation
 from .parameters import Parameters, Prior, floats
-from .trial import Trial
-from .windows import Reach, state_names
+from .trial import Trial, refuse
+from .windows import DelayRange, state_names
 
 Names = Sequence[str] | Mapping[str, float | None]
 """Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""
@@ -52,24 +52,35 @@ class ProblemSpec:
                 object.__setattr__(self, name, copy.copy(value))
         if self.simulation is not None:
             refuse_other(self.simulation, Simulation, "`simulation=`", "Simulation(step=0.01)")
-        if not isinstance(self.system, System):
-            raise TypeError(f"`system` must be a jaxkane.System, got {type(self.system).__name__}.")
-        for name in ("priors", "defect_std"):
-            if not isinstance(getattr(self, name), (Mapping, type(None))):
-                raise TypeError(f"`{name}` must be a dict by name, got {getattr(self, name)!r}.")
-        if self.window is not None and not real_number(self.window, "`window`") > 0:
-            raise ValueError(f"`window` must be a positive duration [s], got {self.window}.")
-        if self.defect_std is not None and self.window is None:
-            raise ValueError(
+        dicts = {"priors": self.priors, "defect_std": self.defect_std}
+        refuse(
+            (
+                not isinstance(self.system, System),
+                f"`system` must be a jaxkane.System, got {type(self.system).__name__}.",
+            ),
+            *(
+                (not isinstance(x, (Mapping, type(None))), f"`{n}` must be a dict, got {x!r}.")
+                for n, x in dicts.items()
+            ),
+            error=TypeError,
+        )
+        other = "noise" if self.noise is not None else "defect_std"
+        refuse(
+            (
+                self.window is not None and not real_number(self.window, "`window`") > 0,
+                f"`window` must be a positive duration [s], got {self.window}.",
+            ),
+            (
+                self.defect_std is not None and self.window is None,
                 "`defect_std` is given without `window`. Pass the length of a window [s]: `defect_std` links the "
-                "windows of a trial."
-            )
-        if self.errors is not None and (self.noise is not None or self.defect_std is not None):
-            other = "noise" if self.noise is not None else "defect_std"
-            raise ValueError(
+                "windows of a trial.",
+            ),
+            (
+                self.errors is not None and getattr(self, other) is not None,
                 f"Pass either `errors` or `{other}`, not both. Error models require a motion without process noise. "
-                "With `noise`, `NoiseScale` in `free` estimates the standard deviation of a channel."
-            )
+                "With `noise`, `NoiseScale` in `free` estimates the standard deviation of a channel.",
+            ),
+        )
 
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -215,7 +226,7 @@ def nuisance_of(spec: ProblemSpec, channels: Sequence[str], sampled: Sequence[st
     )
 
 
-def reach_of(trials: Sequence[Trial], parameters: Parameters, nuisance: Nuisance) -> Reach | None:
+def delay_range_of(trials: Sequence[Trial], parameters: Parameters, nuisance: Nuisance) -> DelayRange | None:
     """The largest delay and the largest advance of inputs [s], from the bounds; None if no input has a delay.
 
     **Raises:** `ValueError` if a delay may be longer than a trial.
@@ -224,7 +235,7 @@ def reach_of(trials: Sequence[Trial], parameters: Parameters, nuisance: Nuisance
         # A delay of each trial has no bounds (`is_eliminated`), so all input samples of the trial are kept.
         return np.inf, np.inf
     shortest = min(trials, key=lambda trial: np.ptp(trial.t))
-    reaches = [(0.0, 0.0)]
+    ranges = [(0.0, 0.0)]
     for entry, start, (lower, upper) in zip(
         parameters.entries, np.asarray(parameters.start), parameters.bounds.tolist(), strict=True
     ):
@@ -236,20 +247,20 @@ def reach_of(trials: Sequence[Trial], parameters: Parameters, nuisance: Nuisance
                     f"The bounds of {entry.name} allow {delay:g} s, but {shortest.name} lasts only "
                     f"{np.ptp(shortest.t):.6g} s. Pass narrower `bounds`, or omit short trials."
                 )
-        reaches.append((upper, -lower))
-    late, early = map(max, zip(*reaches, strict=True))
-    return (late, early) if len(reaches) > 1 else None
+        ranges.append((upper, -lower))
+    latest, earliest = map(max, zip(*ranges, strict=True))
+    return (latest, earliest) if len(ranges) > 1 else None
 
 
 def delayed_inputs(spec: ProblemSpec) -> tuple[dict[str, float], dict[str, float]]:
     """By input, the longest delay [s] of inputs with an upper bound and without `before`; and by input, the value of
     `before`."""
-    late, before = {}, {}
+    longest_delays, before = {}, {}
     for item in (item for item in spec.free if isinstance(item, Delay) and item.of != "sensor"):
         upper = (item.bounds or (None, None))[1]
         for name in {*item.channels} & {*spec.system.inputs}:
             if item.before is not None:
                 before[name] = real_number(item.before, f"Delay({name!r}): `before`")
             elif upper is not None:
-                late[name] = max(upper, 0.0)
-    return late, before
+                longest_delays[name] = max(upper, 0.0)
+    return longest_delays, before

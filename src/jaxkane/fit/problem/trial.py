@@ -19,6 +19,13 @@ _FEEDBACK = (
 )
 
 
+def refuse(*rules: tuple[Any, str], error: type[Exception] = ValueError) -> None:
+    """Raise an exception for the first rule (is_wrong, message) that is wrong."""
+    for is_wrong, message in rules:
+        if is_wrong:
+            raise error(message)
+
+
 class Trial:
     """The measurements of one experiment.
 
@@ -215,19 +222,10 @@ class Trial:
             f"fewer than two samples are between {start:g} and {stop:g} s. The trial lasts from {self.t[0]:g} to "
             f"{self.t[-1]:g} s. Choose a longer part of it.",
         )
-
-        def cut(group):
-            return {key: value[inside] for key, value in group.items()}
-
-        return Trial(
-            self.t[inside],
-            cut(self.measured),
-            cut(self.inputs),
-            sigma=cut(self.sigma),
-            initial=cut(self.initial),
-            name=self.name,
-            labels=self.labels,
-        )
+        groups = self.measured, self.inputs, self.sigma, self.initial
+        measured, inputs, sigma, initial = ({key: x[inside] for key, x in group.items()} for group in groups)
+        kept: dict[str, Any] = {"name": self.name, "labels": self.labels}
+        return Trial(self.t[inside], measured, inputs, sigma=sigma, initial=initial, **kept)
 
     def with_initial_state(self, initial: Mapping[str, ArrayLike]) -> Trial:
         """A copy of the trial with other initial values, `initial` as in `Trial`."""
@@ -317,7 +315,8 @@ def check_records(trials: Sequence[Trial] | Trial) -> tuple[str, ...]:
     for trial in trials:
         key = b"".join([trial.t.tobytes(), *(c.encode() + y.tobytes() for c, y in sorted(trial.measured.items()))])
         if key in first:
-            notes.append(f"{trial.name} has the same samples as {first[key]}, so these are counted twice. Omit one.")
+            twice = f"{trial.name} has the same samples as {first[key]}"
+            notes.append(f"{twice}, so these are counted twice. Omit one trial.")
         first.setdefault(key, trial.name)
     return tuple(notes)
 

@@ -20,7 +20,7 @@ from ..._system.system import System
 from .parameters import floats
 from .trial import Trial
 
-Reach = tuple[float, float]
+DelayRange = tuple[float, float]
 """The largest delay and the largest advance of inputs [s]."""
 
 WindowSlice = tuple[int, int, int]
@@ -97,22 +97,13 @@ class Windows(eqx.Module):
             return times, self.inputs
         # One step before the window, because a ramp (`Ramps`) begins one step before its discontinuity.
         first = jnp.maximum(jnp.searchsorted(times, self.t[0] - self.step, side="right") - 1, 0)
-
-        def chosen(x):
-            return jax.lax.dynamic_slice_in_dim(x, first, self.n_acting, axis=-1)
-
-        return chosen(times), chosen(self.inputs)
+        chosen = (jax.lax.dynamic_slice_in_dim(x, first, self.n_acting, axis=-1) for x in (times, self.inputs))
+        return tuple(chosen)  # type: ignore[return-value]
 
     @property
     def shape(self) -> Shape:
         (W, n_t), n_in = self.t.shape, self.t_input.shape[1]
         return Shape(W, n_t, n_in, self.n_acting)
-
-    def where(self, counts: np.ndarray) -> Windows:
-        """The same windows, in which only those with `counts` (W,) have weight and links."""
-        weight = np.where(counts[:, None, None], np.asarray(self.weight), 0)
-        linked = np.where(counts, np.asarray(self.linked), 0)
-        return dataclasses.replace(self, weight=on_device(weight), linked=on_device(linked))
 
     def of_rows(self, rows: np.ndarray) -> Windows:
         """The windows with the indices `rows` (m,): all windows of some trials. The trials are renumbered from zero."""
@@ -177,10 +168,10 @@ def cut(
     applies: np.ndarray,
     *,
     has_defects: bool = False,
-    reach: Reach | None = None,
+    delay_range: DelayRange | None = None,
     step: float | None = None,
     guess: Mapping[str, float] | None = None,
-    late: Mapping[str, float] | None = None,
+    longest_delays: Mapping[str, float] | None = None,
     before: Mapping[str, float] | None = None,
 ) -> tuple[Windows, tuple[WindowSlice, ...]]:
     """Cut trials into windows.
@@ -196,16 +187,16 @@ def cut(
     - `channels`: names of the measured channels.
     - `applies`: whether each parameter applies to each trial (T, p).
     - `has_defects`: whether defects link the windows of a trial.
-    - `reach`: the largest delay and advance of inputs [s]; None without delays.
+    - `delay_range`: the largest delay and advance of inputs [s]; None without delays.
     - `step`: the integration step [s]; by default the sample interval.
     - `guess`: by name, initial guesses other than zero for coordinates without data.
-    - `late`: by input, its longest delay [s]; a trial starts after it.
+    - `longest_delays`: by input, its longest delay [s]; a trial starts after it.
     - `before`: by input, its value before the first sample.
 
     **Returns:** the windows, and the slice of each.
     """
-    late, before = late or {}, before or {}
-    firsts = [first_after(trial, late) for trial in trials]
+    longest_delays, before = longest_delays or {}, before or {}
+    firsts = [first_after(trial, longest_delays) for trial in trials]
     places = [(k, i, n) for k, trial in enumerate(trials) for i, n in _pieces(trial, window, has_defects, firsts[k])]
     if not has_defects:  # a window without measurements would only add unknowns
         places = [place for place in places if any(np.isfinite(_take(trials, place, c)).any() for c in channels)]
@@ -219,16 +210,20 @@ def cut(
     for (k, i, n), extra in zip(places, linked, strict=True):
         trial, last = trials[k], i + n - 1 + extra
         columns["t"].append(clocks[k][np.minimum(np.arange(i, i + n_t), last)])
-        between, lasts = _interval(trial.t[i : last + 1]), trial.t[last] - trial.t[i]
+        t, h = trial.t, _interval(trial.t[i : last + 1])
         # Not longer than the window, so that halving the step has an effect.
-        columns["step"].append(between if step is None else min(step, lasts))
-        begin, stop = (i, last + 1) if reach is None else _reached(trial.t, i, last, reach, float(columns["step"][-1]))
+        h = h if step is None else min(step, t[last] - t[i])
+        begin, stop = i, last + 1
+        if delay_range is not None:
+            begin = max(int(np.searchsorted(t, t[i] - delay_range[0] - h, side="right")) - 1, 0)
+            stop = min(int(np.searchsorted(t, t[last] + delay_range[1] + h)) + 1, len(t))
+        columns["step"].append(h)
         spans.append((begin - bool(before and begin == 0), stop))
         y = np.stack([_take(trials, (k, i, n), c) for c in channels])  # (n_c, n)
         sigma = np.stack([trial.sigma.get(c, np.ones_like(trial.t))[i : i + n] for c in channels])
-        finite = np.isfinite(y)
-        columns["measured"].append(_fill(np.where(finite, y, 0.0), n_t))
-        columns["weight"].append(_fill(np.where(finite, 1.0 / sigma, 0.0), n_t))
+        finite, padding = np.isfinite(y), ((0, 0), (0, n_t - n))
+        columns["measured"].append(np.pad(np.where(finite, y, 0.0), padding))
+        columns["weight"].append(np.pad(np.where(finite, 1.0 / sigma, 0.0), padding))
     n_in = max(stop - begin for begin, stop in spans)
     for (k, _, _), (begin, _), h in zip(places, spans, columns["step"], strict=True):
         trial, wanted = trials[k], np.arange(begin, begin + n_in)
@@ -237,14 +232,15 @@ def cut(
         rows = [trial.inputs.get(name, np.zeros_like(trial.t))[inside] for name in system.inputs]
         rows = [np.where(wanted < 0, before.get(name, x[0]), x) for name, x in zip(system.inputs, rows, strict=True)]
         columns["inputs"].append(np.array(rows).reshape(len(system.inputs), n_in))
-    names = state_names(system)
-    guesses = [(guess or {}).get(name, 0.0) for name in names]
-    pairs = tuple(zip(names, guesses, strict=True))
-    start = np.array([[_start(trials[k], i, n, *pair) for pair in pairs] for k, i, n in places])
+    names, guess = state_names(system), guess or {}
+    start = np.array([[_start(trials[k], i, n, name, guess.get(name, 0.0)) for name in names] for k, i, n in places])
     owner = np.array([k for k, _, _ in places])
     # One step on each side of a window, for the ramps that begin or end there.
     span = np.ptp(columns["t"], axis=1) + 2 * np.array(columns["step"])
-    longest = {k: span[owner == k].max() for k in owner.tolist()}
+    acting = []  # the maximum number of input samples within the longest window of a trial, one before and one after
+    for k in set(owner.tolist()):
+        t, lasts = trials[k].t, float(span[owner == k].max())
+        acting.append(np.max(np.searchsorted(t, t + lasts * (1 + 1e-9), side="right") - np.arange(len(t))) + 2)
     windows = Windows(
         **{key: floats(value) for key, value in columns.items()},
         start=floats(start),
@@ -254,7 +250,7 @@ def cut(
         trial=on_device(owner, np.int32),
         first=on_device(np.append(True, owner[1:] != owner[:-1])),
         applies=on_device(applies[owner]),
-        n_acting=min(n_in, max(_most_within(trials[k].t, float(lasts)) for k, lasts in longest.items())),
+        n_acting=min(n_in, int(max(acting))),
     )
     return windows, tuple(places)
 
@@ -308,12 +304,12 @@ def state_sizes(system: System, trials: Sequence[Trial]) -> np.ndarray:
     return np.array([size or min(known, default=1.0) for size in sizes])
 
 
-def first_after(trial: Trial, late: Mapping[str, float]) -> int:
-    """The index of the first sample at which all varying inputs are recorded, if they are delayed by `late` [s].
+def first_after(trial: Trial, longest_delays: Mapping[str, float]) -> int:
+    """The index of the first sample at which all varying inputs are recorded, with their `longest_delays` [s].
 
     **Raises:** `ValueError` if fewer than two samples remain.
     """
-    longest = max((lag for name, lag in late.items() if np.ptp(trial.inputs.get(name, 0.0)) > 0), default=0.0)
+    longest = max((lag for name, lag in longest_delays.items() if np.ptp(trial.inputs.get(name, 0.0)) > 0), default=0.0)
     # Without the tolerance, rounding would exclude a sample that is exactly `longest` after the first one.
     first = int(np.searchsorted(trial.t, trial.t[0] + longest * (1 - 1e-9)))
     if first > len(trial.t) - 2:
@@ -343,41 +339,18 @@ def _pieces(trial: Trial, window: float | None, has_defects: bool, first: int) -
                 "sample, which does not determine a motion. Pass a longer `window`, or link the windows by "
                 "`defect_std`."
             )
-        starts = np.array(_without_lone(starts.tolist(), len(t)))
+        kept = [0]  # a single sample is joined to the next window
+        for start in starts[1:].tolist():
+            if start - kept[-1] > 1 and start < len(t) - 1:
+                kept.append(start)
+        starts = np.array(kept)
     return [(first + int(i), int(n)) for i, n in zip(starts, np.diff(np.append(starts, len(t))), strict=True)]
-
-
-def _without_lone(starts: list[int], n: int) -> list[int]:
-    """The first samples of windows with at least two samples each. A single sample is joined to the next window."""
-    kept = [0]
-    for start in starts[1:]:
-        if start - kept[-1] > 1 and start < n - 1:
-            kept.append(start)
-    return kept
-
-
-def _reached(t: np.ndarray, i: int, last: int, reach: Reach, step: float) -> tuple[int, int]:
-    """The first input sample of a trial that may act within a window, and the end (exclusive)."""
-    late, early = reach
-    begin = np.searchsorted(t, t[i] - late - step, side="right") - 1
-    stop = np.searchsorted(t, t[last] + early + step) + 1
-    return max(int(begin), 0), min(int(stop), len(t))
-
-
-def _most_within(t: np.ndarray, lasts: float) -> int:
-    """The maximum number of samples in an interval of `lasts` [s], plus one sample before and one after."""
-    return int(np.max(np.searchsorted(t, t + lasts * (1 + 1e-9), side="right") - np.arange(len(t)))) + 2
 
 
 def _take(trials: Sequence[Trial], place: WindowSlice, channel: str) -> np.ndarray:
     """Samples (n,) of one window; NaN if the trial does not have the channel."""
     k, i, n = place
     return trials[k].measured.get(channel, np.full_like(trials[k].t, np.nan))[i : i + n]
-
-
-def _fill(rows: np.ndarray, n_t: int) -> np.ndarray:
-    """Pad rows with zeros to (n, n_t)."""
-    return np.pad(rows, ((0, 0), (0, n_t - rows.shape[1])))
 
 
 def check_starts(trials: Sequence[Trial], places: Sequence[WindowSlice], names: Sequence[str]) -> None:

@@ -18,12 +18,11 @@ from ..._system.system import System
 from ..problem.errors import whitened
 from ..problem.model import Unknowns
 from ..problem.parameters import Parameters, places_of
-from ..problem.problem import Problem
+from ..problem.problem import STEP_TOLERANCE, Problem, residual_deviation, step_errors
 from ..problem.specification import refuse_other
 from ..problem.trial import check_records
 from ..solve.linearization import Linearization
-from ..solve.mixed_effects import degrees_of_freedom
-from ..solve.step_refinement import STEP_TOLERANCE, residual_deviation, step_errors
+from ..solve.variance_components import degrees_of_freedom
 from . import diagnostics as diagnostics
 from . import statistics as statistics
 from .identifiability import Identifiability, identifiability_at

@@ -28,7 +28,7 @@ class FitState:
     problem: Problem
     point: Unknowns
     linearization: Linearization
-    step_errors: np.ndarray  # (W,), see `step_refinement.step_errors`
+    step_errors: np.ndarray  # (W,), see `problem.step_errors`
     history: tuple[float, ...]
     status: str
     method: str

@@ -17,7 +17,7 @@ from ..._system.system import System
 from ..problem.declarations import Free, leaf_names
 from ..problem.from_declarations import parameters_of
 from ..problem.model import Unknowns
-from ..problem.problem import Problem
+from ..problem.problem import Problem, finer
 from ..problem.specification import ProblemSpec, refuse_other, with_options
 from ..problem.trial import Trial, as_trials
 from ..solve.blocks import Blocks
@@ -25,7 +25,6 @@ from ..solve.fit import search, uninterrupted, with_distributions
 from ..solve.linearization import Linearization
 from ..solve.local_unknowns import Unsimulated, solve_nuisance
 from ..solve.optimizers import LeastSquares
-from ..solve.step_refinement import finer
 from .diagnostics import AT_A_MINIMUM, STATUS
 from .fit_result import Fit
 from .linearized import folds_of

@@ -136,22 +136,17 @@ class Eliminated(NamedTuple):
         After the elimination, only rounding errors remain of a column that is linearly dependent on others, and less of
         a column without influence.
         """
-
-        def of(d, squares):
+        informed = []
+        for d, squares in zip(self._diagonals, _column_squares(self.blocks), strict=True):
             norm, eps, tiny = _safe(squares), np.finfo(d.dtype).eps, np.finfo(d.dtype).tiny
-            return (d > 1e5 * eps * norm) & (norm > tiny**0.25)
-
-        (of_z, of_b), (z, b) = _column_squares(self.blocks), self._diagonals
-        return of(z, of_z), of(b, of_b)
+            informed.append((d > 1e5 * eps * norm) & (norm > tiny**0.25))
+        return informed[0], informed[1]
 
     @property
     def _diagonals(self) -> tuple[np.ndarray, np.ndarray]:
-        n_z, n_b = self.z_rows.shape[2], self.b_rows.shape[1]
-
-        def of(R):
-            return np.abs(np.diagonal(R, axis1=-2, axis2=-1))
-
-        return of(self.z_rows[..., :n_z]), of(self.b_rows[..., :n_b])
+        parts = self.z_rows[..., : self.z_rows.shape[2]], self.b_rows[..., : self.b_rows.shape[1]]
+        z, b = (np.abs(np.diagonal(R, axis1=-2, axis2=-1)) for R in parts)
+        return z, b
 
     def step(self, damping: float, longest: np.ndarray | float = np.inf) -> tuple[np.ndarray, float]:
         """The damped step (n_x,) and the minimum of the damped sum of squares.

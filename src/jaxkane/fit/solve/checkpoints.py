@@ -106,11 +106,16 @@ def described(problem: Problem) -> dict[str, Any]:
     model, settings = problem.model, problem.model.settings
     numbers, rest = eqx.partition(model, eqx.is_array)
 
-    def first(tree):
-        return jax.tree.map(lambda x: np.asarray(x)[0], tree)
-
-    window, point = first(problem.windows), problem.start
-    fixed, guessed = _fixed_and_guessed(problem)
+    point = problem.start
+    window, z, b = jax.tree.map(
+        lambda x: np.asarray(x)[0], (problem.windows, point.window_starts, point.trial_unknowns)
+    )
+    changed = {number for entry in problem.parameters.entries for number, *_ in entry.targets}
+    leaves = [
+        (i, leaf_name(path), x) for i, (path, x) in enumerate(jax.tree_util.tree_leaves_with_path(problem.system))
+    ]
+    fixed = {name: x for i, name, x in leaves if eqx.is_array(x) and i not in changed}
+    guessed = [x for i, _, x in leaves if eqx.is_array(x) and i in changed]
 
     def residuals(numbers, window, z, b, x):
         model = eqx.combine(numbers, rest)
@@ -136,17 +141,5 @@ def described(problem: Problem) -> dict[str, Any]:
         "fixed parameter": {name: digest(x) if np.ndim(x) else float(x) for name, x in fixed.items()},
         "initial guesses, priors": digest(jax.tree.leaves(dataclasses.replace(numbers, system=guessed))),
         "data": digest(jax.tree.leaves(problem.windows)),
-        "program": digest(
-            jax.make_jaxpr(residuals)(
-                numbers, window, first(point.window_starts), first(point.trial_unknowns), point.parameters
-            )
-        ),
+        "program": digest(jax.make_jaxpr(residuals)(numbers, window, z, b, point.parameters)),
     }
-
-
-def _fixed_and_guessed(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
-    """The arrays of the system that the fit does not change, by name, and those that contain its initial guesses."""
-    moved = {number for entry in problem.parameters.entries for number, *_ in entry.targets}
-    leaves = jax.tree_util.tree_leaves_with_path(problem.system)
-    arrays = [(i, leaf_name(path), x) for i, (path, x) in enumerate(leaves) if eqx.is_array(x)]
-    return {name: x for i, name, x in arrays if i not in moved}, [x for i, _, x in arrays if i in moved]

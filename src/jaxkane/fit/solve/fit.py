@@ -16,18 +16,16 @@ from ..._system.system import System
 from ..collocated._fit import Collocation, CollocationFit
 from ..problem.declarations import Items
 from ..problem.model import Simulation, Unknowns
-from ..problem.problem import Problem
+from ..problem.problem import Problem, finer, residual_deviation
 from ..problem.specification import refuse_other, with_options
-from ..problem.trial import Trial
+from ..problem.trial import Trial, refuse
 from ..result.diagnostics import AT_A_MINIMUM
 from ..result.fit_result import Fit
 from ..result.statistics import trial_names
 from .checkpoints import Checkpoint
-from .error_models import estimate_errors
 from .local_unknowns import Unsimulated, solve_nuisance, usable
-from .mixed_effects import estimated_deviations
 from .optimizers import Iterate, LeastSquares, Optimizer
-from .step_refinement import finer, residual_deviation
+from .variance_components import estimate_errors, estimated_deviations
 
 
 @with_options
@@ -144,6 +142,12 @@ def solve(
     return dataclasses.replace(result, failed=failed)
 
 
+def _again(before: Fit, problem: Problem, method: Any, start: Unknowns, run: dict[str, Any]) -> Fit:
+    """Another search, with the history of the ones before."""
+    result = search(problem, method, start=start, **run)
+    return dataclasses.replace(result, history=(*before.history, *result.history[1:]))
+
+
 def with_distributions(result: Fit, method: Any, run: dict[str, Any]) -> Fit:
     """Estimate the standard deviations of the distributions over groups and all other unknowns alternately."""
     for _ in range(20 if result.problem.parameters.distributions else 0):
@@ -151,8 +155,7 @@ def with_distributions(result: Fit, method: Any, run: dict[str, Any]) -> Fit:
             break
         before = result.problem.parameters.deviations
         after = estimated_deviations(result.problem, result.point, result.linearization)
-        again = search(result.problem.with_deviations(after), method, start=result.point, **run)
-        result = dataclasses.replace(again, history=(*result.history, *again.history[1:]))
+        result = _again(result, result.problem.with_deviations(after), method, result.point, run)
         if np.all(np.abs(np.log(after / before)) < 1e-5):
             break
     return result
@@ -164,22 +167,20 @@ def _with_fine_steps(result: Fit, method: Any, run: dict[str, Any]) -> Fit:
     If the repeated fit fails, does not converge or is interrupted, the first fit is returned with the status
     "unchecked".
     """
-    chosen = (result.problem.specification.simulation or Simulation()).chooses or result.problem.chooses_steps
+    before = result.problem
+    chosen = (before.specification.simulation or Simulation()).chooses or before.chooses_steps
     for _ in range(3):
         if not chosen or result.status not in ("converged", "bound") or not result.too_coarse:
             break
-        before = result.problem
-        deviation = residual_deviation(before, result.linearization.squares)
-        try:
-            problem = finer(before, result.point, deviation)
+        before, again = result.problem, None
+        with contextlib.suppress(KeyboardInterrupt, Unsimulated):
+            problem = finer(before, result.point, residual_deviation(before, result.linearization.squares))
             if problem.has_steps and np.array_equal(problem.windows.step, before.windows.step):
                 break
-            again = search(problem, method, start=result.point, **run)
-        except (KeyboardInterrupt, Unsimulated):
+            again = _again(result, problem, method, result.point, run)
+        if again is None or again.status not in AT_A_MINIMUM:
             return dataclasses.replace(result, status="unchecked")
-        if again.status not in AT_A_MINIMUM:
-            return dataclasses.replace(result, status="unchecked")
-        result = dataclasses.replace(again, history=(*result.history, *again.history[1:]))
+        result = again
     return result
 
 
@@ -215,10 +216,7 @@ def minimize(
     **Raises:** `TypeError` if `optimizer` is not an `Optimizer`; `ValueError` if a window cannot be simulated with the
     initial guess, or if the checkpoint belongs to another fit.
     """
-    if not isinstance(optimizer, Optimizer):
-        raise TypeError(
-            f"`optimizer` must be an optimizer such as LeastSquares() or GradientDescent(), got {optimizer!r}."
-        )
+    refuse_other(optimizer, Optimizer, "`optimizer=`", "LeastSquares() or GradientDescent()")
     refuse_other(problem, Problem, "minimize", "minimize(fit.problem, LeastSquares())")
     if start is not None:
         _refuse_start_of_another(problem, start)
@@ -287,34 +285,32 @@ def _resting(result: Fit, place: int, method: Any, run: dict[str, Any]) -> Fit:
     fixed, x = resting
     problem = dataclasses.replace(result.problem, model=dataclasses.replace(result.problem.model, parameters=fixed))
     start = dataclasses.replace(point, parameters=on_device(x), meaning=problem.start.meaning)
-    try:
-        again = search(problem, method, start=start, **run)
-    except Unsimulated:
-        return result
-    history = (*result.history, *again.history[1:])
-    better = again.cost <= result.cost + 1e-6 * result.linearization.squares
-    return dataclasses.replace(again, history=history) if better else result
+    with contextlib.suppress(Unsimulated):
+        again = _again(result, problem, method, start, run)
+        if again.cost <= result.cost + 1e-6 * result.linearization.squares:
+            return again
+    return result
 
 
 def _refuse_start_of_another(problem: Problem, start: Any) -> None:
     refuse_other(start, Unknowns, "`start=`", "start=fit.point, or change the system's values")
     shapes, own = ([x.shape for x in (u.parameters, u.trial_unknowns, u.window_starts)] for u in (start, problem.start))
-    if shapes != own:
-        raise ValueError(
+    refuse(
+        (
+            shapes != own,
             "`start` belongs to another problem: its parameters, unknowns of trials and initial values of windows "
-            f"have the shapes {shapes}, but this problem has {own}. If a fit omitted trials, use `fit.problem`."
-        )
-    if start.meaning not in ((), problem.start.meaning):
-        raise ValueError(
+            f"have the shapes {shapes}, but this problem has {own}. If a fit omitted trials, use `fit.problem`.",
+        ),
+        (
+            start.meaning not in ((), problem.start.meaning),
             "`start` belongs to another problem, with other names, initial guesses or scales of its parameters. Pass "
-            "values by name: start=problem.at({name: fit.estimates[name], ...})."
-        )
+            "values by name: start=problem.at({name: fit.estimates[name], ...}).",
+        ),
+    )
 
 
 @dataclasses.dataclass
 class _Run:
-    """The state of a search."""
-
     now: Iterate
     best: Iterate
     history: list[float]
@@ -385,7 +381,6 @@ def _first(problem: Problem, optimizer: Optimizer, start: Unknowns, steps: int) 
 
 
 def _resumed(file: Checkpoint, problem: Problem, optimizer: Optimizer, start: Unknowns) -> _Run | None:
-    """The search from a checkpoint; None if there is no checkpoint."""
     saved = file.read(point=start, best=start, history=0.0)
     if saved is None:
         return None

@@ -16,8 +16,10 @@ from ..._integrate.status import Status
 from ..._kane.right_hand_side import values_of
 from ..._system.system import System, unpacked
 from ...estimate._filter import begun, brought_back, sensed
-from ...estimate._process_noise import MODES, Disturbance, Noise
+from ...estimate._process_noise import MODES, Disturbance
 from ...estimate._square_root import moments, root, update
+from ..problem.errors import LOG_2PI
+from ..problem.model import Model, Prediction
 from ..problem.windows import Windows, state_names
 
 
@@ -52,18 +54,11 @@ def smoothed_moments(steps: Step) -> tuple[Float[Array, "n_t n"], Float[Array, "
     def go_back(after: Any, step: Step) -> tuple[Any, Any]:
         a, G = after
         a, G = step.left @ a - step.shift, step.left @ G @ step.left.T
-        moments = step.mean - step.S @ a, step.S @ _symmetric_root(G)
+        values, vectors = jnp.linalg.eigh((G + G.T) / 2)
+        moments = step.mean - step.S @ a, step.S @ (vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None])
         return (step.back @ a, one - step.back @ (one - G) @ step.back.T), moments
 
     return jax.lax.scan(go_back, (jnp.zeros(n, one.dtype), one), steps, reverse=True)[1]
-
-
-def _symmetric_root(G: Array) -> Array:
-    values, vectors = jnp.linalg.eigh((G + G.T) / 2)
-    return vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None, :]
-
-
-LOG_2PI = 1.8378770664093453
 
 
 class Filtered(NamedTuple):
@@ -85,7 +80,7 @@ class Filtered(NamedTuple):
     steps: Step
 
 
-def filtered(model: Any, window: Windows, start: Array, b: Array, x: Array, begin: Array | None = None) -> Filtered:
+def filtered(model: Model, window: Windows, start: Array, b: Array, x: Array, begin: Array | None = None) -> Filtered:
     """Filter one trial. The filtered vector v contains the state and the unknowns of the trial.
 
     If an initial value is a sample, its distribution follows from this sample alone.
@@ -102,12 +97,22 @@ def filtered(model: Any, window: Windows, start: Array, b: Array, x: Array, begi
     system, calibration = model.parameters.apply(model.system, x, window.applies)
     y, weight, t = window.measured.T, window.weight.T, window.t  # (n_t, n_c), (n_t,)
     factor = jnp.stack([jnp.asarray(calibration.get(("noise scale", c), 1.0), x.dtype) for c in model.channels])
-    begin = _given_deviations(model, start.shape[0]) if begin is None else begin
-    v, system_at = jnp.concatenate([start, _fixed(model, b)]), lambda _: system
+    if begin is None:
+        deviations = model.nuisance.start_deviation, model.nuisance.trial_deviation
+        of_z, of_b = (jnp.where(jnp.isfinite(s), s, 0.0) for s in deviations)
+        begin = jnp.concatenate([jnp.zeros_like(start).at[model.unknown_places].set(of_z), of_b])
+    # The filter estimates unknowns of the trial with a prior, so they start at zero.
+    b = jnp.where(jnp.isfinite(model.nuisance.trial_deviation), 0.0, b)
+    v, system_at = jnp.concatenate([start, b]), lambda _: system
     moved = np.isin(np.arange(len(system.coordinates)), model.moved)
     motion = _Motion(model, system, calibration, window)
-    if model.noise.starts_at_samples:
-        begin = motion.unknown_before_samples(begin)
+    noise: Any = model.noise
+    if noise.starts_at_samples:
+        # If a sample gives the initial value, its prior is so wide that only the sample has an influence.
+        names, given = state_names(system), window.start_weight
+        wide = float(jnp.finfo(begin.dtype).eps) ** (-1 / 3)  # its error is then as small as rounding
+        for c, i in ((c, names.index(name)) for c, name in enumerate(model.channels) if name in names):
+            begin = begin.at[i].set(jnp.where(given[c] > 0, wide / jnp.where(given[c] > 0, given[c], 1.0), begin[i]))
     S = begun(system_at, t[0], v, jnp.diag(begin), moved)
 
     def corrected(v: Array, S: Array, t: Array, y: Array, weight: Array) -> Any:
@@ -126,7 +131,7 @@ def filtered(model: Any, window: Windows, start: Array, b: Array, x: Array, begi
         step = Step(v, S, new.shift, new.left, back)
         return (mean, after, reached), (new.innovation, new.deviation, predicted, step)
 
-    if model.noise.starts_at_samples:
+    if noise.starts_at_samples:
         v, S, *_ = corrected(v, S, t[0], y[0], window.start_weight)
     # The trial starts at its first sample, so the first step has zero length.
     times = (jnp.concatenate([t[:1], t[:-1]]), t)
@@ -154,7 +159,7 @@ class Reached(NamedTuple):
 class _Motion:
     """The motion of one trial with process noise, and its measurements."""
 
-    model: Any
+    model: Model
     system: System
     calibration: Any
     window: Windows
@@ -172,21 +177,12 @@ class _Motion:
         valid = is_valid(self.system, y, t, self.signals(v[self.n :]))
         return Reached(t, y, jnp.where(valid, jnp.int32(Status.COMPLETED), jnp.int32(Status.INVALID)))
 
-    def unknown_before_samples(self, begin: Array) -> Array:
-        """Standard deviations (n,) at the start. If a sample gives the initial value, its prior is so wide that only
-        the sample has an influence."""
-        names, weight = state_names(self.system), self.window.start_weight
-        wide = float(jnp.finfo(begin.dtype).eps) ** (-1 / 3)  # its error is then as small as rounding
-        for c, i in ((c, names.index(name)) for c, name in enumerate(self.model.channels) if name in names):
-            begin = begin.at[i].set(jnp.where(weight[c] > 0, wide / jnp.where(weight[c] > 0, weight[c], 1.0), begin[i]))
-        return begin
-
     def predicted(self, v: Array, S: Array, t0: Array, t1: Array, reached: Reached):
         """The mean v and the root S at t1 from those at t0, and the rotation of the coordinates of S.
 
         The steps are at most those of the window. The result is NaN if the simulation has ended.
         """
-        noise: Noise = self.model.noise
+        noise: Any = self.model.noise
         n, n_w, dtype = v.shape[0], len(noise.names), v.dtype
         density, named = noise.spectral_densities(self.calibration), (self.system.speeds, self.system.states)
         # The derivative of a square root is infinite at zero, and zero times infinity is NaN: mask the argument too.
@@ -218,7 +214,6 @@ class _Motion:
         return jax.lax.fori_loop(jnp.int32(0), times, piece, (v, S, jnp.eye(n, dtype=dtype), reached))
 
     def moved(self, v: Array, t0: Array, t1: Array, disturbance: Disturbance) -> Array:
-        """The vector v after one integration step."""
         y, b, settings = v[: self.n], v[self.n :], self.model.settings
         return jnp.concatenate([one_step(self.system, y, t0, t1, self.signals(b), settings, disturbance), b])
 
@@ -235,40 +230,22 @@ class _Motion:
         state, b = unpacked(system, v[: self.n]), v[self.n :]
         values = values_of(system, state.x, inputs_at(system, self.signals(b), t, state))
         calibration = model.nuisance.with_local(self.calibration, b)
-        return model.as_read(sensed(system, model.channels, t, state.q, state.u, values), calibration)
+        return model.as_read([*sensed(system, model.channels, t, state.q, state.u, values)], calibration)
 
 
-def _given_deviations(model: Any, n: int) -> Array:
-    """Standard deviations of v (n + n_b,) at the start, from the priors; zero without a prior."""
-    nuisance = model.nuisance
-
-    def finite(x):
-        return jnp.where(jnp.isfinite(x), x, 0.0)
-
-    y = jnp.zeros(n, nuisance.start_deviation.dtype).at[model.unknown_places].set(finite(nuisance.start_deviation))
-    return jnp.concatenate([y, finite(nuisance.trial_deviation)])
-
-
-def _fixed(model: Any, b: Array) -> Array:
-    """The unknowns of the trial at the start of the filter: zero for those with a prior, which the filter estimates,
-    else `b`."""
-    return jnp.where(jnp.isfinite(model.nuisance.trial_deviation), 0.0, b)
-
-
-def information_of(model: Any, window: Windows, start: Array, start_dot: Array, z: Array, b: Array, x: Array):
-    """The rows [J, r] of one trial for Fisher scoring.
+def information_of(model: Model, window: Windows, start: Array, start_dot: Array, z: Array, b: Array, x: Array):
+    """Residuals (m,) of one trial for Fisher scoring, their derivatives (m, n_z + n_b + p), and the prediction.
 
     J^T r is the gradient of half of minus twice the log likelihood. J^T J is the expected (Fisher) information. A
     least-squares step with these rows is a step of Fisher scoring. Given the earlier innovations, each innovation e is
     Gaussian with standard deviation s:
 
         e_dot / s,   e / s;      sqrt(2) s_dot / s,   (1 - e^2 / s^2) / sqrt(2)
-
-    **Returns:** J, r, minus twice the log likelihood including the priors, and the `Filtered` result.
     """
+    noise: Any = model.noise
     n_z, n_b, k = z.shape[0], b.shape[0], z.shape[0] + b.shape[0] + x.shape[0]
     # An unknown that is a random variable of the filter does not need derivatives: the result does not depend on it.
-    moves = np.array([j for j in range(k) if j >= n_z + n_b or not model.noise.random[j]], dtype=np.int32)
+    moves = np.array([j for j in range(k) if j >= n_z + n_b or not noise.random[j]], dtype=np.int32)
     unit = jnp.eye(k, dtype=z.dtype)[moves]
     directions = (start_dot.T[moves], unit[:, n_z : n_z + n_b], unit[:, n_z + n_b :])
 
@@ -290,14 +267,12 @@ def information_of(model: Any, window: Windows, start: Array, start_dot: Array, 
     r = jnp.where(measured, e / s, 0.0)
     of_size = jnp.where(measured, (1 - r**2) / 2**0.5, 0.0)
     J = jnp.concatenate([e_dot / s[:, None], 2**0.5 * s_dot / s[:, None], priors_dot])
-    value = minus_twice_log_likelihood(result, window) + jnp.sum(priors**2)
+    s, e, seen = result.deviation, result.innovation, window.weight > 0
+    value = jnp.sum(jnp.where(seen, (e / s) ** 2 + 2 * jnp.log(s) + LOG_2PI, 0.0)) + jnp.sum(priors**2)
     # A sample that gives an initial value does not have an innovation.
-    deviation = result.deviation.at[:, 0].set(jnp.where(window.start_weight > 0, jnp.nan, result.deviation[:, 0]))
-    result = result._replace(deviation=deviation)
-    return J, jnp.concatenate([r, of_size, priors]), value, result
-
-
-def minus_twice_log_likelihood(result: Filtered, window: Windows) -> Array:
-    """Minus twice the log likelihood of the measurements of one trial."""
-    measured, s = window.weight > 0, result.deviation
-    return jnp.sum(jnp.where(measured, (result.innovation / s) ** 2 + 2 * jnp.log(s) + LOG_2PI, 0.0))
+    s = s.at[:, 0].set(jnp.where(window.start_weight > 0, jnp.nan, s[:, 0]))
+    return (
+        jnp.concatenate([r, of_size, priors]),
+        J,
+        Prediction(result.predicted, result.status, s, value, result.unknowns),
+    )

@@ -80,13 +80,12 @@ def blocks_of(
     # If there are few windows, they are divided, because cluster-robust errors need the scores of several parts.
     n_parts = -(-PARTS // windows.t.shape[0]) if model.noise is None and not n_next else 1
 
+    # The transcription gives residuals, derivatives and a prediction. All else is the same for every transcription.
+    rows_of = jacobian_of if model.noise is None else information_of
+
     def window_block(arguments):
         window, z, z_next, b, start, start_dot = arguments
-        if model.noise is None:
-            r, J, prediction = jacobian_of(model, window, start, start_dot, z, b, point.parameters)
-        else:
-            J, r, value, result = information_of(model, window, start, start_dot, z, b, point.parameters)
-            prediction = Prediction(result.predicted, result.status, result.deviation, value, result.unknowns)
+        r, J, prediction = rows_of(model, window, start, start_dot, z, b, point.parameters)
         links = by_next(model, window, r.shape[0])[:, :n_next]
         A = jnp.column_stack([J[:, :n_z], links, J[:, n_z:], r + links @ z_next[:n_next]])
         # For least squares, the triangle is equivalent to the (m, k) matrix. Invalid rows are masked before and set to
@@ -213,7 +212,9 @@ class Linearization(eqx.Module):
 
     @property
     def _own(self) -> np.ndarray:
-        return self._squares if self.prediction.cost is None else np.asarray(self.prediction.cost)
+        """The contribution of every window (W,) to the cost."""
+        cost = self.prediction.cost
+        return np.sum(np.asarray(self.blocks.R)[:, :, -1] ** 2, axis=1) if cost is None else np.asarray(cost)
 
     @property
     def prior_squares(self) -> float:
@@ -227,12 +228,7 @@ class Linearization(eqx.Module):
         In ordinary least squares it equals the cost. With process noise, it is about twice the number of measurements,
         whereas the cost may be negative.
         """
-        return float(np.sum(self._squares)) + self.prior_squares
-
-    @property
-    def _squares(self) -> np.ndarray:
-        """The sum of squares of every window (W,)."""
-        return np.sum(np.asarray(self.blocks.R)[:, :, -1] ** 2, axis=1)
+        return float(np.sum(np.sum(np.asarray(self.blocks.R)[:, :, -1] ** 2, axis=1))) + self.prior_squares
 
     @property
     def good(self) -> np.ndarray:

@@ -20,12 +20,9 @@ def moved(point: Unknowns, x: Any, eliminated: Eliminated) -> Unknowns:
     """The point after a step x of the parameters and the corresponding step of the nuisance values."""
     x = np.asarray(x)
     z, b = eliminated.back_substitute(x)
-
-    def after(before, step):
-        return on_device(np.asarray(before) + step)
-
-    numbers = zip((point.parameters, point.trial_unknowns, point.window_starts), (x, b, z), strict=True)
-    return Unknowns(*(after(*pair) for pair in numbers), meaning=point.meaning)
+    before = point.parameters, point.trial_unknowns, point.window_starts
+    after = (on_device(np.asarray(old) + step) for old, step in zip(before, (x, b, z), strict=True))
+    return Unknowns(*after, meaning=point.meaning)
 
 
 def usable(at: Linearization | None) -> bool:
@@ -38,12 +35,15 @@ class Unsimulated(ValueError):
 
     def __init__(self, problem: Problem, point: Unknowns, at: Linearization | None, bad: np.ndarray):
         bad = problem.without_start(point) if at is None else bad
+        first = jax.tree.map(lambda x: x[0], problem.windows)
+        arguments = first.start, point.window_starts[0], point.trial_unknowns[0], point.parameters
+        events = jax.eval_shape(problem.model.simulate, first, *arguments).events
         self.reasons: dict[int, str] = {}
         for i in np.flatnonzero(bad):
             (k, first, n), why = problem.slices[i], "its initial state cannot satisfy the constraints"
             if at is not None:
                 status = int(at.status[i])
-                why = "not finite" if status == Status.COMPLETED else reason(status, _event_names(problem))
+                why = "not finite" if status == Status.COMPLETED else reason(status, events)
             t = problem.trials[k].t
             self.reasons.setdefault(
                 k, f"the residuals from {t[first]:g} to {t[first + n - 1]:g} s are not finite ({why})"
@@ -164,10 +164,3 @@ def _chosen(better: np.ndarray, owner: np.ndarray, new: Any, old: Any) -> tuple[
     b, z = of(better)(tried.trial_unknowns, point.trial_unknowns), of_windows(tried.window_starts, point.window_starts)
     point = Unknowns(point.parameters, b, z, point.meaning)
     return point, Linearization(eqx.tree_at(lambda blocks: blocks.R, at.blocks, R), seen)
-
-
-def _event_names(problem: Problem) -> tuple[str, ...]:
-    first = jax.tree.map(lambda x: x[0], problem.windows)
-    start = problem.start
-    local = start.window_starts[0], start.trial_unknowns[0]
-    return jax.eval_shape(problem.model.simulate, first, first.start, *local, start.parameters).events

@@ -300,10 +300,11 @@ class GradientDescent(Optimizer):
         if proposed(problem, at, 1e-3).gain <= negligible:
             return last_step(problem, now, 1e-3, negligible)
         eliminated, refresh = eliminate(at.blocks, 0.0), self.refresh and (self.refresh if self.transform else 1)
-        directions, unit, gradient = np.asarray(state.directions), np.asarray(state.unit), _gradient(eliminated)
+        A, r = eliminated.rows
+        directions, unit, gradient = np.asarray(state.directions), np.asarray(state.unit), A.T @ r
         if i == 0 or (refresh and i % refresh == 0):
             floor = (1.0 if self.transform else 1e-3) * variance_of(problem, at) ** 0.5
-            directions = _directions(eliminated, floor if refresh else None)
+            directions = _directions(A, floor if refresh else None)
         unit = unit if unit > 0 else np.linalg.norm(directions.T @ gradient)
         directions, unit = on_device(directions), on_device(unit)
         step, y, of_optax = _descend(self._optax)(directions, unit, gradient, state.of_optax, state.y)
@@ -330,20 +331,13 @@ def _descend(transform: optax.GradientTransformation) -> Callable[..., tuple[Arr
     return descend
 
 
-def _gradient(eliminated: Eliminated) -> np.ndarray:
-    """The gradient of half the sum of squares, with the nuisance values eliminated."""
-    A, r = eliminated.rows
-    return A.T @ r
-
-
-def _directions(eliminated: Eliminated, floor: float | None) -> np.ndarray:
+def _directions(A: np.ndarray, floor: float | None) -> np.ndarray:
     """The preconditioner (A^T A)^(-1/2) (p, p).
 
     The symmetric square root is used, so that the momentum of an optimizer remains valid when the preconditioner is
     updated. Directions with singular values below `floor` are not determined by the data. A step along them is limited
     to about the scale of a parameter.
     """
-    A, _ = eliminated.rows
     if floor is None:
         return np.eye(A.shape[1], dtype=A.dtype) / np.linalg.norm(A)
     _, s, V = np.linalg.svd(A, full_matrices=False)
