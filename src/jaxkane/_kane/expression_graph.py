@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._common.lookup import refuse_any, refuse_if
 from .._scalarjit.compat import ClosedJaxpr, jaxpr_as_fun
 from .._scalarjit.components import ELIMINATE_UP_TO, as_vector, is_written_out
 from .._scalarjit.graph import Graph, NotScalarError, unrolled
@@ -45,20 +46,12 @@ class Function(NamedTuple):
     needs_states: bool = False
 
 
-def _all_rates(system, t, q, u, w, u_dep):
-    """Rates of the coordinates as a function of all speeds, including the dependent ones."""
-    evaluator = DescriptionEvaluator(system)
-    return (as_vector(evaluator.rates(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
-
-
-def _velocity_residuals(system, t, q, u, w, u_dep):
-    return (as_vector(DescriptionEvaluator(system).residuals(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
-
-
-def _configuration_residuals(system, t, q, u, w, u_dep):
-    return (as_vector(DescriptionEvaluator(system).configuration(t, as_row(q, system.coordinates, "q")), q),)
-
-
+# Derivatives of the rates (q_dot, u_dot) with respect to these kinds of arguments.
+JACOBIANS = {
+    "state_jacobian": ("q", "u"),
+    "parameter_jacobian": ("parameters",),
+    "input_jacobian": ("inputs",),
+}
 FUNCTIONS: dict[str, Function] = {
     "rates": Function(("q_dot", "u_dot"), lambda s, t, q, u, w, _: motion_rates_by_matrix(s, t, q, u, w)),
     "equations": Function(("M", "f"), lambda s, t, q, u, w, _: equations_of_motion(s, t, q, u, w)),
@@ -73,17 +66,21 @@ FUNCTIONS: dict[str, Function] = {
     "partial_velocities": Function(("V", "W"), lambda s, t, q, u, w, _: partial_velocities(s, t, q, u, w)),
     "state_rates": Function(("x_dot",), lambda s, t, q, u, w, _: (rates(s, t, q, u, w).x,), needs_states=True),
     "kinetic_energy": Function(("energy",), lambda s, t, q, u, w, _: (kinetic_energy(s, t, q, u),)),
-    "coordinate_rates": Function(("q_dot",), _all_rates),
-    "velocity_residuals": Function(("c",), _velocity_residuals, True),
-    "configuration_residuals": Function(("h",), _configuration_residuals),
 }
-# Derivatives of the rates (q_dot, u_dot) with respect to these kinds of arguments.
-JACOBIANS = {
-    "state_jacobian": ("q", "u"),
-    "parameter_jacobian": ("parameters",),
-    "input_jacobian": ("inputs",),
+OFFERED = (*FUNCTIONS, *JACOBIANS)
+# As functions of all speeds, including the dependent ones.
+FUNCTIONS |= {
+    "coordinate_rates": Function(("q_dot",), lambda *args: _read(DescriptionEvaluator.rates, *args)),
+    "velocity_residuals": Function(("c",), lambda *args: _read(DescriptionEvaluator.residuals, *args), True),
+    "configuration_residuals": Function(
+        ("h",), lambda *args: _read(lambda system, t, q, u: system.configuration(t, q), *args)
+    ),
 }
-OFFERED = (*(name for name, f in FUNCTIONS.items() if f.evaluate.__name__ == "<lambda>"), *JACOBIANS)
+
+
+def _read(quantity: Callable[..., Any], system: System, t: Any, q: Any, u: Any, w: Any, u_dep: Any) -> tuple[Any]:
+    row = as_row(q, system.coordinates, "q")
+    return (as_vector(quantity(DescriptionEvaluator(system), t, row, (*u, *u_dep)), q),)
 
 
 class Argument(NamedTuple):
@@ -118,13 +115,12 @@ class Formulas:
         refuse_multipliers(system)
         self.system, self.name, self.dtype = system, type(system).__name__, str(jnp.dtype(dtype))
         self.functions = {**FUNCTIONS, **(more or {})}
-        if self.dtype not in ("float64", "float32"):
-            raise ValueError(f"{self.name}: `dtype` must be 'float64' or 'float32', got {dtype!r}.")
-        batched = in_batches(system)
-        if batched:
-            raise ValueError(
-                f"{self.name} is a batch: {', '.join(batched)} has additional leading axes. Pass one member of it."
-            )
+        refuse_if(
+            self.dtype not in ("float64", "float32"),
+            f"{self.name}: `dtype` must be 'float64' or 'float32', got {dtype!r}.",
+        )
+        after = " has additional leading axes. Pass one member of it."
+        refuse_any(in_batches(system), f"{self.name} is a batch:", after)
         if not is_concrete(system):
             raise TypeError(f"{self.name} is traced. Call this function outside of jax.jit, vmap and grad.")
         check_system(system, 0.0, None)
@@ -158,7 +154,6 @@ class Formulas:
         self.nodes = functools.cache(self._nodes)
 
     def values(self) -> dict[str, np.ndarray]:
-        """The parameter values of the system by name."""
         floats = [x for x, is_float in zip(self.leaves, self.is_float, strict=True) if is_float]
         return {a.name: np.asarray(x, self.dtype) for a, x in zip(self.of_kind("parameters"), floats, strict=True)}
 
@@ -166,7 +161,6 @@ class Formulas:
         return [a for a in self.arguments if a.kind == kind]
 
     def names(self, kind: str) -> tuple[str, ...]:
-        """The names of all numbers of a kind, in order."""
         return tuple(name for a in self.of_kind(kind) for name in a.elements)
 
     def evaluate(self, function: str, *args: Any) -> tuple[Any, ...]:
@@ -181,16 +175,19 @@ class Formulas:
 
     def _program(self, function: str, keeps_solutions: bool = False) -> ClosedJaxpr:
         """A function as a JAX program without calls of other programs. `keeps_solutions`: see `cse`."""
-        if self.functions[function].needs_constraints and not self.system.dependent_speeds:
-            raise ValueError(f"{self.name} has no dependent speeds, so {function!r} does not exist. Omit it.")
-        if self.functions[function].needs_states and not self.system.states:
-            raise ValueError(f"{self.name} has no first-order states, so {function!r} does not exist. Omit it.")
+        refuse_if(
+            self.functions[function].needs_constraints and not self.system.dependent_speeds,
+            f"{self.name} has no dependent speeds, so {function!r} does not exist. Omit it.",
+        )
+        refuse_if(
+            self.functions[function].needs_states and not self.system.states,
+            f"{self.name} has no first-order states, so {function!r} does not exist. Omit it.",
+        )
         specs = [jax.ShapeDtypeStruct(a.shape, self.dtype) for a in self.arguments]
         with jax.enable_x64(self.dtype == "float64"):
             return cse(jax.make_jaxpr(functools.partial(self.evaluate, function))(*specs), keeps_solutions)
 
     def _nodes(self, function: str) -> dict[str, np.ndarray]:
-        """The outputs of a function by name, as nodes."""
         if function in JACOBIANS:
             blocks = self.derivatives("rates", self.directions(*JACOBIANS[function]))
             return {"jacobian": np.concatenate([*blocks.values()])}

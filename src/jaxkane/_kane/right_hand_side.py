@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._common.lookup import not_there, refuse_unknown
+from .._common.lookup import checked, not_there, refuse_any, refuse_unknown
 from .._scalarjit.components import Component, Numbers, add3, as_vector, component, cross, is_exact, is_written_out
 from .._scalarjit.scalar_function import ScalarFunction, tree_of
 from .._system.kinematics import Frame, Point, Vector
@@ -52,14 +52,12 @@ class MeasurementContext(Inputs):
 
     def acceleration(self, point: Point) -> Vector:
         """Acceleration [m/s^2] of a Point in the inertial frame, as a Vector."""
-        if not isinstance(point, Point):
-            raise TypeError(f"now.acceleration(point) needs a Point, got {point!r}. For a body, pass its `center`.")
+        checked(point, Point, "now.acceleration(point) needs a Point", " For a body, pass its `center`.")
         return self._rate(point.velocity)
 
     def angular_acceleration(self, frame: Frame) -> Vector:
         """Angular acceleration [rad/s^2] of a Frame in the inertial frame, as a Vector."""
-        if not isinstance(frame, Frame):
-            raise TypeError(f"now.angular_acceleration(frame) needs a Frame, got {frame!r}.")
+        checked(frame, Frame, "now.angular_acceleration(frame) needs a Frame")
         return self._rate(frame.angular_velocity)
 
     def force(self, name: str) -> Any:
@@ -145,30 +143,22 @@ def _outputs(system: System, t: Component, q: Row, u: Row, motion: Motion, now: 
     outputs = _flat(label, system.outputs(t, q, u, motion, now))
     reserved = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
     twice = [name for name in outputs if name in reserved]
-    if twice:
-        raise ValueError(
-            f"{label}: {', '.join(twice)} is already the name of a coordinate, a speed, an input or a state. "
-            f"Trajectories are read by name, so choose another one, e.g. {'measured_' + twice[0]!r}."
-        )
+    after = " is already the name of a coordinate, a speed, an input or a state. Choose another one, e.g. measured_..."
+    refuse_any(twice, f"{label}:", after)
     return outputs
 
 
 def _flat(label: str, outputs: Any) -> dict[str, Component]:
-    if not isinstance(outputs, Mapping):
-        hint = " Does it end without a `return`?" if outputs is None else ""
-        raise TypeError(f"{label} must return a dict of numbers by name, got {outputs!r}.{hint}")
+    hint = " Does it end without a `return`?" if outputs is None else ""
     flat: dict[str, Component] = {}
-    for name, value in outputs.items():
-        if not isinstance(name, str) or not name:
-            raise TypeError(f"{label}: the name of an output must be a string, got {name!r}.")
+    for name, value in checked(outputs, Mapping, f"{label} must return a dict of numbers by name", hint).items():
+        checked(name or None, str, f"{label}: the name of an output must be a string")
         if isinstance(value, Mapping):
             items = {f"{name}.{key}": x for key, x in _flat(label, value).items()}
         else:
             items = {name: _number(label, name, value)}
-        for key, x in items.items():
-            if key in flat:
-                raise ValueError(f"{label}: two outputs have the name {key!r}. Rename one.")
-            flat[key] = x
+        refuse_any([key for key in items if key in flat], f"{label}: two outputs have the name", ". Rename one.")
+        flat |= items
     return flat
 
 

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import scipy.linalg
 
-from .._common.lookup import as_names, not_there, real_number
+from .._common.lookup import as_names, checked, real_number, refuse_any, refuse_if, refuse_unknown
 from .._scalarjit.compat import Tracer
 from ._joints import JointType
 from ._mechanism import Field, LinkStructure, LoopStructure, Structure, class_of, loop_residuals, polynomial
@@ -42,10 +42,10 @@ def with_dependent(
     norms = [joint.name + joint.coordinates[-1][0] for joint in structure.joints if len(joint.coordinates) > 1]
     choices = _checked_choices(structure, choices)
     if not (structure.loops or structure.couplings):
-        if choices.dependent:
-            raise ValueError(
-                f"`dependent` names {', '.join(choices.dependent)}, but the mechanism has no loop. Omit `dependent`."
-            )
+        refuse_if(
+            choices.dependent,
+            f"`dependent` names {', '.join(choices.dependent or ())}, but the mechanism has no loop. Omit `dependent`.",
+        )
         return structure._replace(dependent_coordinates=tuple(norms))
     with jax.ensure_compile_time_eval():  # trial numbers must be concrete also inside `jax.jit`
         trial = _Trial(structure, fields, values)
@@ -74,26 +74,22 @@ def with_dependent(
 
 
 def _checked_choices(structure: Structure, choices: LoopChoices) -> LoopChoices:
-    """**Raises:** `ValueError` for unknown names."""
     choices = choices._replace(independent=as_names(choices.independent, "independent"))
-    if choices.pose is not None and not isinstance(choices.pose, Mapping):
-        raise TypeError(f"`pose` must be a dict of coordinates by name, got {choices.pose!r}.")
+    checked(choices.pose, Mapping | None, "`pose` must be a dict of coordinates by name")
     coordinates = [name for joint in structure.joints for name in joint.names(joint.coordinates)]
     joints = [joint.name for joint in structure.joints]
     for what, names, known, kind in (
         ("independent", choices.independent, joints, "the joints"),
         ("pose", choices.pose or (), coordinates, "the coordinates"),
     ):
-        wrong = [name for name in names if name not in known]
-        if wrong:
-            raise ValueError(f"`{what}`: " + str(not_there(wrong[0], known, kind).args[0]))
+        refuse_unknown(names, known, f"`{what}` names what is not among {kind}:")
     for name, value in (choices.pose or {}).items():
-        if not np.isfinite(real_number(value, f"`pose`: {name!r}")):
-            raise ValueError(f"`pose`: {name!r} = {value!r} is not finite.")
+        refuse_if(
+            not np.isfinite(real_number(value, f"`pose`: {name!r}")), f"`pose`: {name!r} = {value!r} is not finite."
+        )
     dependent = None if choices.dependent is None else as_names(choices.dependent, "dependent")
     both = [name for name in dependent or () if name in choices.independent]
-    if both:
-        raise ValueError(f"`dependent` and `independent` both name {both[0]!r}. Name it in one of them.")
+    refuse_any(both, "`dependent` and `independent` both name", ". Name it in one of them.")
     return choices._replace(dependent=dependent)
 
 
@@ -144,11 +140,11 @@ def _dependent_names(
     preferred = C * [1e3 if name in follows else 1.0 for name in trial.speeds]
     groups = _by_joints(structure, trial.speeds, lambda joint: joint.speeds, choices.independent)
     chosen = _best_columns(preferred, groups)
-    if len(chosen) < len(rows):
-        raise ValueError(
-            f"{structure.name}: the loops have {len(rows)} independent residuals, and cannot be solved without the "
-            f"joints that `independent` names: {', '.join(choices.independent)}. Name fewer."
-        )
+    refuse_if(
+        len(chosen) < len(rows),
+        f"{structure.name}: the loops have {len(rows)} independent residuals, and cannot be solved without the "
+        f"joints that `independent` names: {', '.join(choices.independent)}. Name fewer.",
+    )
     speeds = [trial.speeds[i] for i in chosen]
     if all(name.endswith("_rate") for name in speeds):
         return speeds, [*(name.removesuffix("_rate") for name in speeds), *norms]
@@ -163,18 +159,18 @@ def _named_dependent(
     trial: _Trial, C: np.ndarray, dependent: Sequence[str], norms: list[str]
 ) -> tuple[list[str], list[str]]:
     simple = [joint.name for joint in trial.structure.joints if len(joint.speeds) == 1]
-    wrong = [name for name in dependent if name not in simple]
-    if wrong:
-        raise ValueError("`dependent`: " + str(not_there(wrong[0], simple, "the hinges and sliders").args[0]))
-    if len(set(dependent)) != len(C):
-        raise ValueError(
-            f"`dependent` names {len(set(dependent))} joints, but the loops have {len(C)} independent residuals. Name "
-            "one joint for each."
-        )
+    refuse_unknown(dependent, simple, "`dependent` names what is not among the hinges and sliders:")
+    refuse_if(
+        len(set(dependent)) != len(C),
+        f"`dependent` names {len(set(dependent))} joints, but the loops have {len(C)} independent residuals. Name "
+        "one joint for each.",
+    )
     speeds = [f"{name}_rate" for name in dependent]
     columns = C[:, [trial.speeds.index(name) for name in speeds]]
-    if np.linalg.svd(columns, compute_uv=False)[-1] < 1e-9 * np.abs(C).max():
-        raise ValueError(f"`dependent`: the loops cannot be solved for {', '.join(dependent)}. Name other joints.")
+    refuse_if(
+        np.linalg.svd(columns, compute_uv=False)[-1] < 1e-9 * np.abs(C).max(),
+        f"`dependent`: the loops cannot be solved for {', '.join(dependent)}. Name other joints.",
+    )
     return speeds, [*dependent, *norms]
 
 
@@ -236,7 +232,6 @@ _KINEMATIC = ("position", "anchor", "site")
 
 
 def _chain_to(links: Mapping[str, LinkStructure], name: str | None) -> list[str]:
-    """The names of the links from the ground to a link."""
     chain: list[str] = []
     while name is not None:
         chain.append(name)
