@@ -24,6 +24,7 @@ from .._scalarjit.components import (
     Numbers,
     as_vector,
     is_exact,
+    is_zero,
     stack,
 )
 from .._scalarjit.scalar_function import ScalarFunction
@@ -182,22 +183,20 @@ def consistency_quantities(system: System, t: Component, q: Numbers, u: Numbers,
         f"{evaluator.name}: {', '.join(twice)} is the name of an auxiliary speed and of a point or a frame. "
         "constraint_forces returns a force by name for both. Rename one of them.",
     )
-    quantities = [
-        *_of_speeds(evaluator, t, q, u),
+    of_frames = [(frame, [*frame._to_child, frame._spin]) for frame in frames_of(motion, loads)]
+    quantities: list[Quantity] = [
+        *((("rate", name), [(x,)]) for name, x in zip(system.coordinates, evaluator.rates(t, q, u), strict=True)),
+        *((("residual", str(i)), [(x,)]) for i, x in enumerate(evaluator.residuals(t, q, u))),
+        *((("constraint", str(i)), [(x,)]) for i, x in enumerate(evaluator.configuration(t, q))),
         *_of_bodies(motion),
         *_of_points(motion, loads),
-        *_of_frames(motion, loads),
+        *(
+            (("frame", frame.name, frame.parent.name), rows)  # type: ignore[union-attr]
+            for frame, rows in of_frames
+            if not all(is_exact(x) for row in rows for x in row) or any(frame._spin)
+        ),
     ]
     return {(i, *key): stack(rows).astype(like.dtype) for i, (key, rows) in enumerate(quantities)}
-
-
-def _of_speeds(evaluator: DescriptionEvaluator, t: Component, q: Numbers, u: Numbers) -> Iterator[Quantity]:
-    for name, rate in zip(evaluator.system.coordinates, evaluator.rates(t, q, u), strict=True):
-        yield ("rate", name), [(rate,)]
-    for i, residual in enumerate(evaluator.residuals(t, q, u)):
-        yield ("residual", str(i)), [(residual,)]
-    for i, h in enumerate(evaluator.configuration(t, q)):
-        yield ("constraint", str(i)), [(h,)]
 
 
 def _of_bodies(motion: Motion) -> Iterator[Quantity]:
@@ -231,17 +230,10 @@ def _of_points(motion: Motion, loads: Iterable[Load]) -> Iterator[Quantity]:
             done.add(link)
             frame, velocity = link._relative_motion
             rows = [link._offset.components_in(frame), velocity.components_in(frame)]  # type: ignore[union-attr]
-            if not all(is_exact(x) for x in rows[0]) or not all(is_exact(x) and x == 0.0 for x in rows[1]):
+            if not all(is_exact(x) for x in rows[0]) or not all(is_zero(x) for x in rows[1]):
                 # A point that `loads` creates from a motion without speeds is at rest too, but is not a contact point.
                 at_rest = link._base is None and frame is motion.N
                 yield ("contact" if at_rest else "place", words.get(link, f"the point {link.name!r}"), frame.name), rows
-
-
-def _of_frames(motion: Motion, loads: Iterable[Load]) -> Iterator[Quantity]:
-    for frame in frames_of(motion, loads):
-        rows = [*frame._to_child, frame._spin]
-        if not all(is_exact(x) for row in rows for x in row) or any(frame._spin):
-            yield ("frame", frame.name, frame.parent.name), rows  # type: ignore[union-attr]
 
 
 def _has_consistent_velocity(point: Point) -> bool:
@@ -249,7 +241,7 @@ def _has_consistent_velocity(point: Point) -> bool:
     if point._base is not None:
         return point._relative_motion is not None
     known = (*point.velocity.components, *(point._offset.components if point._offset is not None else ()))
-    return all(is_exact(x) and x == 0.0 for x in known)  # the origin
+    return all(is_zero(x) for x in known)  # the origin
 
 
 _CHECKED = Cache()  # structures
@@ -452,11 +444,11 @@ class _Consistency:
     def _curved_along(self, q: np.ndarray, direction: np.ndarray, zero: Quantities) -> set[Any]:
         """The quantities that are not affine along a direction of the speeds. `zero`: their values at rest."""
         one, scaled = self._read(q, direction), {s: self._read(q, s * direction) for s in _SIZES}
-
-        def is_curved(key: Any, z: Any, x: Any, f: Any, s: float) -> bool:
-            return self._differs(f - z - s * (x - z), f, s * x, z, smallest=self._smallest(key))
-
-        return {key for key, z in zero.items() for s, at in scaled.items() if is_curved(key, z, one[key], at[key], s)}
+        each = [(key, z, one[key], s, at[key]) for key, z in zero.items() for s, at in scaled.items()]
+        differs = self._differs
+        return {
+            key for key, z, x, s, f in each if differs(f - z - s * (x - z), f, s * x, z, smallest=self._smallest(key))
+        }
 
     def _smallest(self, key: Any) -> float:
         return self.smallest if _is_translation(key) else 1.0

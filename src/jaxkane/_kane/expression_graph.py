@@ -6,8 +6,9 @@ graph, so common subexpressions occur once.
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -192,10 +193,8 @@ class Formulas:
             blocks = self.derivatives("rates", self.directions(*JACOBIANS[function]))
             return {"jacobian": np.concatenate([*blocks.values()])}
         program = self.program(function)
-        try:
+        with self._explained(function):
             outputs = unrolled(program, self.inputs, self.graph)
-        except NotScalarError as error:
-            raise ValueError(self._refusal(function, error)) from None
         return dict(zip(self.functions[function].outputs, outputs, strict=True))
 
     def directions(self, *kinds: str) -> list[Direction]:
@@ -204,11 +203,8 @@ class Formulas:
 
     def derivatives(self, function: str, directions: Sequence[Direction]) -> dict[str, np.ndarray]:
         """The derivatives (..., d) of a function's outputs with respect to d numbers, as nodes."""
-        try:
-            with jax.enable_x64(self.dtype == "float64"):
-                outputs = jacobian(self.program(function, keeps_solutions=True), self.inputs, directions, self.graph)
-        except NotScalarError as error:
-            raise ValueError(self._refusal(function, error)) from None
+        with self._explained(function), jax.enable_x64(self.dtype == "float64"):
+            outputs = jacobian(self.program(function, keeps_solutions=True), self.inputs, directions, self.graph)
         return dict(zip(self.functions[function].outputs, outputs, strict=True))
 
     def directional_derivative(self, function: str, direction: Mapping[int, np.ndarray]) -> list[np.ndarray]:
@@ -218,12 +214,9 @@ class Formulas:
         """
         places = [i for i, nodes in direction.items() if nodes.size]
         outputs = self.nodes(function).values()
-        try:
-            with jax.enable_x64(self.dtype == "float64"):
-                program, has_tangent = tangent_program(self.program(function, keeps_solutions=True), places)
-                tangents = iter(unrolled(program, [*self.inputs, *(direction[i] for i in places)], self.graph))
-        except NotScalarError as error:
-            raise ValueError(self._refusal(function, error)) from None
+        with self._explained(function), jax.enable_x64(self.dtype == "float64"):
+            program, has_tangent = tangent_program(self.program(function, keeps_solutions=True), places)
+            tangents = iter(unrolled(program, [*self.inputs, *(direction[i] for i in places)], self.graph))
         zero = self.graph.constant(0.0, self.dtype)
         pairs = zip(has_tangent, outputs, strict=True)
         return [next(tangents) if has else np.full(nodes.shape, zero) for has, nodes in pairs]
@@ -246,21 +239,25 @@ class Formulas:
         blocks = jax.jacfwd(rates_of)([jnp.asarray(args[i]) for i in places])
         return (jnp.concatenate([block.reshape(n, -1) for block in blocks], axis=1),)
 
-    def _refusal(self, function: str, error: NotScalarError) -> str:
+    @contextlib.contextmanager
+    def _explained(self, function: str) -> Iterator[None]:
+        """**Raises:** `ValueError` for an operation that cannot be written with scalars."""
         n, k = len(self.system.speeds), len(self.system.dependent_speeds)
         if not is_written_out(n) and function not in ("equations", "coordinate_rates"):
             why = f"because the equations of a system with {n} speeds are solved by LAPACK"
             remedy = "Export M and f with functions=('equations',), and solve M u_dot = f in the other program"
         elif k > ELIMINATE_UP_TO:
-            why = f"because {k} dependent speeds are computed by LAPACK"
-            remedy = "Use fewer dependent speeds"
+            why, remedy = f"because {k} dependent speeds are computed by LAPACK", "Use fewer dependent speeds"
         else:
             why = "which its description uses"
             remedy = "Use functions of single numbers, jnp.where and constant indices"
-        return (
-            f"{self.name}: {function!r} cannot be written as formulas of single numbers: it contains {error}, {why}. "
-            f"{remedy}. Or use jaxkane.export.stablehlo, which supports every operation."
-        )
+        try:
+            yield
+        except NotScalarError as error:
+            raise ValueError(
+                f"{self.name}: {function!r} cannot be written as formulas of single numbers: it contains {error}, "
+                f"{why}. {remedy}. Or use jaxkane.export.stablehlo, which supports every operation."
+            ) from None
 
 
 def _elements(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:

@@ -107,7 +107,8 @@ class Impact(eqx.Module):
 
 def checked_restitution(value: Any, label: str = "Impact") -> Any:
     is_one = not isinstance(value, (tuple, list)) and getattr(value, "ndim", 0) != 1
-    for e in (value,) if is_one else value:
+    values: Any = (value,) if is_one else value
+    for e in values:
         check_number(e, f"{label}: a coefficient of restitution")
         if is_concrete(e) and not 0 <= float(e) <= 1:
             raise ValueError(f"{label}: the coefficient of restitution is {float(e)}. It must be between 0 and 1.")
@@ -208,9 +209,7 @@ def impact_at(
     if is_written_out(len(system.speeds)):
         return _impact_written_out(system, t, q, u, inputs, read)
 
-    def column(direction: Any) -> Array:
-        return _residuals_along(system, t, q, u, inputs, read, direction)
-
+    column = functools.partial(_residuals_along, system, t, q, u, inputs, read)
     C = jax.vmap(column, out_axes=-1)(np.eye(len(system.speeds), dtype=q.dtype))
     return _solved(mass_matrix_columns(system, t, q, u, inputs), C, _quantities(system, t, q, u, inputs, read))
 
@@ -284,10 +283,7 @@ class Permanent(NamedTuple):
         system: Any = kane.system
         if not hasattr(system, "multiplier_residuals"):
             return None
-
-        def residuals(u: Row) -> Row:
-            return system.multiplier_residuals(kane.t, kane.q, u)
-
+        residuals = functools.partial(system.multiplier_residuals, kane.t, kane.q)
         return cls(kane.jacobian(residuals), stack([residuals(kane.u_all)])[0].astype(kane.dtype))
 
     def rows(self, X: Array) -> tuple[Array, Array]:

@@ -148,11 +148,8 @@ class KaneEquations(DescriptionEvaluator):
         The textbook prints a minus before C_dep_dot (Example 7).
         """
         at_rest = (0.0,) * self.n
-
-        def columns(t: Component, *q: Component) -> list[Row]:
-            return KaneEquations(self.system, t, q, at_rest).J
-
-        return jvp(columns, (self.t, *self.q), (1.0, *self.q_dot))[1]
+        along = (1.0, *self.q_dot)
+        return jvp(lambda t, *q: KaneEquations(self.system, t, q, at_rest).J, (self.t, *self.q), along)[1]
 
     def bias(self) -> Row:
         """The dependent accelerations (k,) at u_dot = 0.
@@ -180,10 +177,8 @@ class KaneEquations(DescriptionEvaluator):
         the dependent speeds are `bias`.
         """
 
-        def momenta(t: Component, *q: Component) -> list[tuple[Row, Row]]:
-            return self.read("momenta", t, q, self.u_all)
-
-        values, rates = jvp(momenta, (self.t, *self.q), (1.0, *self.q_dot))
+        at, along = (self.t, *self.q), (1.0, *self.q_dot)
+        values, rates = jvp(lambda t, *q: self.read("momenta", t, q, self.u_all), at, along)
         if u_dot is None and self.k:
             u_dot = (*(0.0,) * self.n, *self.bias())
         if u_dot is not None:
@@ -263,14 +258,13 @@ def motion_rates(
         return _motion_rates(system, t, q, u, inputs)
     q_dot, f = rates_and_forcing(system, t, q, u, inputs)
 
-    def times(u_dot: Array) -> Array:
-        return _mass_times(system, t, q, u, inputs, u_dot)
-
-    def solve(_: Any, f: Array) -> Array:
-        return _accelerations_under(system, t, q, u, inputs, f)
-
     # Its derivative is that of M u_dot = f (implicit function theorem). The elimination itself is never differentiated.
-    return q_dot, jax.lax.custom_linear_solve(times, f, solve, symmetric=True)
+    return q_dot, jax.lax.custom_linear_solve(
+        lambda u_dot: _mass_times(system, t, q, u, inputs, u_dot),
+        f,
+        lambda _, f: _accelerations_under(system, t, q, u, inputs, f),
+        symmetric=True,
+    )
 
 
 def motion_rates_by_matrix(
@@ -296,9 +290,7 @@ def rates_and_equations(
 def mass_matrix_columns(system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]) -> Float[Array, "n n"]:
     """M (n, n), by one batched program for all columns."""
 
-    def column(direction: Numbers) -> Array:
-        return _mass_times(system, t, q, u, inputs, direction)
-
+    column = functools.partial(_mass_times, system, t, q, u, inputs)
     return jax.vmap(column)(np.eye(len(system.speeds), dtype=q.dtype))
 
 

@@ -80,7 +80,8 @@ def with_multipliers(system: System) -> System:
     if has_multipliers(system):
         return system
     refuse_if(system.auxiliary_speeds, f"with_multipliers({name}): auxiliary speeds are not supported. Remove them.")
-    return _class_of(type(system))(system)
+    kind: Any = type(system)
+    return _class_of(kind)(system)
 
 
 @functools.lru_cache(maxsize=1000)

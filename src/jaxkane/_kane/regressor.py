@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -138,7 +138,12 @@ def _bodies_of(system: System) -> tuple[tuple[BodyParameters, ...], tuple[int, .
     axes: list[int | None] = [None] * len(bodies)
     spinning = [b.angular_velocity is not b.frame.angular_velocity and not b.is_particle for _, b in bodies]
     if any(spinning):
-        spins = _at_random_speeds(lambda *args: masses_and_spins(*args)[1], system, n_u)
+        rng = np.random.default_rng(0)
+        point, t, q = at_random_point((system, 0.3, None), rng)
+        u = rng.uniform(0.5, 1.5, n_u).astype(q.dtype)
+        with concretely():
+            at = jax.tree.leaves(point), jnp.asarray(t, q.dtype), list(q), list(u)
+            spins = jax.device_get(jax.jit(lambda *args: masses_and_spins(*args)[1])(*at))
         axes = [_axis(spin) if spins_in_frame else None for spins_in_frame, spin in zip(spinning, spins, strict=True)]
     reads = np.array([depends_on(program, [i]) for i in range(len(leaves))], bool).reshape(len(leaves), -1)
     named = {point: name for name, point in motion.points.items()}
@@ -155,14 +160,6 @@ def _bodies_of(system: System) -> tuple[tuple[BodyParameters, ...], tuple[int, .
         about = "its mass centre" if origin is body.center else named.get(origin, origin.name)
         parameters.append(BodyParameters(i, name, about, indices, axis, not depends_on_leaves))
     return tuple(parameters), tuple(int(i) for i in np.flatnonzero(reads.any(axis=1)))
-
-
-def _at_random_speeds(f: Callable[..., Any], system: System, n_u: int) -> Any:
-    rng = np.random.default_rng(0)
-    system, t, q = at_random_point((system, 0.3, None), rng)
-    u = rng.uniform(0.5, 1.5, n_u).astype(q.dtype)
-    with concretely():
-        return jax.device_get(jax.jit(f)(jax.tree.leaves(system), jnp.asarray(t, q.dtype), list(q), list(u)))
 
 
 SKEW = -1  # the body rotates in its frame about an axis that is not one of the frame's axes
@@ -248,20 +245,18 @@ class _OriginKinematics(KaneEquations):
             for body, each in zip(bodies, parameters, strict=True):
                 body.mass = add(body.mass, added_mass) if each.has_constant_mass else body.mass
             loads = evaluator.loads_at(self.t, self.q, u, motion)
-            return [(body.mass, _at_center(body, loads)) for body in bodies]
+            at_center = [
+                [x.vector.components_in(body.frame) for x in loads if isinstance(x, Force) and x.point is body.center]
+                for body in bodies
+            ]
+            return [
+                (body.mass, functools.reduce(add3, each, ZERO3)) for body, each in zip(bodies, at_center, strict=True)
+            ]
 
         primals = [*[leaves[i] for i in places], self._zero()]
         # Use a different tangent for each parameter, so that no sum or difference of them remains constant.
         tangents = [jnp.full_like(x, 1.0 + 0.1 * i) for i, x in enumerate(primals)]
         return jvp(masses_and_weights, primals, tangents)[1]
-
-
-def _at_center(body: Body, loads: Sequence[Any]) -> Row:
-    force: Row = ZERO3
-    for load in loads:
-        if isinstance(load, Force) and load.point is body.center:
-            force = add3(force, load.vector.components_in(body.frame))
-    return force
 
 
 @ScalarFunction
@@ -327,9 +322,8 @@ def parameter_values(model: RegressorModel, t, q, u) -> Float[Array, " p"]:
 
 
 def _ten(body: Body) -> Row:
-    m, r = body.mass, ZERO3
-    for step in origin_of(body)[1]:
-        r = add3(r, step.components_in(body.frame))
+    m, steps = body.mass, [step.components_in(body.frame) for step in origin_of(body)[1]]
+    r = functools.reduce(add3, steps, ZERO3)
     I = parallel_axis(body.inertia, mul(-1.0, m), r)
     return (m, *(mul(m, x) for x in r), I[0][0], I[1][1], I[2][2], I[0][1], I[0][2], I[1][2])
 

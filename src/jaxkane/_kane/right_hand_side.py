@@ -123,11 +123,11 @@ def evaluate_with_accelerations(kane: KaneEquations, u_dot: Row, method: Method)
     if not vectors:
         return result
     n_q = len(q)
-
-    def components_of_vectors(t: Component, *z: Component) -> list[Row]:
-        return [vector.components for vector in evaluate(t, z[:n_q], z[n_q:])[1]]
-
-    values, rates = jvp(components_of_vectors, (kane.t, *q, *u), (1.0, *kane.q_dot, *u_dot_all))
+    values, rates = jvp(
+        lambda t, *z: [vector.components for vector in evaluate(t, z[:n_q], z[n_q:])[1]],
+        (kane.t, *q, *u),
+        (1.0, *kane.q_dot, *u_dot_all),
+    )
     omegas = [vector.frame.angular_velocity.components for vector in vectors]
     # dv/dt in N = derivative of the components + omega x v
     rates_in_N = [add3(rate, cross(w, v)) for rate, w, v in zip(rates, omegas, values, strict=True)]
@@ -318,28 +318,17 @@ def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dic
 def _vector_field(system, t, y, inputs):
     state = unpacked(system, y)
     values = values_of(system, state.x, inputs)
-    if state.contacts is not None or has_multipliers(system):
-        return _rates_in_contact(system, t, y, values)
-    q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
-    x_dot = None
-    if system.states:
-        kane = KaneEquations(system, t, state.q, state.u, values)
+    memory, x_dot, still = state.contacts, None, None
+    if memory is not None or has_multipliers(system):
+        kane, _, forces, _ = forces_in_contact(system, layout_of(system), t, state.q, state.u, memory, values)
+        q_dot, u_dot = as_vector(kane.q_dot, y), forces.u_dot
+        still = None if memory is None else jnp.zeros_like(memory)  # contact states change at jumps only
+    else:
+        q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
+        kane = KaneEquations(system, t, state.q, state.u, values) if system.states else None
+    if kane is not None and system.states:
         x_dot = as_vector(evaluate_with_accelerations(kane, as_row(u_dot, system.speeds, "u_dot"), _state_rates), y)
-    return packed(State(q_dot, u_dot, x_dot))
-
-
-def _rates_in_contact(system: System, t: Component, y: Array, values: dict[str, Any]) -> Array:
-    """The packed rates of a state with contact states, whose rates are zero."""
-    state, layout = unpacked(system, y), layout_of(system)
-    memory = state.contacts
-    kane, _, forces, _ = forces_in_contact(system, layout, t, state.q, state.u, memory, values)
-    x_dot = None
-    if system.states:
-        u_dot = as_row(forces.u_dot, system.speeds, "u_dot")
-        x_dot = as_vector(evaluate_with_accelerations(kane, u_dot, _state_rates), y)
-    return packed(
-        State(as_vector(kane.q_dot, y), forces.u_dot, x_dot, None if memory is None else jnp.zeros_like(memory))
-    )
+    return packed(State(q_dot, u_dot, x_dot, still))
 
 
 @ScalarFunction

@@ -264,8 +264,8 @@ class Frame:
 
     def _unit(self, axis: int) -> Vector:
         if self._units is None:
-            self._units = tuple(Vector(self, unit) for unit in rotations.IDENTITY)
-        return self._units[axis]
+            self._units = tuple(Vector(self, unit) for unit in rotations.IDENTITY)  # type: ignore[assignment]
+        return self._units[axis]  # type: ignore[index]
 
     def vector(self, x: Component, y: Component, z: Component) -> Vector:
         """The vector `x * frame.x + y * frame.y + z * frame.z`."""

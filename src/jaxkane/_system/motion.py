@@ -352,7 +352,7 @@ class Motion:
         parts += [(Point, *item) for item in self.points.items()] + [(Frame, *item) for item in self.frames.items()]
         for kind, name, part in parts:
             checked(part, kind, f"Motion: every {kind.__name__.lower()} must be a {kind.__name__}")
-            checked(name, str, f"Motion: the name of {part!r} must be a string")
+            name = checked(name, str, f"Motion: the name of a {kind.__name__.lower()} must be a string")
             if name in named and not (name == UNNAMED and kind is Body):
                 kinds = " and ".join(f"a {type(each).__name__.lower()}" for each in (named[name], part))
                 raise DuplicateName(

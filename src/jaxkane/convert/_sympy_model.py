@@ -291,10 +291,7 @@ class Extractor:
 
     def model(self) -> ExtractedModel:
         data, place = self.data, self._place
-
-        def in_loads(x: SymPyObject) -> int:
-            return place(x, self.of_loads)
-
+        in_loads = functools.partial(place, among=self.of_loads)
         parts = {
             # Bodies at rest in the inertial frame, such as the ground, do not affect the motion.
             "bodies": tuple(self._body(body) for body in data.bodies if not self._rests(body)),

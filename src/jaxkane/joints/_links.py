@@ -15,7 +15,7 @@ from .._kane.unilateral import MOST_CONTACTS
 from .._scalarjit.compat import Tracer
 from ..rotations import Matrix
 from ._joints import Hinge, Joint, JointType, Slide, components, exact, exact_numbers, is_structural_zero
-from ._loops import LoopChoices, with_dependent
+from ._loops import with_dependent
 from ._mechanism import (
     MOMENTS,
     ActuatorStructure,
@@ -211,7 +211,7 @@ def mechanism(
         couplings=tuple(x for x in closures if isinstance(x, CouplingStructure)),
     )
     fields = tuple(_field(name, joints) for name in values)
-    structure = with_dependent(structure, fields, values, LoopChoices(dependent, independent, pose))
+    structure = with_dependent(structure, fields, values, dependent, independent, pose)
     return class_of(structure._replace(poses=_poses(structure, poses or {})), fields)(**values)
 
 

@@ -158,8 +158,8 @@ class Mechanism(System):
         for field in dataclasses.fields(self):  # names with a dot cannot be keyword arguments
             value = values.pop(field.name, dataclasses.MISSING)
             if value is dataclasses.MISSING:  # a parameter that a subclass of a mechanism's class adds
-                has_factory = field.default_factory is not dataclasses.MISSING
-                value = field.default_factory() if has_factory else field.default
+                factory = field.default_factory
+                value = field.default if factory is dataclasses.MISSING else factory()
             if value is dataclasses.MISSING:
                 raise TypeError(f"{type(self).__name__}: the parameter {field.name} is missing and has no default.")
             setattr(self, field.name, value)
