@@ -88,21 +88,21 @@ def test_autoreload_replaces_methods():
 
 def test_names_and_units_assigned_to_a_class_are_checked():
     kind = fresh()
-    with pytest.raises(TypeError, match=r"Pendulum.coordinates must be a tuple of names, got the string 'angle'"):
+    with pytest.raises(TypeError, match=r"Pendulum.coordinates must be a tuple of names, .* got 'angle'"):
         kind.coordinates = "angle"
     kind.coordinates = ["angle"]
     assert kind.coordinates == ("angle",)
-    with pytest.raises(TypeError, match=r"Pendulum.units is a dict of strings by name.*got 'rad'"):
+    with pytest.raises(TypeError, match=r"Pendulum.units must be a dict of strings by name.*got 'rad'"):
         kind.units = "rad"
 
 
 @pytest.mark.parametrize(
     ("units", "error", "match"),
     [
-        ({"angle": 3}, TypeError, r"contains strings by name.*got 'angle': 3"),
-        ({"angle": None}, TypeError, r"got 'angle': None"),
-        ({3: "rad"}, TypeError, r"got 3: 'rad'"),
-        (["angle"], TypeError, r"is a dict of strings by name.*got \['angle'\]"),
+        ({"angle": 3}, TypeError, r"must be a dict of strings by name.*got 3"),
+        ({"angle": None}, TypeError, r"'angle', got None"),
+        ({3: "rad"}, TypeError, r"got 3"),
+        (["angle"], TypeError, r"must be a dict of strings by name.*got \['angle'\]"),
         (
             {"angel": "rad"},
             ValueError,
@@ -245,7 +245,7 @@ def test_reading_a_structural_zero_raises_an_explanation():
     ("t", "error", "match"),
     [
         (float("nan"), ValueError, "the time t = nan is not finite"),
-        (None, TypeError, r"the time `t` must be one number \[s\], got None"),
+        (None, TypeError, r"the time `t` must be one number, got None"),
         (1j, TypeError, r"the time `t` must be one number"),
     ],
 )
@@ -468,9 +468,7 @@ def test_masked_values_are_rejected_and_unmasked_arrays_accepted():
 def test_a_parameter_named_like_a_method_is_rejected(name):
     """It replaced the method: events never came, and accelerations were those of other rates."""
     kind = type("Named", (Pendulum,), {"__annotations__": {name: jk.Scalar}, name: jk.parameter(1.0)})
-    with pytest.raises(
-        ValueError, match=rf"Named: the parameter '{name}' would replace `System.{name}`. Give it another"
-    ):
+    with pytest.raises(ValueError, match=rf"Named: the parameter {name} would replace"):
         kind()
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from ._common.lookup import refuse_if
 from ._scalarjit.components import Component, Triple, add, cross, dot, is_exact, matvec, mul, several, sub
 
 Matrix = tuple[Triple, Triple, Triple]
@@ -24,14 +25,21 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 def axes_of(sequence: str) -> tuple[int, ...]:
     """The axes (0, 1 or 2) of a body-fixed sequence such as "3-1-2" or "312"."""
     digits = str(sequence).replace("-", "")
-    if not digits or any(d not in "123" for d in digits):
-        raise ValueError(f'A body-fixed sequence is written with the axes 1, 2, 3, such as "3-1-2"; got {sequence!r}.')
+    refuse_if(
+        not digits or any(d not in "123" for d in digits),
+        f'A body-fixed sequence is written with the axes 1, 2, 3, such as "3-1-2"; got {sequence!r}.',
+    )
     return tuple(int(d) - 1 for d in digits)
 
 
 def simple_rotation(axis: int, angle: Component) -> Matrix:
     """[R] of a right-hand rotation by `angle` [rad] about axis 0, 1 or 2."""
-    return _simple(axis, *cosine_and_sine(angle))
+    (c, s), i, j = cosine_and_sine(angle), (axis + 1) % 3, (axis + 2) % 3
+    rows: list[list[Component]] = [[0.0] * 3 for _ in range(3)]
+    rows[axis][axis] = 1.0
+    rows[i][i], rows[i][j] = c, s
+    rows[j][i], rows[j][j] = -s, c
+    return _frozen(rows)
 
 
 def cosine_and_sine(angle: Component) -> tuple[Component, Component]:
@@ -39,15 +47,6 @@ def cosine_and_sine(angle: Component) -> tuple[Component, Component]:
     if is_exact(angle) and math.isfinite(angle):
         return math.cos(angle), math.sin(angle)
     return jnp.cos(angle), jnp.sin(angle)
-
-
-def _simple(axis: int, c: Component, s: Component) -> Matrix:
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    rows: list[list[Component]] = [[0.0] * 3 for _ in range(3)]
-    rows[axis][axis] = 1.0
-    rows[i][i], rows[i][j] = c, s
-    rows[j][i], rows[j][j] = -s, c
-    return _frozen(rows)
 
 
 def _frozen(rows) -> Matrix:

@@ -20,6 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ._common.lookup import checked, refuse_if
 from ._scalarjit.components import Component, positive
 from ._system.kinematics import Frame, Point, Vector
 from ._system.motion import Body, point_of
@@ -35,7 +36,7 @@ def gyroscope(frame: Frame) -> Named:
 
     - `frame`: the frame of the instrument, such as `body_frame.rotate_fixed(self.mounting)`.
     """
-    return _along(_checked(frame).angular_velocity, frame)
+    return _along(_a_frame(frame).angular_velocity, frame)
 
 
 def accelerometer(now: Any, point: Point | Body, frame: Frame, gravity: Vector) -> Named:
@@ -145,12 +146,8 @@ def load_cell(now: Any, name: str, frame: Frame) -> Named:
     **Raises:** `KeyError` for an unknown name. `TypeError` for the name of an auxiliary speed, whose force is the
     number `now.force(name)`.
     """
-    force = now.force(name)
-    if not isinstance(force, Vector):
-        raise TypeError(
-            f"load_cell: {name!r} is an auxiliary speed. Its force is a number, not a Vector. Use now.force({name!r})."
-        )
-    return _along(force, frame)
+    what = f"load_cell: {name!r} is an auxiliary speed. Its force is a number, not a Vector"
+    return _along(checked(now.force(name), Vector, what, f" Use now.force({name!r})."), frame)
 
 
 # -- filters: (rates of their states, output)
@@ -225,18 +222,16 @@ def delayed(signal: Component, x: Any, delay: Component) -> tuple[tuple[Componen
 
 def _states(x: Any, sizes: tuple[int, ...], name: str) -> tuple[Component, ...]:
     states = tuple(x) if not hasattr(x, "shape") and hasattr(x, "__iter__") else (x,)
-    if len(states) not in sizes:
-        raise ValueError(
-            f"sensors.{name}: the number of states must be {' or '.join(map(str, sizes))}, got {len(states)}."
-        )
+    refuse_if(
+        len(states) not in sizes,
+        f"sensors.{name}: the number of states must be {' or '.join(map(str, sizes))}, got {len(states)}.",
+    )
     return states
 
 
 def _along(vector: Vector, frame: Frame) -> Named:
-    return dict(zip("xyz", vector.components_in(_checked(frame)), strict=True))
+    return dict(zip("xyz", vector.components_in(_a_frame(frame)), strict=True))
 
 
-def _checked(frame: Frame) -> Frame:
-    if not isinstance(frame, Frame):
-        raise TypeError(f"The frame of a sensor must be a Frame, got {frame!r}.")
-    return frame
+def _a_frame(frame: Frame) -> Frame:
+    return checked(frame, Frame, "The frame of a sensor must be a Frame")

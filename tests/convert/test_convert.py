@@ -216,7 +216,7 @@ def test_only_the_limits_in_stops_become_contacts():
     contacts = system.contacts(0.0, [0.1, 0.2, 0.3], [0.0] * 3, None)
     assert list(contacts) == ["k lower", "k upper", "m lower", "m upper"]
     np.testing.assert_allclose(float(contacts["m upper"].gap), np.deg2rad(9.0) - 0.3)
-    with pytest.raises(ValueError, match=r"`stops` contains 'n', which is not .* with a range are: k, l, m"):
+    with pytest.raises(ValueError, match=r"`stops` contains n, which is not .* with a range are: k, l, m"):
         jk.convert.from_mjcf(mjcf(three), stops=["n"])
     with pytest.raises(TypeError, match="must be a list"):
         jk.convert.from_mjcf(mjcf(three), stops="k")

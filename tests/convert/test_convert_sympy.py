@@ -302,8 +302,8 @@ def test_missing_values_and_unknown_symbols_are_rejected(me):
     kane = rolling_disc(me, sm)
     for given, words in (
         ({}, "no value for g, m, r"),
-        (params | {"mass": 1.0}, "no symbol 'mass'"),
-        (params | {"m": -1.0, "units": 1.0}, "no symbol 'units'"),
+        (params | {"mass": 1.0}, "no symbol mass"),
+        (params | {"m": -1.0, "units": 1.0}, "no symbol units"),
     ):
         with pytest.raises(ValueError, match=words):
             jk.convert.from_sympy(kane, given)
@@ -323,7 +323,7 @@ def test_missing_values_and_unknown_symbols_are_rejected(me):
         jk.convert.from_sympy(make(bodies=[bob]), {m: 1.0})
     P.set_vel(N, u * N.x)
     taken = me.Particle("bob", P, sm.Symbol("speeds"))
-    with pytest.raises(ValueError, match="'speeds' cannot be the name of a parameter"):
+    with pytest.raises(ValueError, match="speeds cannot be the name of a parameter"):
         jk.convert.from_sympy(make(bodies=[taken]), {"speeds": 1.0})
     with pytest.raises(TypeError, match="needs a KanesMethod"):
         jk.convert.from_sympy(q.diff() - u, {})

@@ -242,10 +242,10 @@ def test_a_named_joint_is_independent(kept):
     ("more", "words"),
     [
         ({"independent": ["q1", "q2"]}, "2 independent residuals, and cannot be solved without .*: q1, q2. Name fewer"),
-        ({"independent": ["q4"]}, "`independent`: .*'q4'"),
+        ({"independent": ["q4"]}, "`independent` .* q4"),
         ({"independent": "q1"}, "`independent` must be a list of names"),
-        ({"independent": ["q2"], "dependent": ["q2", "q3"]}, "both name 'q2'"),
-        ({"pose": {"q": 1.0}}, "`pose`: .*'q'"),
+        ({"independent": ["q2"], "dependent": ["q2", "q3"]}, "both name q2"),
+        ({"pose": {"q": 1.0}}, "`pose` .*: q;"),
         ({"poses": {"start": {"q1": 1.0}}}, "the pose 'start' needs one value per coordinate; see 'q2'"),
     ],
 )
@@ -459,7 +459,7 @@ def test_parameters_have_names_units_and_a_sign():
     )
     assert parameters_of(arm, body).names[:2] == ("mass.link1", "center.link1.z")
     assert float(arm.replace({"mass.link1": 3.0}).mass["link1"]) == 3.0
-    with pytest.raises(ValueError, match=r"no parameter .mass\.link7."):
+    with pytest.raises(ValueError, match=r"no parameter mass\.link7;"):
         arm.replace({"mass.link7": 3.0})
     with pytest.raises(ValueError, match=r"mass.link1 = -1.0 must be positive"):
         arm.replace({"mass.link1": -1.0})
@@ -506,15 +506,15 @@ def test_a_loop_may_be_made_of_traced_numbers():
         ([Link("a.b")], {}, "without a dot.*'a.b'"),
         ([Link("")], {}, "without a dot"),
         ([Link("a"), Link("a")], {}, "Two links have the name 'a'"),
-        ([Link("a", "c")], {}, "parent of the link 'a'.*'c'"),
+        ([Link("a", "c")], {}, "parent of the link 'a'.*c"),
         ([Link("a", "b"), Link("b", "a")], {}, "form a cycle: a, b"),
-        ([Link("a", None, hinge("h"), **BAR), Link("b", "a", hinge("h"), **BAR)], {}, "Two joints have the name 'h'"),
+        ([Link("a", None, hinge("h"), **BAR), Link("b", "a", hinge("h"), **BAR)], {}, "Two joints have the name h"),
         ([Link("a", None, hinge("h.1"), **BAR)], {}, "joint.*'h.1'"),
-        ([Link("a", None, hinge("h"), **BAR)], {"actuators": [Actuator("T", "k")]}, "actuator 'T'.*'k'"),
+        ([Link("a", None, hinge("h"), **BAR)], {"actuators": [Actuator("T", "k")]}, "actuator 'T'.*k"),
         ([Link("a", None, hinge("h"), **BAR)], {"actuators": [Actuator("T", "h", (1, 2))]}, "gear of the actuator 'T'"),
-        ([Link("a", None, hinge("h"), **BAR)], {"sites": [Site("s", "z")]}, "site 's'.*'z'"),
-        ([Link("a", None, hinge("h"), **BAR)], {"sites": [Site("a", "a")]}, "sites or links have the name 'a'"),
-        ([Link("a", None, hinge("h"), **BAR)], {"loops": [Loop("s", "t")]}, "A loop: .*'s'"),
+        ([Link("a", None, hinge("h"), **BAR)], {"sites": [Site("s", "z")]}, "site 's'.*z"),
+        ([Link("a", None, hinge("h"), **BAR)], {"sites": [Site("a", "a")]}, "sites or links have the name a"),
+        ([Link("a", None, hinge("h"), **BAR)], {"loops": [Loop("s", "t")]}, "A loop .*: s;"),
         ([Link("a", None, ball("h"), **BAR)], {"loops": [Coupling("h")]}, "Coupling: 'h' is not a hinge or a slider"),
         ([Link("a", None, hinge("h"), (1, 2), **BAR)], {}, "position.a must have three components"),
         ([Link("a", None, hinge("h"), orientation=(1, 2), **BAR)], {}, "'a': the orientation must be"),
@@ -591,7 +591,7 @@ def test_a_universal_joint_has_two_axes():
 def test_a_zero_axis_raises():
     with pytest.raises(ValueError, match="axis of 'h'"):
         hinge("h", (0, 0, 0))
-    with pytest.raises(TypeError, match="not a Link"):
+    with pytest.raises(TypeError, match="needs a Link"):
         mechanism([hinge("h")])
 
 

@@ -99,7 +99,12 @@ def _write(path: Path, put: Callable[[BinaryIO], Any], replace: bool) -> bool:
             if path.exists():
                 shutil.copymode(path, scratch)
             os.replace(scratch, path)
-        _name_to_disk(path.parent)
+        if os.name == "posix":  # the name must be on the disk, too
+            handle = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
         return True
     finally:
         scratch.unlink(missing_ok=True)
@@ -166,12 +171,3 @@ def _named_anew(scratch: Path, path: Path) -> bool:
             return False
         os.replace(scratch, path)
     return True
-
-
-def _name_to_disk(folder: Path) -> None:
-    if os.name == "posix":  # the name must be on the disk, too
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

@@ -47,12 +47,33 @@ def label_of(name: str) -> str:
     return name.replace("$", r"\$")
 
 
+def checked(value: Any, kind: Any, what: str, remedy: str = "") -> Any:
+    """The value. `what` is the begin of the message, e.g. "The axis of a hinge must be a Vector".
+
+    **Raises:** `TypeError` if the value is not an instance of `kind`.
+    """
+    if not isinstance(value, kind):
+        raise TypeError(f"{what}, got {value!r}.{remedy}")
+    return value
+
+
+def refuse_if(condition: Any, message: str) -> None:
+    """Raise `ValueError` if the condition is true."""
+    if condition:
+        raise ValueError(message)
+
+
+def refuse_any(wrong: Iterable[Any], before: str, after: str) -> None:
+    """Raise `ValueError` with the `wrong` names between two parts of the message, if there are any."""
+    names = [*map(str, wrong)]
+    refuse_if(names, f"{before} {', '.join(names)}{after}")
+
+
 def refuse_unknown(names: Iterable[str], known: Iterable[str], message: str, have: str = "there are") -> None:
     """Raise `ValueError` for unknown names. `message` precedes the names, e.g. "Bicycle: q has no"."""
     known = tuple(known)
     wrong = [str(name) for name in dict.fromkeys(names) if name not in known]
-    if wrong:
-        raise ValueError(f"{message} {', '.join(wrong)}; {hint(wrong, known, have)}")
+    refuse_any(wrong, message, "; " + hint(wrong, known, have))
 
 
 def not_there(name: Any, known: Iterable[str], where: str) -> KeyError:
@@ -92,8 +113,7 @@ def decimal_number(text: str) -> float:
     **Raises:** `ValueError` for any other text.
     """
     number = float(text) if DECIMAL.fullmatch(text) else float("inf")
-    if abs(number) == float("inf"):
-        raise ValueError(f"{text!r} is not a finite decimal number.")
+    refuse_if(abs(number) == float("inf"), f"{text!r} is not a finite decimal number.")
     return number
 
 
@@ -120,6 +140,5 @@ def positive_number(value: Any, what: str) -> float:
     **Raises:** `ValueError` for other numbers; otherwise as `real_number`.
     """
     number = real_number(value, what)
-    if not 0.0 < number < float("inf"):
-        raise ValueError(f"{what} must be positive, got {value!r}.")
+    refuse_if(not 0.0 < number < float("inf"), f"{what} must be positive, got {value!r}.")
     return number

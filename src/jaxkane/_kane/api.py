@@ -6,7 +6,7 @@ any order. `KaneEquations` contains the equations.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -35,9 +35,30 @@ from .kanes_method import KaneEquations, as_one_program, motion_rates, rates_and
 InputValues = Mapping[str, Component] | None
 
 
-def checked_arrays(system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None):
-    """Check the arguments of a public function and return them as arrays of one dtype."""
+def _at_state(read: Callable[[KaneEquations, Array], Array]) -> ScalarFunction:
+    return ScalarFunction(lambda system, t, q, u, inputs: read(KaneEquations(system, t, q, u, inputs), q))
+
+
+_generalized_active_forces = _at_state(lambda kane, q: as_vector(kane.active_forces(kane.partial_velocities()), q))
+_coordinate_rates = _at_state(lambda kane, q: as_vector(kane.q_dot, q))
+_dependent_speeds = _at_state(lambda kane, q: as_vector(kane.u_dep, q))
+_constraint_jacobian = _at_state(lambda kane, q: stack(kane.J).astype(q.dtype).T)
+_constraint_jacobian_rate = _at_state(lambda kane, q: stack(kane.J_dot()).astype(q.dtype).T)
+_kinetic_energy = _at_state(
+    lambda kane, q: as_vector([kinetic_energy_of(kane.motion(kane.t, kane.q, kane.u_all))], q)[0]
+)
+
+
+def checked_arrays(
+    system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None, *, of_motion: bool = False
+):
+    """Check the arguments of a public function and return them as arrays of one dtype.
+
+    `of_motion`: whether the result depends on the accelerations, which for a system with multipliers need these.
+    """
     check_is_system(system)
+    if of_motion:
+        refuse_multipliers(system)
     name = type(system).__name__
     refuse_incomplete(system, q, u)
     left_out = [c for c in system.coordinates if c not in q] if isinstance(q, Mapping) else []
@@ -70,8 +91,7 @@ def equations_of_motion(
     **Raises:** `ValueError` for wrong shapes and for an unknown input. Also if the numbers of velocity residuals and
     dependent speeds differ, or if the methods of the system contradict each other.
     """
-    refuse_multipliers(system)
-    arrays = checked_arrays(system, t, q, u, inputs)
+    arrays = checked_arrays(system, t, q, u, inputs, of_motion=True)
     return as_one_program(rates_and_equations, system)(*arrays)[1:]
 
 
@@ -84,8 +104,7 @@ def accelerations(
     a speed moves no mass, or if the constraints cannot be solved for the dependent speeds. If the arguments are traced,
     the result is NaN or infinite instead.
     """
-    refuse_multipliers(system)
-    arrays = checked_arrays(system, t, q, u, inputs)
+    arrays = checked_arrays(system, t, q, u, inputs, of_motion=True)
     return finite_or_explained(as_one_program(motion_rates, system)(*arrays)[1], arrays)
 
 
@@ -152,12 +171,6 @@ def generalized_active_forces(
     return _generalized_active_forces(*checked_arrays(system, t, q, u, inputs))
 
 
-@ScalarFunction
-def _generalized_active_forces(system, t, q, u, inputs):
-    kane = KaneEquations(system, t, q, u, inputs)
-    return as_vector(kane.active_forces(kane.partial_velocities()), q)
-
-
 def generalized_inertia_forces(
     system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None, *, u_dot: Numbers = None
 ) -> Float[Array, " n"]:
@@ -169,8 +182,7 @@ def generalized_inertia_forces(
 
     - `u_dot`: accelerations (n,), or a dict by name. The default is zero.
     """
-    refuse_multipliers(system)
-    arrays = checked_arrays(system, t, q, u, inputs)
+    arrays = checked_arrays(system, t, q, u, inputs, of_motion=True)
     if u_dot is not None:
         u_dot = as_array(u_dot, system.speeds, f"{type(system).__name__}: u_dot")
     return _generalized_inertia_forces(*arrays, u_dot)
@@ -195,22 +207,12 @@ def coordinate_rates(system: System, t: Component, q: Numbers, u: Numbers) -> Fl
     return _coordinate_rates(*checked_arrays(system, t, q, u))
 
 
-@ScalarFunction
-def _coordinate_rates(system, t, q, u, inputs):
-    return as_vector(KaneEquations(system, t, q, u).q_dot, q)
-
-
 def dependent_speeds(system: System, t: Component, q: Numbers, u: Numbers) -> Float[Array, " k"]:
     """Dependent speeds u_dep (k,) from the velocity residuals: C_dep u_dep = -(C_ind u + c0).
 
     Arguments as `equations_of_motion`, without `inputs`.
     """
     return _dependent_speeds(*checked_arrays(system, t, q, u))
-
-
-@ScalarFunction
-def _dependent_speeds(system, t, q, u, inputs):
-    return as_vector(KaneEquations(system, t, q, u).u_dep, q)
 
 
 def dependent_accelerations(
@@ -220,8 +222,7 @@ def dependent_accelerations(
 
     Arguments as `equations_of_motion`.
     """
-    refuse_multipliers(system)
-    arrays = checked_arrays(system, t, q, u, inputs)
+    arrays = checked_arrays(system, t, q, u, inputs, of_motion=True)
     u_dot = as_one_program(motion_rates, system)(*arrays)[1]
     return finite_or_explained(_dependent_accelerations(*arrays, u_dot), arrays)
 
@@ -240,11 +241,6 @@ def constraint_jacobian(system: System, t: Component, q: Numbers) -> Float[Array
     return _constraint_jacobian(*checked_arrays(system, t, q, (0.0,) * len(system.speeds)))
 
 
-@ScalarFunction
-def _constraint_jacobian(system, t, q, u, inputs):
-    return stack(KaneEquations(system, t, q, u).J).astype(q.dtype).T
-
-
 def constraint_jacobian_rate(system: System, t: Component, q: Numbers, u: Numbers) -> Float[Array, "k n"]:
     """J_dot (k, n), the time derivative of J along the motion.
 
@@ -256,20 +252,9 @@ def constraint_jacobian_rate(system: System, t: Component, q: Numbers, u: Number
     return _constraint_jacobian_rate(*checked_arrays(system, t, q, u))
 
 
-@ScalarFunction
-def _constraint_jacobian_rate(system, t, q, u, inputs):
-    return stack(KaneEquations(system, t, q, u).J_dot()).astype(q.dtype).T
-
-
 def kinetic_energy(system: System, t: Component, q: Numbers, u: Numbers) -> Float[Array, ""]:
     """Kinetic energy [J] of all bodies. The dependent speeds are computed from the constraints.
 
     Arguments as `equations_of_motion`, without `inputs`.
     """
     return _kinetic_energy(*checked_arrays(system, t, q, u))
-
-
-@ScalarFunction
-def _kinetic_energy(system, t, q, u, inputs):
-    kane = KaneEquations(system, t, q, u)
-    return as_vector([kinetic_energy_of(kane.motion(kane.t, kane.q, kane.u_all))], q)[0]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._common.lookup import not_there, refuse_unknown
+from .._common.lookup import checked, not_there, refuse_any, refuse_if, refuse_unknown
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, Numbers, component
 from .._system.system import System
@@ -68,6 +68,12 @@ def is_one_number(value: Any) -> bool:
     return is_numeric(value) and not isinstance(value, (list, tuple)) and np.shape(value) == ()
 
 
+def check_number(value: Any, what: str, remedy: str = "") -> None:
+    """**Raises:** `TypeError` if the value is not one real number, concrete or traced."""
+    if not is_one_number(value):
+        raise TypeError(f"{what} must be one number, got {value!r}.{remedy}")
+
+
 def is_numeric(value: Any) -> bool:
     """Whether the value is a real number, or an array or a sequence of real numbers, concrete or traced."""
     leaves = jax.tree.leaves(value, is_leaf=lambda x: x is None)
@@ -82,12 +88,10 @@ def is_numeric(value: Any) -> bool:
 def check_is_system(system: Any) -> None:
     """**Raises:** `TypeError` if the argument is not an instance of `System`. `ValueError` without coordinates or
     speeds."""
-    if not isinstance(system, System):
-        hint = f" Create one with {system.__name__}(...)." if isinstance(system, type) else ""
-        raise TypeError(f"The first argument must be an instance of a System, got {system!r}.{hint}")
+    remedy = f" Create one with {system.__name__}(...)." if isinstance(system, type) else ""
+    checked(system, System, "The first argument must be an instance of a System", remedy)
     for what, names in (("coordinates", system.coordinates), ("speeds", (*system.speeds, *system.dependent_speeds))):
-        if not names:
-            raise ValueError(f"{type(system).__name__} has no {what}. Name them in its class: {what} = (...).")
+        refuse_if(not names, f"{type(system).__name__} has no {what}. Name them in its class: {what} = (...).")
 
 
 def refuse_multipliers(system: Any) -> None:
@@ -101,8 +105,7 @@ def refuse_multipliers(system: Any) -> None:
 
 def check_time(name: str, t: Component) -> None:
     """Raise an exception if `t` is not one finite number. `name` is the name of the system."""
-    if not is_one_number(t):
-        raise TypeError(f"{name}: the time `t` must be one number [s], got {t!r}.")
+    check_number(t, f"{name}: the time `t`")
     if not isinstance(t, Tracer) and not np.isfinite(np.asarray(t)):
         raise ValueError(f"{name}: the time t = {t} is not finite.")
 
@@ -143,17 +146,12 @@ def refuse_incomplete(system: System, q: Numbers, u: Numbers) -> None:
     label, determined = "q", missing
     if not missing and isinstance(u, Mapping) and u and hasattr(system, "multiplier_residuals"):
         label, determined = "u", [s for s in system.speeds if s not in u]
-    if determined:
-        raise ValueError(
-            f"{name}: {label} omits {', '.join(determined)}, which the others determine. Find the state with "
-            f"jaxkane.assemble(system, q, u) and pass its state.{label}, or pass the value in {label}."
-        )
+    after = ", which the others determine. Find the state with jaxkane.assemble(system, q, u) and "
+    refuse_any(determined, f"{name}: {label} omits", f"{after}pass its state.{label}, or pass the value in {label}.")
     dependent = [s for s in system.dependent_speeds if s in u] if isinstance(u, Mapping) else []
-    if dependent:
-        raise ValueError(
-            f"{name}: u contains {', '.join(dependent)}, but dependent speeds are computed from the others. Omit it. "
-            "jaxkane.assemble accepts it and compares it with the velocity residuals."
-        )
+    after = ", but dependent speeds are computed from the others. Omit it. "
+    after += "jaxkane.assemble accepts it and compares it with the velocity residuals."
+    refuse_any(dependent, f"{name}: u contains", after)
 
 
 def inputs_of(system: System) -> str:
@@ -174,22 +172,19 @@ class Inputs(dict[str, Component]):
 
 def checked_inputs(system: System, inputs: Mapping[str, Component] | None) -> dict[str, Component]:
     """All inputs of a system by name. Omitted inputs are exact zeros."""
-    return _checked(system, inputs, system.inputs, "input")
+    return checked_values(system, inputs, states=())
 
 
-def checked_values(system: System, values: Mapping[str, Component] | None) -> dict[str, Component]:
+def checked_values(
+    system: System, values: Mapping[str, Component] | None, states: Sequence[str] | None = None
+) -> dict[str, Component]:
     """All inputs and states of a system by name, as passed to `loads`. Omitted ones are exact zeros."""
-    return _checked(system, values, (*system.inputs, *system.states), "input or state" if system.states else "input")
-
-
-def _checked(system: System, values: PyTree, names: Sequence[str], kind: str) -> dict[str, Component]:
-    title = type(system).__name__
-    if not isinstance(values, (Mapping, type(None))):
-        raise TypeError(f"{title}: the inputs must be a dict {{name: number}}, got {values!r}.")
-    if not values:
+    states = system.states if states is None else states
+    names, kind, title = (*system.inputs, *states), "input or state" if states else "input", type(system).__name__
+    if not checked(values, Mapping | None, f"{title}: the inputs must be a dict {{name: number}}"):
         return dict.fromkeys(names, 0.0)
-    refuse_unknown(values, names, f"{title} has no {kind} named", "it has")
-    for name, value in values.items():
-        if not is_one_number(value):
-            raise TypeError(f"{title}: the {kind} {name!r} must be one number, got {value!r}.")
-    return {name: component(values.get(name, 0.0)) for name in names}
+    refuse_unknown(values, names, f"{title} has no {kind} named", "it has")  # pyright: ignore[reportArgumentType]
+    numbers = {name: values.get(name, 0.0) for name in names}  # pyright: ignore[reportOptionalMemberAccess]
+    for name, value in numbers.items():
+        check_number(value, f"{title}: the {kind} {name!r}")
+    return {name: component(value) for name, value in numbers.items()}

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._common.lookup import refuse_if
 from .._scalarjit.cache import Cache
 from .._scalarjit.compat import Tracer, concretely
 from .._scalarjit.components import (
@@ -23,6 +24,7 @@ from .._scalarjit.components import (
     Numbers,
     as_vector,
     is_exact,
+    is_zero,
     stack,
 )
 from .._scalarjit.scalar_function import ScalarFunction
@@ -33,7 +35,7 @@ from .._system.system import System
 from .arguments import is_concrete, without_derivatives
 from .constraint_residuals import configuration_residual, residual_sizes, scales_by_unit, violations
 from .description import DescriptionEvaluator, at_random_point, frames_of, structure_of, turning_bodies
-from .scaling import least_norm
+from .scaling import least_norm, nearest_root
 
 ROUNDING, MEASURED = 2e-3, 0.05
 ROTOR = 1e-12  # share of the largest moment of inertia: if the others are below it, the body is a rotor
@@ -176,27 +178,25 @@ def consistency_quantities(system: System, t: Component, q: Numbers, u: Numbers,
     motion = evaluator.motion(t, q, u)
     loads = evaluator.loads_at(t, q, u, motion)
     twice = sorted({*motion.points, *motion.frames} & {*system.auxiliary_speeds})
-    if twice:
-        raise ValueError(
-            f"{evaluator.name}: {', '.join(twice)} is the name of an auxiliary speed and of a point or a frame. "
-            "constraint_forces returns a force by name for both. Rename one of them."
-        )
-    quantities = [
-        *_of_speeds(evaluator, t, q, u),
+    refuse_if(
+        twice,
+        f"{evaluator.name}: {', '.join(twice)} is the name of an auxiliary speed and of a point or a frame. "
+        "constraint_forces returns a force by name for both. Rename one of them.",
+    )
+    of_frames = [(frame, [*frame._to_child, frame._spin]) for frame in frames_of(motion, loads)]
+    quantities: list[Quantity] = [
+        *((("rate", name), [(x,)]) for name, x in zip(system.coordinates, evaluator.rates(t, q, u), strict=True)),
+        *((("residual", str(i)), [(x,)]) for i, x in enumerate(evaluator.residuals(t, q, u))),
+        *((("constraint", str(i)), [(x,)]) for i, x in enumerate(evaluator.configuration(t, q))),
         *_of_bodies(motion),
         *_of_points(motion, loads),
-        *_of_frames(motion, loads),
+        *(
+            (("frame", frame.name, frame.parent.name), rows)  # type: ignore[union-attr]
+            for frame, rows in of_frames
+            if not all(is_exact(x) for row in rows for x in row) or any(frame._spin)
+        ),
     ]
     return {(i, *key): stack(rows).astype(like.dtype) for i, (key, rows) in enumerate(quantities)}
-
-
-def _of_speeds(evaluator: DescriptionEvaluator, t: Component, q: Numbers, u: Numbers) -> Iterator[Quantity]:
-    for name, rate in zip(evaluator.system.coordinates, evaluator.rates(t, q, u), strict=True):
-        yield ("rate", name), [(rate,)]
-    for i, residual in enumerate(evaluator.residuals(t, q, u)):
-        yield ("residual", str(i)), [(residual,)]
-    for i, h in enumerate(evaluator.configuration(t, q)):
-        yield ("constraint", str(i)), [(h,)]
 
 
 def _of_bodies(motion: Motion) -> Iterator[Quantity]:
@@ -230,17 +230,10 @@ def _of_points(motion: Motion, loads: Iterable[Load]) -> Iterator[Quantity]:
             done.add(link)
             frame, velocity = link._relative_motion
             rows = [link._offset.components_in(frame), velocity.components_in(frame)]  # type: ignore[union-attr]
-            if not all(is_exact(x) for x in rows[0]) or not all(is_exact(x) and x == 0.0 for x in rows[1]):
+            if not all(is_exact(x) for x in rows[0]) or not all(is_zero(x) for x in rows[1]):
                 # A point that `loads` creates from a motion without speeds is at rest too, but is not a contact point.
                 at_rest = link._base is None and frame is motion.N
                 yield ("contact" if at_rest else "place", words.get(link, f"the point {link.name!r}"), frame.name), rows
-
-
-def _of_frames(motion: Motion, loads: Iterable[Load]) -> Iterator[Quantity]:
-    for frame in frames_of(motion, loads):
-        rows = [*frame._to_child, frame._spin]
-        if not all(is_exact(x) for row in rows for x in row) or any(frame._spin):
-            yield ("frame", frame.name, frame.parent.name), rows  # type: ignore[union-attr]
 
 
 def _has_consistent_velocity(point: Point) -> bool:
@@ -248,7 +241,7 @@ def _has_consistent_velocity(point: Point) -> bool:
     if point._base is not None:
         return point._relative_motion is not None
     known = (*point.velocity.components, *(point._offset.components if point._offset is not None else ()))
-    return all(is_exact(x) and x == 0.0 for x in known)  # the origin
+    return all(is_zero(x) for x in known)  # the origin
 
 
 _CHECKED = Cache()  # structures
@@ -402,7 +395,6 @@ class _Consistency:
         return consistency_quantities.numpy(self.system, self.t, q, u.astype(q.dtype), self.inputs)
 
     def _rates(self, q: np.ndarray, u: np.ndarray, quantities: Quantities) -> Quantities:
-        """Time derivatives of all quantities along the motion."""
         q_dot = np.concatenate([x.ravel() for x in _of_kind(quantities, "rate").values()])
         at = self.system, self.t, q, u.astype(q.dtype), self.inputs
         along = None, np.ones((1,), q.dtype), q_dot[:, None], None, None
@@ -436,27 +428,30 @@ class _Consistency:
         zero, at_a, at_b, at_both = (self._read(q, u) for u in (0.0 * a, a, b, a + b))
         self.has_constraints = bool(_of_kind(zero, "constraint"))
         self._set_smallest(at_a)
-        scaled = {s: self._read(q, s * a) for s in _SIZES}
+        curved = self._curved_along(q, a, zero)
         for key, z in zero.items():
             x, y, both = at_a[key], at_b[key], at_both[key]
-            differs = functools.partial(self._differs, smallest=self.smallest if _is_translation(key) else 1.0)
-            bent = differs(both - x - y + z, both, x, y, z)
-            if bent or any(differs(f[key] - z - s * (x - z), f[key], s * x, z) for s, f in scaled.items()):
-                curved = [name for i, name in enumerate(self.speeds) if self._is_curved(q, key, z, i)]
-                which = f"in {', '.join(curved)}" if curved else "in the speeds: it contains products of two speeds"
+            if key in curved or self._differs(both - x - y + z, both, x, y, z, smallest=self._smallest(key)):
+                along = zip(self.speeds, np.eye(len(self.speeds)), strict=True)
+                names = [name for name, direction in along if key in self._curved_along(q, direction, zero)]
+                which = f"in {', '.join(names)}" if names else "in the speeds: it contains products of two speeds"
                 raise ValueError(
                     f"{self.name}: {_in_words(key)} is not affine {which}. Kane's method needs velocities that are "
                     "linear in the speeds, plus a term that may depend on time and coordinates. Remove squares, abs() "
                     "and maximum() of speeds."
                 )
 
-    def _is_curved(self, q: np.ndarray, key: tuple[Any, ...], zero: Any, i: int) -> bool:
-        direction = np.eye(len(self.speeds))[i]
-        one = self._read(q, direction)[key]
-        values = {s: self._read(q, s * direction)[key] for s in _SIZES}
-        smallest = self.smallest if _is_translation(key) else 1.0
-        differs = functools.partial(self._differs, smallest=smallest)
-        return any(differs(x - zero - s * (one - zero), x, s * one, zero) for s, x in values.items())
+    def _curved_along(self, q: np.ndarray, direction: np.ndarray, zero: Quantities) -> set[Any]:
+        """The quantities that are not affine along a direction of the speeds. `zero`: their values at rest."""
+        one, scaled = self._read(q, direction), {s: self._read(q, s * direction) for s in _SIZES}
+        each = [(key, z, one[key], s, at[key]) for key, z in zero.items() for s, at in scaled.items()]
+        differs = self._differs
+        return {
+            key for key, z, x, s, f in each if differs(f - z - s * (x - z), f, s * x, z, smallest=self._smallest(key))
+        }
+
+    def _smallest(self, key: Any) -> float:
+        return self.smallest if _is_translation(key) else 1.0
 
     # Velocities are the rates of positions and orientations.
 
@@ -492,22 +487,15 @@ class _Consistency:
         """The nearest coordinates that satisfy the configuration constraints, or NaN if there are none nearby."""
         if not self.has_constraints:
             return q
-        # Solve more accurately than the rates are compared. With residuals of a tenth of the tolerance, two systems of
-        # the tests seemed to contradict themselves by 2e-8.
-        exact = max(1e-4 * self.tolerance, 32 * float(np.finfo(q.dtype).eps))
-        violation = np.inf
-        for _ in range(20):
-            violation = np.max(violations(self.system, self.t, q)[0], initial=0.0)
-            if violation <= exact:
-                return q
-            h = configuration_residual.numpy(self.system, self.t, q)
-            G = configuration_residual.numpy_jvp((self.system, self.t, q), (None, None, np.eye(len(q), dtype=q.dtype)))
-            sizes, weights = residual_sizes(self.system, self.t, q)[0], scales_by_unit(self.system, self.t, q)
-            sizes = np.where(sizes > 0, sizes, 1.0)
-            G = G * weights / sizes[:, None]
-            if not np.all(np.isfinite(G)):
-                break
-            q = (q - weights * (np.linalg.pinv(G, rcond=1e-6) @ (h / sizes))).astype(q.dtype)
+        sizes, weights = residual_sizes(self.system, self.t, q)[0], scales_by_unit(self.system, self.t, q)
+        sizes, along = np.where(sizes > 0, sizes, 1.0), (None, None, np.diag(weights))
+
+        def scaled(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            h, G = configuration_residual.numpy(self.system, self.t, q), configuration_residual.numpy_jvp
+            return h / sizes, G((self.system, self.t, q), along) / sizes[:, None]
+
+        q = nearest_root(scaled, q, weights)
+        violation = np.max(violations(self.system, self.t, q)[0], initial=0.0)
         return q if violation <= 0.1 * self.tolerance else np.full_like(q, np.nan)
 
     def _check_quantity(self, key: Any, value: Any, rate: Any) -> None:

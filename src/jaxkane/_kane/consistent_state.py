@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._common.lookup import as_names, refuse_unknown
+from .._common.lookup import as_names, refuse_any, refuse_unknown
 from .._scalarjit.cache import Cache
 from .._scalarjit.cache_key import jit
 from .._scalarjit.compat import concretely
@@ -32,10 +32,11 @@ from .constraint_residuals import (
     scales_by_unit,
     violations,
 )
-from .contact import REDUNDANT, ContactRows, has_multipliers, layout_of, speeds_in_contact
+from .contact import ContactRows, has_multipliers, layout_of, speeds_in_contact
 from .contact_checks import check_contacts
 from .description import at_random_point, structure_of
 from .diagnosis import diagnosis
+from .impact import REDUNDANT
 from .kanes_method import KaneEquations
 from .scaling import SMALLEST_SIZE
 
@@ -93,17 +94,12 @@ def with_touching(system: System, touching: Sequence[str]) -> System:
     layout = layout_of(system)
     can_touch = [name for name, is_bearing in zip(layout.names, layout.is_bearing, strict=True) if not is_bearing]
     refuse_unknown(touching, can_touch, f"{type(system).__name__} has no contact", "it has")
-    places = [layout.names.index(name) for name in touching]
+    places, own = [layout.names.index(name) for name in touching], type(system)
 
     def configuration_constraints(self: System, t: Component, q: Numbers) -> Sequence[Any]:
-        kane = KaneEquations(system_of(self), t, q, (0.0,) * len(system.speeds))
+        kane = KaneEquations(with_class(self, own), t, q, (0.0,) * len(system.speeds))
         gaps = ContactRows(kane, layout).gaps(kane.t, kane.q, kane.u_all)
-        return [*type(system).configuration_constraints(self, t, q), *(gaps[i] for i in places)]
-
-    own = type(system)
-
-    def system_of(self: System) -> System:
-        return with_class(self, own)
+        return [*own.configuration_constraints(self, t, q), *(gaps[i] for i in places)]
 
     name = f"{own.__name__} with {', '.join(touching)} touching"
     changed: Any = type(own)(own.__name__, (own,), {"configuration_constraints": configuration_constraints})  # type: ignore[misc]
@@ -121,22 +117,18 @@ def euler_parameters(system: System) -> list[tuple[int, ...]]:
 
 def _search_euler_parameters(system: System) -> list[tuple[int, ...]]:
     """Those at two random points: with 700 coordinates and 100 constraints, one point gave seven wrong matches."""
-    first, second = (_norms_at_random_point(system, seed) for seed in (0, 1))
-    return [(i, i + 1, i + 2, i + 3) for i in sorted(first & second)]
-
-
-def _norms_at_random_point(system: System, seed: int) -> set[int]:
-    """The first indices of four coordinates whose norm, minus one, is the value of a constraint."""
-    rng = np.random.default_rng(seed)
-    probe = rng.uniform(0.2, 0.9, len(system.coordinates)).astype(jnp.result_type(float))
-    with concretely():
-        trial = at_random_point((system, np.zeros((), probe.dtype), probe), rng)
-        values = np.abs(configuration_residual.numpy(*trial))
-    return {
-        i
-        for i, square in enumerate(np.convolve(probe**2, np.ones(4), "valid") if len(probe) > 3 else ())
-        if any(np.any(np.abs(values - abs(x)) < 1e-5) for x in (square - 1.0, square**0.5 - 1.0))
-    }
+    found: list[set[int]] = []
+    for seed in (0, 1):
+        rng = np.random.default_rng(seed)
+        probe = rng.uniform(0.2, 0.9, len(system.coordinates)).astype(jnp.result_type(float))
+        with concretely():
+            values = np.abs(
+                configuration_residual.numpy(*at_random_point((system, np.zeros((), probe.dtype), probe), rng))
+            )
+        squares = np.convolve(probe**2, np.ones(4), "valid") if len(probe) > 3 else np.zeros(0)
+        norms = np.abs([squares - 1.0, squares**0.5 - 1.0])  # the norm of four coordinates or its square, minus one
+        found.append({*np.flatnonzero(np.any(np.abs(norms[..., None] - values) < 1e-5, axis=(0, 2))).tolist()})
+    return [(i, i + 1, i + 2, i + 3) for i in sorted(found[0] & found[1])]
 
 
 def _reads_any(system: System, names: Sequence[str]) -> bool:
@@ -152,55 +144,59 @@ _MAX_STEPS = 64
 _OTHER_GUESSES = 8
 
 
-def _iterated(xp: ModuleType, equations: Any, slopes: Any, start: Numbers, solve: Any, loop: Any) -> tuple[Any, Any]:
-    """The root of `equations` and the number of Newton steps. Values and unknowns are scaled to size 1."""
+def _root(xp: ModuleType, equations: Any, slopes: Any, start: Numbers, met: float, redundant: bool) -> tuple[Any, Any]:
+    """The root of `equations` and the number of Newton steps. Values and unknowns are scaled to size 1.
+
+    By NumPy, which takes less time than a compilation by XLA, or by JAX, with derivatives up to the third order by the
+    implicit function theorem.
+
+    **Arguments:**
+
+    - `met`: the largest values that are regarded as zero.
+    - `redundant`: whether equations may depend on others. The steps are then the shortest.
+    """
     eps = float(jnp.finfo(start.dtype).eps)
 
-    def step(carry: Any) -> PyTree:
-        x, last, _, n = carry
-        values = equations(x)
-        dx = solve(slopes(x), values)
-        finite, size = xp.all(xp.isfinite(dx)), xp.max(xp.abs(dx))
-        # Steps that do not become shorter are rounding errors. Near a double root, each step is half the last one.
-        stalls = (size > 0.75 * last) & xp.all(xp.abs(values) <= _met(start.dtype))
-        ends = ~finite | (size <= 8 * eps * (1 + xp.max(xp.abs(x)))) | stalls
-        return xp.where(finite, x - dx, x), size, ends, n + 1
+    def solution(A: Numbers, b: Numbers) -> Numbers:
+        if xp is jnp and not redundant:
+            return jnp.linalg.solve(A, b)
+        finite = xp.all(xp.isfinite(A)) & xp.all(xp.isfinite(b))
+        A, b = xp.where(finite, A, 0.0), xp.where(finite, b, xp.zeros_like(b))
+        return xp.where(finite, xp.linalg.lstsq(A, b, rcond=REDUNDANT if redundant else None)[0], xp.nan)
 
-    carry = start, xp.asarray(np.inf, start.dtype), xp.asarray(False), xp.asarray(0)
-    x, _, _, steps = loop(lambda carry: ~carry[2] & (carry[3] < _MAX_STEPS), step, carry)
-    return x, steps
+    def solve(equations: Any, start: Numbers, slopes: Any = None) -> tuple[Any, Any]:
+        slopes = slopes or jax.jacfwd(equations)
 
+        def step(carry: Any) -> PyTree:
+            x, last, _, n = carry
+            values = equations(x)
+            dx = solution(slopes(x), values)
+            finite, size = xp.all(xp.isfinite(dx)), xp.max(xp.abs(dx))
+            # Steps that do not become shorter are rounding errors. Near a double root, each step is half the last one.
+            stalls = (size > 0.75 * last) & xp.all(xp.abs(values) <= met)
+            ends = ~finite | (size <= 8 * eps * (1 + xp.max(xp.abs(x)))) | stalls
+            return xp.where(finite, x - dx, x), size, ends, n + 1
 
-def _root_in_numbers(equations: Any, slopes: Any, start: Numbers) -> tuple[Any, Any]:
-    """The root by NumPy, which takes less time than a compilation by XLA."""
-
-    def solve(A: Numbers, b: Numbers) -> Numbers:
-        try:
-            return np.linalg.solve(A, b)
-        except np.linalg.LinAlgError:
-            return np.full_like(b, np.nan)
-
-    def loop(condition: Any, body: Any, carry: Any) -> PyTree:
-        while condition(carry):
-            carry = body(carry)
-        return carry
-
-    return _iterated(np, equations, slopes, start, solve, loop)
-
-
-def _root_under_trace(equations: Any, slopes: Any, start: Numbers) -> tuple[Any, Any]:
-    """The root by JAX, with derivatives of any order by the implicit function theorem."""
-
-    def solve(f: Any, start: Numbers) -> tuple[Any, Any]:
-        x, steps = _iterated(jnp, f, jax.jacfwd(f), start, jnp.linalg.solve, jax.lax.while_loop)
-        return x, steps.astype(x.dtype)  # JAX 0.10 rejects the tangent of an integer
+        carry = start, xp.asarray(np.inf, start.dtype), xp.asarray(False), xp.asarray(0)
+        if xp is jnp:
+            carry = jax.lax.while_loop(lambda carry: ~carry[2] & (carry[3] < _MAX_STEPS), step, carry)
+        while xp is np and not carry[2] and carry[3] < _MAX_STEPS:
+            carry = step(carry)
+        return carry[0], carry[3].astype(start.dtype)  # JAX 0.10 rejects the tangent of an integer
 
     def solve_linear(f: Any, b: Numbers) -> Numbers:
+        # The pseudo-inverse is finite for a singular matrix. NaN in one member of a batch would give NaN in the
+        # derivatives of shared parameters. It is not differentiated, but the residual of the refined solution is.
         A = jax.jacfwd(f)(jnp.zeros_like(b))
-        # A singular matrix in one member of a batch would give NaN in the derivatives of shared parameters.
-        regular = _singular(jnp, A)[1][-1] > 0
-        return jnp.linalg.solve(jnp.where(regular, A, jnp.eye(len(b), dtype=b.dtype)), b)
+        fixed = jax.lax.stop_gradient(jnp.where(jnp.isfinite(A), A, 0.0))
+        inverse = jnp.linalg.pinv(fixed, rtol=REDUNDANT if redundant else None)
+        x = inverse @ b
+        for _ in range(2):
+            x = x + inverse @ (b - A @ x)
+        return x
 
+    if xp is np:
+        return solve(equations, start, slopes)
     return jax.lax.custom_root(equations, start, solve, solve_linear, has_aux=True)  # type: ignore[return-value]
 
 
@@ -250,29 +246,22 @@ def newton_compiled(system: System, q0, t, where: tuple[int, ...], lenient: bool
     return result._replace(q=nan_where(~result.converged, result.q, (system, q0, t)))
 
 
-def _residuals_along(xp: ModuleType, system: System, t: Component, along: np.ndarray) -> tuple[Any, Any]:
-    """The residuals (h,) as a function of q, and their derivatives (h, d) along directions (n_q, d)."""
-    if xp is np:
-        return (
-            lambda q: configuration_residual.numpy(system, t, q),
-            lambda q: configuration_residual.numpy_jvp((system, t, q), (None, None, along)),
-        )
-    rest = jnp.zeros(along.shape[1], along.dtype)
-    return (
-        lambda q: configuration_residual(system, t, q),
-        lambda q: jax.jacfwd(lambda dq: configuration_residual(system, t, q + along @ dq))(rest),
-    )
-
-
 def _newton(xp: ModuleType, system: System, q0, t, where: tuple[int, ...], lenient: bool) -> NewtonResult:
-    places, dtype = np.array(where, int), q0.dtype
+    places, dtype, redundant = np.array(where, int), q0.dtype, has_multipliers(system)
+    met = configuration_tolerance(dtype) if redundant else _met(dtype)
     # Values that are not finite must not reach the linear solver. It would raise an exception for the whole batch.
     finite = functools.reduce(operator.and_, [xp.all(xp.isfinite(x)) for x in jax.tree.leaves((system, q0))])
     system, q0 = jax.tree.map(lambda x: xp.where(finite, x, xp.ones_like(x)), (system, q0))
     along = np.eye(len(q0), dtype=dtype)[:, places]  # (n_q,moved)
-    root = _root_in_numbers if xp is np else _root_under_trace
 
-    residuals, slopes = _residuals_along(xp, system, t, along)
+    def residuals(q: Numbers) -> Numbers:
+        return configuration_residual.numpy(system, t, q) if xp is np else configuration_residual(system, t, q)
+
+    def slopes(q: Numbers) -> Numbers:
+        if xp is np:
+            return configuration_residual.numpy_jvp((system, t, q), (None, None, along))
+        return jax.jacfwd(lambda dq: residuals(q + along @ dq))(jnp.zeros(len(places), dtype))
+
     moved, sizes = scales_along(system, t, q0, along.T), residual_sizes(system, t, q0)[0]
     sizes = xp.where(sizes > 0, sizes, 1.0)
 
@@ -301,14 +290,14 @@ def _newton(xp: ModuleType, system: System, q0, t, where: tuple[int, ...], lenie
         G = slopes(at(amount)) / sizes[:, None] @ directions.T
         return xp.where(already_met[:, None], np.eye(n_h, dtype=dtype), G)
 
-    amount, steps = root(equations, equation_slopes, xp.zeros(n_h, dtype))
+    amount, steps = _root(xp, equations, equation_slopes, xp.zeros(n_h, dtype), met, redundant)
     q = at(amount)
     own, implied = violations(system, t, q)
-    is_met = xp.all(own <= _met(dtype))
+    is_met = xp.all(own <= met)
     implied_is_met = xp.all(implied <= configuration_tolerance(dtype))
     # At a double root, a residual of eps corresponds to a slope of sqrt(eps).
     smallest = _singular(xp, equation_slopes(amount))[1][-1]
-    is_determined = smallest > 4 * float(jnp.finfo(dtype).eps) ** 0.5
+    is_determined = (smallest > 4 * float(jnp.finfo(dtype).eps) ** 0.5) | redundant
     converged = finite & is_met & implied_is_met & is_determined
     remainder, implied = (xp.max(xp.abs(x), initial=0.0) for x in (residuals(q), implied_residual(system, t, q)))
     return NewtonResult(q, converged, is_met, is_determined, remainder, implied, steps)
@@ -399,8 +388,7 @@ def assemble(
     if is_concrete(parts):
         names = (*system.coordinates, *system.speeds, *system.states)
         bad = [n for n, y in zip(names, np.concatenate(parts), strict=True) if not np.isfinite(y)]
-        if bad:
-            raise ValueError(f"{name}: {', '.join(bad)} is not finite.")
+        refuse_any(bad, f"{name}:", " is not finite.")
     q0 = _solve_configuration(with_touching(system, touching) if touching else system, q0, t, problem)
     if touching or has_multipliers(system):
         named = dict(u) if isinstance(u, Mapping) else {}
@@ -430,8 +418,7 @@ def _solve_configuration(system: System, q0, t, problem: AssemblyProblem):
     if len(problem.moved) < n_h:  # e.g. a plane loop that is closed by a Vector, whose third component is always zero
         problem = problem._replace(lenient=True)
     places = tuple(system.coordinates.index(c) for c in problem.moved)
-    solve = _nearest_configuration if has_multipliers(system) else newton
-    result = solve(system, q0, t, places, problem.lenient)
+    result = newton(system, q0, t, places, problem.lenient)
     if not is_concrete(system, q0, t) or bool(result.converged):
         return result.q
     if places and not (result.is_met and not result.is_determined):
@@ -440,41 +427,11 @@ def _solve_configuration(system: System, q0, t, problem: AssemblyProblem):
         found = []
         for i in range(_OTHER_GUESSES):
             offset = 0.25 * (1 + i // 2) * rng.uniform(-1.0, 1.0, len(places)) * scales
-            other = solve(system, q0 + (offset @ along).astype(q0.dtype), t, places, problem.lenient)
+            other = newton(system, q0 + (offset @ along).astype(q0.dtype), t, places, problem.lenient)
             found += [other.q] if bool(other.converged) else []
         if found:
             return min(found, key=lambda q: float(np.linalg.norm((along @ np.asarray(q - q0)) / scales)))
     raise NoConfiguration(_why_not(system, q0, problem, result))
-
-
-def _nearest_configuration(system: System, q0, t, where: tuple[int, ...], _: bool) -> NewtonResult:
-    """As `newton`, for constraints that may be redundant, by the Gauss-Newton method."""
-    xp: Any = np if is_concrete(system, q0, t) else jnp
-    if xp is np:
-        system, q0, t = jax.device_get((system, q0, t))
-    places = np.array(where, int)
-    along = np.eye(len(q0), dtype=q0.dtype)[:, places]
-    residuals, slopes = _residuals_along(xp, system, t, along)
-    weights, sizes = scales_by_unit(system, t, q0)[places], residual_sizes(system, t, q0)[0]
-    sizes = xp.where(sizes > 0, sizes, 1.0)
-
-    def step(_: Any, q: Numbers) -> Numbers:
-        J = jax.lax.stop_gradient(slopes(q) * weights[None] / sizes[:, None])
-        J = xp.where(xp.isfinite(J), J, 0.0)
-        return q - along @ (weights * xp.linalg.lstsq(J, residuals(q) / sizes, rcond=REDUNDANT)[0])
-
-    if xp is np:
-        with np.errstate(all="ignore"):
-            q = functools.reduce(lambda q, _: step(_, q), range(_MAX_STEPS), q0) if where else q0
-    else:  # the last two steps have the derivatives of the implicit function theorem up to the second order
-        q = jax.lax.fori_loop(0, _MAX_STEPS, step, jax.lax.stop_gradient(q0))
-        q = step(1, step(0, q0 + jax.lax.stop_gradient(q - q0)))  # fixed coordinates have derivatives, too
-    limit = configuration_tolerance(q0.dtype)
-    is_met, implied_is_met = (xp.all(x <= limit) for x in violations(system, t, q))
-    converged = is_met & implied_is_met
-    remainder, implied = (xp.max(xp.abs(x), initial=0.0) for x in (residuals(q), implied_residual(system, t, q)))
-    q = jax.device_put(q) if xp is np else nan_where(~converged, q, (system, q0, t))
-    return NewtonResult(q, converged, is_met, np.array(True), remainder, implied, _MAX_STEPS)
 
 
 def _why_not(system: System, q0, problem: AssemblyProblem, result: NewtonResult) -> str:

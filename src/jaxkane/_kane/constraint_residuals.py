@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._common.lookup import refuse_any, refuse_if
 from .._scalarjit.cache import Cache
 from .._scalarjit.compat import Tracer, concretely
 from .._scalarjit.components import Component, Numbers, add, as_vector, dot, matvec, mul, stack, total
@@ -39,11 +40,6 @@ def configuration_residual(system: System, t: Component, q: Numbers):
     return as_vector(DescriptionEvaluator(system).configuration(t, tuple(q[i] for i in range(len(q)))), q)
 
 
-@ScalarFunction
-def _implied_residual(system: System, t: Component, q: Numbers):
-    return as_vector([x for group in _implied_groups(system, t, q) for x in group.components], q)
-
-
 def _implied_groups(system: System, t: Component, q: Numbers) -> list[SomeComponents]:
     residuals = system.implied_constraints(t, tuple(q[i] for i in range(len(q))))
     return [*residual_groups(residuals, f"{type(system).__name__}: the residuals of implied_constraints")]
@@ -56,20 +52,25 @@ def implied_residual(system: System, t: Component, q: Numbers) -> Numbers:
     return _by_numpy(_implied_residual, system, t, q)
 
 
+_implied_residual = ScalarFunction(
+    lambda system, t, q: as_vector([x for group in _implied_groups(system, t, q) for x in group.components], q)
+)
+
+
 def _by_numpy(f: ScalarFunction, *args: Any) -> PyTree:
-    """Evaluate concrete arguments by NumPy, so that nothing is compiled."""
     return f.numpy(*args) if is_concrete(args) else f(*args)
 
 
-_UNITS = Cache()  # units of coordinates, by structure
+_ANGLES = Cache()  # indices of coordinates that are angles, by structure
 
 
 def coordinate_units(system: System) -> tuple[str, ...]:
     """The units of the coordinates: as declared, "rad" if constraints use it in sin or cos, otherwise ""."""
-    return _UNITS.get(structure_of(system), lambda: _search_units(system))
+    angles = _ANGLES.get(structure_of(system), lambda: _angles(system))
+    return tuple(system.units.get(c, "rad" if i in angles else "") for i, c in enumerate(system.coordinates))
 
 
-def _search_units(system: System) -> tuple[str, ...]:
+def _angles(system: System) -> set[int]:
     def wide(x: Numbers) -> Numbers:
         # The residuals are traced with JAX's default dtype. Mixing it with float32 parameters would raise an exception.
         return np.asarray(x, float) if eqx.is_inexact_array(x) and not isinstance(x, Tracer) else x
@@ -81,8 +82,7 @@ def _search_units(system: System) -> tuple[str, ...]:
         def residual(*q: Any) -> Array:
             return jnp.array(DescriptionEvaluator(at).configuration(t, q), float)
 
-        angles = inside_pure_functions(residual, len(q))
-    return tuple(system.units.get(c, "rad" if i in angles else "") for i, c in enumerate(system.coordinates))
+        return inside_pure_functions(residual, len(q))
 
 
 def scales_along(system: System, t: Component, q: Numbers, directions: np.ndarray) -> Numbers:
@@ -106,8 +106,7 @@ def scales_by_unit(system: System, t: Component, q: Numbers) -> Numbers:
     """
     units = coordinate_units(system)
     different = [*dict.fromkeys(units)]
-    indicators = np.array([[unit == x for x in units] for unit in different])
-    scales = scales_along(system, t, q, indicators)
+    scales = scales_along(system, t, q, np.array([[unit == x for x in units] for unit in different]))
     xp: Any = np if isinstance(scales, np.ndarray) else jnp
     return xp.stack([scales[different.index(unit)] for unit in units])  # no array indices, for the export to C
 
@@ -227,11 +226,8 @@ def check_left_out(system: System, t: Component, q: Numbers, left_out: Sequence[
 
 def correction(system: System, t: Component, q: Array) -> Float[Array, " n_q"]:
     """The smallest change of coordinates (n_q,) that satisfies the configuration constraints to first order."""
-
-    def residual(q: Array) -> Array:
-        return configuration_residual(system, t, q)
-
-    return -least_change(jax.jacfwd(residual)(q), residual(q), coordinate_weights(system, t, q))
+    G = jax.jacfwd(lambda q: configuration_residual(system, t, q))(q)
+    return -least_change(G, configuration_residual(system, t, q), coordinate_weights(system, t, q))
 
 
 def coordinate_weights(system: System, t: Component, q: Numbers) -> Numbers:
@@ -355,14 +351,15 @@ def best_dependent_speeds(system: System, t: Component, q: Numbers) -> Dependent
     """
     check_is_system(system)
     name = type(system).__name__
-    if not system.dependent_speeds:
-        raise ValueError(f"best_dependent_speeds: {name} has no dependent speeds, so there is no choice to compare.")
+    refuse_if(
+        not system.dependent_speeds,
+        f"best_dependent_speeds: {name} has no dependent speeds, so there is no choice to compare.",
+    )
     refuse_incomplete(system, q, {})
     q = as_array(q, system.coordinates, f"{name}: q")
     check_time(name, t)
     wrong = [c for c, x in zip(system.coordinates, np.asarray(q), strict=True) if not np.isfinite(x)]
-    if wrong:
-        raise ValueError(f"{name}: q is not finite: {', '.join(wrong)}.")
+    refuse_any(wrong, f"{name}: q is not finite:", ".")
     return dependent_speeds_at(system, jnp.asarray(t, q.dtype), q)
 
 
@@ -380,9 +377,23 @@ def dependent_speeds_at(system: System, t: Component, q: Numbers) -> DependentSp
     # Divide by the sizes of the terms, so that a row of rounding errors, e.g. at a dead centre, remains small.
     rows = np.max(C_sizes * columns, axis=1, initial=0.0)
     rows = np.where(rows > 0, rows, 1.0)
-    C = without_rounding(C, C_sizes) * columns / rows[:, None]
-    speeds, name = (*system.speeds, *system.dependent_speeds), type(system).__name__
-    return dependent_speeds_from(C, c0 / rows, speeds, system.dependent_speeds, name, c0_sizes / rows)
+    C, c0, c0_sizes = without_rounding(C, C_sizes) * columns / rows[:, None], c0 / rows, c0_sizes / rows
+    speeds, current, k = (*system.speeds, *system.dependent_speeds), system.dependent_speeds, len(C)
+    ranks = [int(np.linalg.matrix_rank(C[: i + 1], tol=1e-9)) for i in range(k)]
+    redundant = tuple(i for i in range(k) if ranks[i] == (ranks[i - 1] if i else 0))
+    kept = [i for i in range(k) if i not in redundant]
+    conflicting = []
+    for i in redundant:
+        weights = np.linalg.lstsq(C[kept].T, C[i], rcond=None)[0]
+        if abs(c0[i] - weights @ c0[kept]) > 1e-9 * (c0_sizes[i] + np.abs(weights) @ c0_sizes[kept]):
+            conflicting.append(i)
+    own = tuple(speeds.index(s) for s in current)
+    condition = _condition(C, own)
+    conditions = {tuple(sorted(own)): condition} | _best_choices(C)
+    ranked = sorted(((tuple(speeds[i] for i in c), float(x)) for c, x in conditions.items()), key=lambda pair: pair[1])
+    absent = tuple(s for i, s in zip(own, current, strict=True) if not C[:, i].any())
+    of_rows = ranks[-1], redundant, tuple(conflicting), absent
+    return DependentSpeeds(tuple(ranked), current, condition, k, *of_rows, type(system).__name__)
 
 
 @ScalarFunction.compile_cheaply
@@ -403,38 +414,6 @@ def _constraint_rows(system: System, t: Component, q: Array) -> tuple[Array, ...
         return C, as_vector(kane.residuals(kane.t, kane.q, still), q), as_vector(energies, q)
 
     return *rows(system, t, q), *term_sizes(rows, system, t, q)
-
-
-def dependent_speeds_from(
-    C: np.ndarray,
-    c0: np.ndarray,
-    speeds: tuple[str, ...],
-    current: tuple[str, ...],
-    name: str,
-    c0_sizes: np.ndarray | None = None,
-) -> DependentSpeeds:
-    """`best_dependent_speeds` from the rows of the residuals.
-
-    The rows must be scaled if `c0_sizes` is given. Otherwise, all speeds must have the same unit.
-    """
-    if c0_sizes is None:
-        C, c0_sizes = _by_rows(C), np.abs(c0)
-    k = len(C)
-    ranks = [int(np.linalg.matrix_rank(C[: i + 1], tol=1e-9)) for i in range(k)]
-    redundant = tuple(i for i in range(k) if ranks[i] == (ranks[i - 1] if i else 0))
-    kept = [i for i in range(k) if i not in redundant]
-    conflicting = []
-    for i in redundant:
-        weights = np.linalg.lstsq(C[kept].T, C[i], rcond=None)[0]
-        if abs(c0[i] - weights @ c0[kept]) > 1e-9 * (c0_sizes[i] + np.abs(weights) @ c0_sizes[kept]):
-            conflicting.append(i)
-    own = tuple(speeds.index(s) for s in current)
-    condition = _condition(C, own)
-    conditions = {tuple(sorted(own)): condition} | _best_choices(C)
-    ranked = sorted(((tuple(speeds[i] for i in c), float(x)) for c, x in conditions.items()), key=lambda pair: pair[1])
-    absent = tuple(s for i, s in zip(own, current, strict=True) if not C[:, i].any())
-    rank, conflicts = ranks[-1], tuple(conflicting)
-    return DependentSpeeds(tuple(ranked), current, condition, k, rank, redundant, conflicts, absent, name)
 
 
 def _best_choices(C: np.ndarray) -> dict[tuple[int, ...], float]:
@@ -470,7 +449,8 @@ def relative_condition(C: np.ndarray, dependent: Sequence[int]) -> Numbers:
     residual always has the condition number 1. The result is infinite if the residuals cannot be solved, and NaN if C
     is not finite.
     """
-    return _condition(_by_rows(C), dependent)
+    size = np.abs(C).max(axis=-1, keepdims=True)
+    return _condition(C / np.where(size > 0, size, 1.0), dependent)
 
 
 def _condition(C: np.ndarray, dependent: Sequence[int]) -> Numbers:
@@ -482,9 +462,3 @@ def _condition(C: np.ndarray, dependent: Sequence[int]) -> Numbers:
         condition = np.where(smallest > 1e-14 * largest, largest / smallest, np.inf)
     condition = np.where(finite, condition, np.nan)
     return condition if condition.ndim else float(condition)
-
-
-def _by_rows(C: np.ndarray) -> np.ndarray:
-    """Each row divided by its largest entry."""
-    size = np.abs(C).max(axis=-1, keepdims=True)
-    return C / np.where(size > 0, size, 1.0)

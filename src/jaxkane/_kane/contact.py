@@ -22,6 +22,7 @@ Otherwise the slip of a sticking contact would drift by the error of the solver,
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -30,8 +31,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._common.lookup import checked, refuse_if
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import (
+    ZERO3,
     Component,
     add,
     as_vector,
@@ -46,16 +49,16 @@ from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Body, Motion
 from .._system.system import System
-from .arguments import Row, is_concrete, is_one_number
+from .arguments import Row, check_number, is_concrete
 from .constraint_residuals import configuration_tolerance
 from .description import dtype_of, jvp
-from .impact import REDUNDANT, RowBasis, checked_restitution, inverse_root, least_norm
-from .kanes_method import KaneEquations, unit
+from .impact import Permanent, RowBasis, checked_restitution, inverse_root
+from .kanes_method import KaneEquations
 from .scaling import term_sizes
 from .unilateral import MOST_CONTACTS, SLIDES, STICKS, force_scales, with_friction
 
 
-@dataclasses.dataclass(frozen=True, init=False)
+@dataclasses.dataclass(frozen=True)
 class Contact:
     """For `System.contacts`: a contact that pushes but does not pull.
 
@@ -81,50 +84,39 @@ class Contact:
     **Raises:** `TypeError` and `ValueError` for arguments of a wrong type or outside their range.
     """
 
-    point: Point | None
-    normal: Vector | None
-    gap: Any
-    restitution: Any
-    friction: Any
-    static: Any
-    surface: Point | None
+    point: Point | None = None
+    normal: Vector | None = None
+    gap: Any = None
+    restitution: Any = 0.0
+    friction: Any = 0.0
+    static: Any = None
+    surface: Point | None = None
 
-    def __init__(
-        self,
-        point: Point | None = None,
-        normal: Vector | None = None,
-        gap: Any = None,
-        restitution: Any = 0.0,
-        friction: Any = 0.0,
-        static: Any = None,
-        surface: Point | None = None,
-    ):
-        for name, value, kind in (("point", point, Point), ("normal", normal, Vector), ("surface", surface, Point)):
-            if value is not None and not isinstance(value, kind):
-                hint = ' Pass one of its points, such as motion["heel"] or body.center.' * isinstance(value, Body)
-                raise TypeError(f"Contact: `{name}` must be a {kind.__name__}, got {value!r}.{hint}")
-        if (point is None) != (normal is None) or (point is None and gap is None):
-            raise ValueError("Contact: pass a point and a normal, or a gap, or all three.")
-        if point is None and surface is not None:
-            raise ValueError("Contact: `surface` needs a point and a normal.")
-        if not is_one_number(restitution):
-            raise TypeError(f"Contact: the restitution must be one number, got {restitution!r}.")
-        checked_restitution(restitution, "Contact")
-        for name, value in (("gap", gap), ("friction", friction), ("static", static)):
-            if value is not None and not is_one_number(value):
-                raise TypeError(f"Contact: `{name}` must be one number, got {value!r}.")
-        friction, static = _checked_friction("Contact", "friction", friction, static)
-        if point is None and not (is_exact(friction) and is_zero(friction)):
-            raise ValueError(
-                "Contact: a contact with friction needs a point and a normal, because a gap does not determine the "
-                "slip. For friction along a coordinate use jaxkane.DryFriction."
-            )
-        values = (point, normal, gap, restitution, friction, static, surface)
-        for field, value in zip(dataclasses.fields(self), values, strict=True):
-            object.__setattr__(self, field.name, value)
+    def __post_init__(self):
+        remedy = ' Pass one of its points, such as motion["heel"] or body.center.'
+        for name, value, kind in (
+            ("point", self.point, Point),
+            ("normal", self.normal, Vector),
+            ("surface", self.surface, Point),
+        ):
+            what = f"Contact: `{name}` must be a {kind.__name__}"
+            checked(value, kind | None, what, remedy * isinstance(value, Body))
+        refuse_if(
+            (self.point is None) != (self.normal is None) or (self.point is None and self.gap is None),
+            "Contact: pass a point and a normal, or a gap, or all three.",
+        )
+        refuse_if(self.point is None and self.surface is not None, "Contact: `surface` needs a point and a normal.")
+        check_number(self.restitution, "Contact: the restitution")
+        checked_restitution(self.restitution, "Contact")
+        _set_static(self, "friction", "gap")
+        refuse_if(
+            self.point is None and not is_zero(component(self.friction)),
+            "Contact: a contact with friction needs a point and a normal, because a gap does not determine the "
+            "slip. For friction along a coordinate use jaxkane.DryFriction.",
+        )
 
 
-@dataclasses.dataclass(frozen=True, init=False)
+@dataclasses.dataclass(frozen=True)
 class DryFriction:
     """For `System.contacts`: dry friction of a bearing, a slide or a belt, whose normal force is known.
 
@@ -142,27 +134,27 @@ class DryFriction:
 
     slip: Any
     kinetic: Any
-    static: Any
+    static: Any = None
 
-    def __init__(self, slip: Any, kinetic: Any, static: Any = None):
-        for name, value in (("slip", slip), ("kinetic", kinetic), ("static", static)):
-            if not (value is None and name == "static") and not is_one_number(value):
-                raise TypeError(f"DryFriction: `{name}` must be one number, got {value!r}.")
-        kinetic, static = _checked_friction("DryFriction", "kinetic", kinetic, static)
-        for name, value in (("slip", slip), ("kinetic", kinetic), ("static", static)):
-            object.__setattr__(self, name, value)
+    def __post_init__(self):
+        _set_static(self, "kinetic", "slip")
 
 
-def _checked_friction(label: str, name: str, kinetic: Any, static: Any) -> tuple[Any, Any]:
-    if is_concrete(kinetic) and not float(kinetic) >= 0:
-        raise ValueError(f"{label}: `{name}` is {float(kinetic)}. It must not be negative.")
+def _set_static(contact: Contact | DryFriction, kinetic: str, other: str) -> None:
+    """Check the numbers of a contact, and set the static friction to the kinetic one by default."""
+    label, numbers = type(contact).__name__, {name: getattr(contact, name) for name in (other, kinetic, "static")}
+    for name, value in numbers.items():
+        if value is not None or name == kinetic or (name == other and other == "slip"):
+            check_number(value, f"{label}: `{name}`")
+    moving, static = numbers[kinetic], numbers["static"]
+    if is_concrete(moving) and not float(moving) >= 0:
+        raise ValueError(f"{label}: `{kinetic}` is {float(moving)}. It must not be negative.")
     if static is None:
-        return kinetic, kinetic
-    if is_concrete(kinetic, static) and not float(static) >= float(kinetic):
+        object.__setattr__(contact, "static", moving)
+    elif is_concrete(moving, static) and not float(static) >= float(moving):
         raise ValueError(
-            f"{label}: the static friction {float(static)} is smaller than the kinetic friction {float(kinetic)}."
+            f"{label}: the static friction {float(static)} is smaller than the kinetic friction {float(moving)}."
         )
-    return kinetic, static
 
 
 class ContactLayout(NamedTuple):
@@ -231,11 +223,11 @@ def layout_of(system: System) -> ContactLayout:
         laws = [_laws(x) for x in _contacts(kane, kane.t, kane.q, kane.u_all)[1].values()]
         return rows.velocities(kane.t, kane.q, kane.u_all), rows.gaps(kane.t, kane.q, kane.u_all), laws
 
-    if not is_written_out(len(system.speeds)):
-        raise ValueError(
-            f"{type(system).__name__}: contacts need a system with at most 12 speeds, and this one has "
-            f"{len(system.speeds)}. Use MuJoCo for large systems with contacts."
-        )
+    refuse_if(
+        not is_written_out(len(system.speeds)),
+        f"{type(system).__name__}: contacts need a system with at most 12 speeds, and this one has "
+        f"{len(system.speeds)}. Use MuJoCo for large systems with contacts.",
+    )
     dtype = dtype_of(system)
     q, u = (jnp.zeros(len(names), dtype) for names in (system.coordinates, system.speeds))
     program = jax.make_jaxpr(trace)(jnp.zeros((), dtype), q, u)
@@ -246,35 +238,28 @@ def _contacts(kane: KaneEquations, t: Component, q: Row, u: Row) -> tuple[Motion
     motion = kane.motion(t, q, u)
     contacts = kane.system.contacts(t, q, u, motion)
     label = f"{kane.name}.contacts"
-    if not isinstance(contacts, Mapping):
-        raise TypeError(f"{label} must return a dict of contacts by name, got {contacts!r}.")
-    for name, contact in contacts.items():
-        if not isinstance(name, str) or not name:
-            raise TypeError(f"{label}: the name of a contact must be a string, got {name!r}.")
-        if not isinstance(contact, (Contact, DryFriction)):
-            raise TypeError(f"{label}: {name!r} must be a jaxkane.Contact or jaxkane.DryFriction, got {contact!r}.")
+    for name, contact in checked(contacts, Mapping, f"{label} must return a dict of contacts by name").items():
+        checked(name or None, str, f"{label}: the name of a contact must be a string")
+        checked(contact, Contact | DryFriction, f"{label}: {name!r} must be a jaxkane.Contact or jaxkane.DryFriction")
     return motion, {name: contacts[name] for name in sorted(contacts)}
 
 
 def _traced_layout(kane: KaneEquations) -> ContactLayout:
     motion, contacts = _contacts(kane, kane.t, kane.q, kane.u_all)
-    if len(contacts) > MOST_CONTACTS:
-        raise ValueError(
-            f"{kane.name} has {len(contacts)} contacts: {', '.join(contacts)}. At most {MOST_CONTACTS} are possible. "
-            "Use MuJoCo for systems with many contacts."
-        )
+    refuse_if(
+        len(contacts) > MOST_CONTACTS,
+        f"{kane.name} has {len(contacts)} contacts: {', '.join(contacts)}. At most {MOST_CONTACTS} are possible. "
+        "Use MuJoCo for systems with many contacts.",
+    )
     bearings = [isinstance(x, DryFriction) for x in contacts.values()]
-    frictions = [b or not _is_zero(x.friction) for b, x in zip(bearings, contacts.values(), strict=True)]
+    frictions = [b or not is_zero(component(x.friction)) for b, x in zip(bearings, contacts.values(), strict=True)]
     planes = [_plane(x, motion.N) if isinstance(x, Contact) and x.point is not None else 2 for x in contacts.values()]
     in_space = any(f and p is None for f, p in zip(frictions, planes, strict=True))
     points = [isinstance(x, Contact) and x.point is not None for x in contacts.values()]
-    n_residuals = len(ContactRows(kane, NO_CONTACTS).residuals(kane.t, kane.q, kane.u_all))
+    system: Any = kane.system
+    n_residuals = len(system.multiplier_residuals(kane.t, kane.q, kane.u_all)) if has_multipliers(system) else 0
     layout = tuple(contacts), tuple(frictions), tuple(bearings), in_space, tuple(planes), tuple(points)
     return ContactLayout(*layout, n_residuals=n_residuals)
-
-
-def _is_zero(x: Any) -> bool:
-    return is_exact(component(x)) and is_zero(component(x))
 
 
 def _relative_velocity(contact: Contact) -> Vector:
@@ -290,9 +275,8 @@ def _unit_normal(contact: Contact, N: Frame) -> tuple[Component, ...]:
 
 
 def _plane(contact: Contact, N: Frame) -> int | None:
-    """An axis of N along which the contact neither moves nor pushes, or None."""
     v, n = _relative_velocity(contact).components_in(N), _unit_normal(contact, N)
-    still = [i for i in range(3) if is_exact(v[i]) and is_zero(v[i]) and is_exact(n[i]) and is_zero(n[i])]
+    still = [i for i in range(3) if is_zero(v[i]) and is_zero(n[i])]
     return still[-1] if still else None
 
 
@@ -311,13 +295,9 @@ def _tangents(normal: Row, plane: int | None, in_space: bool) -> list[Row]:
     else:
         steep = jnp.abs(jnp.asarray(c)) > 0.6
         first = tuple(jnp.where(steep, x, y) for x, y in zip((c, 0.0 * c, -a), (b, -a, 0.0 * c)))
-    size = jnp.sqrt(sum(jnp.asarray(x) ** 2 for x in first))
-    first = first if is_flat and _number(size) == 1.0 else tuple(x / size for x in first)
+    size = math.hypot(*first) if is_flat else jnp.sqrt(sum(jnp.asarray(x) ** 2 for x in first))
+    first = first if is_flat and size == 1.0 else tuple(x / size for x in first)
     return [first, cross(normal, first)]  # pyright: ignore[reportArgumentType]
-
-
-def _number(x: Any) -> float:
-    return float(x) if is_concrete(x) else float("nan")
 
 
 class Laws(NamedTuple):
@@ -400,19 +380,17 @@ class ContactRows:
 
     def gaps(self, t: Component, q: Row, u: Row) -> list[Component]:
         motion, contacts = _contacts(self.kane, t, q, u)
-        return [self._gap(x, motion.N) for x in contacts.values()]
-
-    def _gap(self, contact: Any, N: Frame) -> Component:
-        if isinstance(contact, DryFriction):
-            return 1.0
-        if contact.gap is not None:
-            return component(contact.gap)
-        position = contact.point.position
-        position = position if contact.surface is None else position - contact.surface.position
-        return position.dot(N.vector(*_unit_normal(contact, N)))
+        gaps: list[Component] = []
+        for contact in contacts.values():
+            if isinstance(contact, DryFriction) or contact.gap is not None:
+                gaps.append(1.0 if isinstance(contact, DryFriction) else component(contact.gap))
+                continue
+            r = contact.point.position
+            r = r if contact.surface is None else r - contact.surface.position
+            gaps.append(r.dot(motion.N.vector(*_unit_normal(contact, motion.N))))
+        return gaps
 
     def gap_rates(self, t: Component, q: Row, u: Row) -> list[Component]:
-        """Rates of the gaps along the motion with these speeds."""
         direction = (1.0, *self.kane.rates(t, q, u))
         return jvp(lambda t, *q: self.gaps(t, q, u), (t, *q), direction)[1]
 
@@ -428,42 +406,35 @@ class ContactRows:
             elif contact.point is None:
                 rows.append([rates[i], *[0.0] * d])
             else:
-                v, n = _relative_velocity(contact), _unit_normal(contact, motion.N)
-                tangents = self.tangents_of(n, i)
-                rows.append([v.dot(motion.N.vector(*e)) for e in (n, *tangents)])
+                v = _relative_velocity(contact)
+                rows.append([v.dot(motion.N.vector(*e)) for e in self.axes(contact, i, motion.N)])
         return rows
 
-    def residuals(self, t: Component, q: Row, u: Row) -> Row:
-        """Velocity residuals that have multipliers."""
-        system: Any = self.kane.system
-        return system.multiplier_residuals(t, q, u) if has_multipliers(system) else ()
-
-    def tangents_of(self, normal: Row, i: int) -> list[Row]:
+    def axes(self, contact: Any, i: int, N: Frame) -> list[Row]:
+        """The normal and the tangents of contact i, with components in N; zero if they do not exist."""
         d = self.layout.d
-        if not self.layout.has_friction[i]:
-            return [(0.0, 0.0, 0.0)] * d
-        return _tangents(normal, self.layout.planes[i], d == 2)
+        if not self.layout.has_point[i]:
+            return [ZERO3] * (1 + d)
+        normal = _unit_normal(contact, N)
+        has_tangents = self.layout.has_friction[i]
+        return [normal, *(_tangents(normal, self.layout.planes[i], d == 2) if has_tangents else [ZERO3] * d)]
 
 
 def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True) -> ContactTerms:
     rows, c, r = ContactRows(kane, layout), len(layout.names), 1 + layout.d
     t, q, u = kane.t, kane.q, kane.u_all
-    like = jnp.zeros((), kane.dtype)
+    like, n_q = jnp.zeros((), kane.dtype), len(q)
 
-    def flat(values: Sequence[Sequence[Component]]) -> Array:
-        return as_vector([x for row in values for x in row], like)
-
-    def velocities(u: Row) -> list[Component]:
+    def velocities(t: Component, q: Row, u: Row) -> list[Component]:
         return [x for row in rows.velocities(t, q, u) for x in row]
 
-    v = flat(rows.velocities(t, q, u))
-    columns = [kane.along_speeds(velocities, kane.with_dependent(unit(kane.n, i))) for i in range(kane.n)]
-    C = stack(columns).astype(kane.dtype).T if c else jnp.zeros((0, kane.n), kane.dtype)
+    v = as_vector(velocities(t, q, u), like)
+    C = kane.jacobian(lambda u: velocities(t, q, u)) if c else jnp.zeros((0, kane.n), kane.dtype)
     partials = kane.partial_velocities()
     mass = kane.mass_matrix(partials)
-    if layout.n_residuals:
-        rates = [kane.along_speeds(lambda u: rows.residuals(t, q, u), unit(kane.n, i)) for i in range(kane.n)]
-        A, M = stack(rates).astype(kane.dtype).T, stack(mass).astype(kane.dtype)
+    permanent = Permanent.of(kane)
+    if permanent is not None:
+        A, M = permanent.C, stack(mass).astype(kane.dtype)
         # A massless link: M is regular for the permitted speeds only. On these, M + A^T W A is the same as M.
         m = jnp.stack([M[i, i] for i in range(kane.n)])[None]
         sizes = jax.lax.stop_gradient(jnp.max(jnp.where(m > 0, A**2 / jnp.where(m > 0, m, 1.0), 0.0), axis=1))
@@ -472,40 +443,27 @@ def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True)
     X = stack(inverse_root(mass)).astype(kane.dtype)  # X^T M X = 1
     a0 = shift = jnp.zeros(kane.n, kane.dtype)
     moving = (1.0, *kane.q_dot, *(0.0,) * kane.n, *kane.bias())
-    n_q = len(q)
-    if layout.n_residuals:
-        basis = RowBasis.of(A @ X, REDUNDANT)
-        residuals = as_vector(rows.residuals(t, q, u), like)
-        drift = jvp(lambda t, *z: rows.residuals(t, z[:n_q], z[n_q:]), (t, *q, *u), moving)[1]
-        a0 = X @ (basis.solve(-as_vector(drift, like))[0] @ basis.Q)
-        shift = X @ (basis.solve(-residuals)[0] @ basis.Q)
+    if permanent is not None:
+        system: Any = kane.system
+        drift = jvp(lambda t, *z: system.multiplier_residuals(t, z[:n_q], z[n_q:]), (t, *q, *u), moving)[1]
+        basis = permanent.basis(X)
+        a0, shift = (X @ basis.least_norm(-b) for b in (as_vector(drift, like), permanent.residuals))
         X = X - (X @ basis.Q.T) @ basis.Q
-    u_array = as_vector(kane.u, like)
-    size = jnp.abs(v) + jnp.abs(C) @ jnp.abs(u_array)
+    size = jnp.abs(v) + jnp.abs(C) @ jnp.abs(as_vector(kane.u, like))
     motion, contacts = _contacts(kane, t, q, u)
     laws = [_laws(x) for x in contacts.values()]
     laws = Laws(*(as_vector([law[i] for law in laws], like) for i in range(3)))
-    tangents = [
-        rows.tangents_of(_unit_normal(x, motion.N), i) if isinstance(x, Contact) and x.point is not None else
-        [(0.0, 0.0, 0.0)] * layout.d
-        for i, x in enumerate(contacts.values())
-    ]  # fmt: skip
-    T = as_vector([y for each in tangents for row in each for y in row], like).reshape(c, layout.d, 3)
+    tangents = [y for i, x in enumerate(contacts.values()) for e in rows.axes(x, i, motion.N)[1:] for y in e]
+    T = as_vector(tangents, like).reshape(c, layout.d, 3)
     gaps = as_vector(rows.gaps(t, q, u), like)
     if with_forces:
         f = as_vector([add(x, y) for x, y in zip(kane.active_forces(partials), kane.inertia_forces(partials))], like)
-
-        def along(t: Component, *z: Component) -> list[Component]:
-            return [x for row in rows.velocities(t, z[:n_q], z[n_q:]) for x in row]
-
-        b = as_vector(jvp(along, (t, *q, *u), moving)[1], like) + C @ a0
+        v_dot = jvp(lambda t, *z: velocities(t, z[:n_q], z[n_q:]), (t, *q, *u), moving)[1]
+        b = as_vector(v_dot, like) + C @ a0
         w = X.T @ f
     else:
         b, w = jnp.zeros_like(v), jnp.zeros(kane.n, kane.dtype)
-    along_q = [
-        kane.along_speeds(lambda u: kane.rates(t, q, u), kane.with_dependent(unit(kane.n, i))) for i in range(kane.n)
-    ]
-    Q = stack(along_q).astype(kane.dtype).T
+    Q = kane.jacobian(lambda u: kane.rates(t, q, u))
     return ContactTerms(gaps, v.reshape(c, r), size.reshape(c, r), C, b, X, w, laws, T, Q, a0, shift)
 
 
@@ -530,7 +488,7 @@ def speeds_in_contact(
     needed = jnp.concatenate([np.zeros(sum(kept), u.dtype), -terms.v[closed, 0]])
     change = terms.shift
     if len(rows):
-        change = change + terms.X @ least_norm(rows @ terms.X, needed - rows @ terms.shift)[0]
+        change = change + terms.X @ RowBasis.of(rows @ terms.X).least_norm(needed - rows @ terms.shift)
     sizes = jnp.abs(rows) @ (jnp.abs(u) + jnp.abs(terms.shift) + jnp.abs(change))
     return u + change, jnp.any(jnp.abs(rows @ change - needed) > configuration_tolerance(u.dtype) * sizes)
 
@@ -654,12 +612,12 @@ def solve_forces(layout: ContactLayout, terms: ContactTerms, memory: ContactMemo
     mask = active.reshape(-1)
     A = jnp.where(mask[:, None] & mask[None], (B @ B.T) @ W, 0.0)
     needed = jnp.where(mask, -(B @ w + terms.b), 0.0)
-    z = least_norm(A, needed)[0]
+    z = RowBasis.of(A).least_norm(needed)
     if c > 1 and layout.d:
         normal = (W @ z).reshape(c, r)[:, 0]
         limits = terms.laws.static * jnp.where(is_bearing, 1.0, normal)
         scales = force_scales(limits, memory.states == STICKS, r)
-        z = scales * least_norm(A * scales[None], needed)[0]
+        z = scales * RowBasis.of(A * scales[None]).least_norm(needed)
     forces = W @ z
     u_dot = terms.a0 + terms.X @ (w + B.T @ forces)
     return ContactForces((forces + known).reshape(c, r), u_dot)
@@ -669,16 +627,11 @@ def _active_rows(layout: ContactLayout, memory: ContactMemory) -> Array:
     """Which rows (c, r) are constraints."""
     is_bearing = jnp.asarray(layout.is_bearing)
     normal = (memory.states >= SLIDES) & ~is_bearing
-    tangential = (memory.states == STICKS)[:, None] & jnp.asarray(_tangential_rows(layout))
-    return jnp.concatenate([normal[:, None], tangential], axis=1)
-
-
-def _tangential_rows(layout: ContactLayout) -> np.ndarray:
-    """Which tangential rows (c, d) exist."""
-    rows = np.zeros((len(layout.names), layout.d), bool)
+    rows = np.zeros((len(layout.names), layout.d), bool)  # the tangential rows that exist
     for i, (has, plane, bearing) in enumerate(zip(layout.has_friction, layout.planes, layout.is_bearing, strict=True)):
         rows[i, : (1 if bearing or plane is not None else layout.d) if has else 0] = True
-    return rows
+    tangential = (memory.states == STICKS)[:, None] & jnp.asarray(rows)
+    return jnp.concatenate([normal[:, None], tangential], axis=1)
 
 
 def projected_speeds(layout: ContactLayout, terms: ContactTerms, memory: ContactMemory, u: Array) -> Array:
@@ -688,7 +641,7 @@ def projected_speeds(layout: ContactLayout, terms: ContactTerms, memory: Contact
     mask = _active_rows(layout, memory).reshape(-1)
     B = jnp.where(mask[:, None], terms.B, 0.0)
     v = terms.v.reshape(-1) + terms.C @ terms.shift
-    return u + terms.shift + terms.X @ least_norm(B, jnp.where(mask, -v, 0.0))[0]
+    return u + terms.shift + terms.X @ RowBasis.of(B).least_norm(jnp.where(mask, -v, 0.0))
 
 
 def without_gaps(terms: ContactTerms, closed: Array, q: Array) -> Array:
@@ -697,16 +650,7 @@ def without_gaps(terms: ContactTerms, closed: Array, q: Array) -> Array:
     The displacement is that of virtual speeds, so it satisfies the velocity constraints.
     """
     rows = jnp.where(closed[:, None], terms.B.reshape(*terms.v.shape, -1)[:, 0], 0.0)
-    return q + terms.Q @ (terms.X @ least_norm(rows, jnp.where(closed, -terms.gaps, 0.0))[0])
-
-
-def _projected(
-    system: System, layout: ContactLayout, t: Component, q: Array, u: Array, memory: ContactMemory, values: Any
-) -> tuple[KaneEquations, Array]:
-    """Kane's equations at the projected speeds, and these speeds."""
-    free = KaneEquations(system, t, q, u, values)
-    u = projected_speeds(layout, _terms(free, layout, with_forces=False), memory, u)
-    return KaneEquations(system, t, q, u, values), u
+    return q + terms.Q @ (terms.X @ RowBasis.of(rows).least_norm(jnp.where(closed, -terms.gaps, 0.0)))
 
 
 def forces_in_contact(
@@ -714,7 +658,9 @@ def forces_in_contact(
 ) -> tuple[KaneEquations, Array, ContactForces, ContactTerms]:
     """Kane's equations at the projected speeds, these speeds, the contact forces and accelerations, and the terms."""
     states = ContactMemory.unpacked(layout, jnp.zeros(layout.memory_size, q.dtype) if memory is None else memory)
-    kane, u = _projected(system, layout, t, q, u, states, values)
+    free = KaneEquations(system, t, q, u, values)
+    u = projected_speeds(layout, _terms(free, layout, with_forces=False), states, u)
+    kane = KaneEquations(system, t, q, u, values)
     terms = _terms(kane, layout)
     return kane, u, solve_forces(layout, terms, states), terms
 
@@ -752,19 +698,13 @@ def event_functions(
     if not layout.d:
         return normal, one
     slip = jnp.sum(terms.v[:, 1:] * memory.starts(layout, terms.tangents), axis=1)
-    friction = _norm(forces[:, 1:])
+    squares = jnp.sum(forces[:, 1:] ** 2, axis=1)  # the derivative of the length is zero at zero
+    length = jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1.0)), 0.0)
+    friction = jnp.abs(forces[:, 1]) if layout.d == 1 else length
     bound = jnp.where(is_bearing, terms.laws.static, terms.laws.static * forces[:, 0])
     has = jnp.asarray(layout.has_friction) & (terms.laws.static > 0)
     tangential = jnp.where(memory.states == STICKS, bound - friction, jnp.where(closed, slip, one))
     return normal, jnp.where(has, tangential, one)
-
-
-def _norm(x: Array) -> Array:
-    """The length of each row, whose derivative at zero is zero."""
-    if x.shape[1] == 1:
-        return jnp.abs(x[:, 0])
-    squares = jnp.sum(x**2, axis=1)
-    return jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1.0)), 0.0)
 
 
 def event_sizes(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Array
 
+from .._common.lookup import refuse_if
 from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component, Numbers, as_vector
 from .._scalarjit.scalar_function import ScalarFunction
@@ -15,6 +16,7 @@ from .constraint_residuals import configuration_residual
 from .contact import ContactLayout, ContactRows, gap_sizes, has_contacts, layout_of
 from .description import at_random_point
 from .kanes_method import KaneEquations
+from .scaling import nearest_root
 
 
 @ScalarFunction
@@ -54,11 +56,11 @@ def check_contacts(system: System, t: Component, q: Numbers, *, may_penetrate: b
             return
         gaps, sizes = gap_sizes.numpy(system, t, q, np.zeros(len(system.speeds), q.dtype))
     for name, gap, size in zip(layout.names, gaps, sizes, strict=True):
-        if gap < -(float(np.finfo(q.dtype).eps) ** 0.6) * size:
-            raise ValueError(
-                f"{type(system).__name__}.contacts: the gap of {name!r} is {gap:.6g} at the start. It must not be "
-                f"negative. Find touching coordinates with jaxkane.assemble(system, q, touching=({name!r},))."
-            )
+        refuse_if(
+            gap < -(float(np.finfo(q.dtype).eps) ** 0.6) * size,
+            f"{type(system).__name__}.contacts: the gap of {name!r} is {gap:.6g} at the start. It must not be "
+            f"negative. Find touching coordinates with jaxkane.assemble(system, q, touching=({name!r},)).",
+        )
 
 
 def _touching(system: System, t: np.ndarray, q: np.ndarray, i: int) -> np.ndarray:
@@ -67,19 +69,16 @@ def _touching(system: System, t: np.ndarray, q: np.ndarray, i: int) -> np.ndarra
     The gap to a curved surface need not be a distance: its rate must be the velocity where it is zero.
     """
     along = None, None, np.eye(len(q), dtype=q.dtype)
-    for _ in range(20):
+
+    def scaled(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         at = system, t, q
-        residuals = np.append(configuration_residual.numpy(*at), _gaps.numpy(*at)[i])
+        h = np.append(configuration_residual.numpy(*at), _gaps.numpy(*at)[i])
         G = np.vstack([configuration_residual.numpy_jvp(at, along), _gaps.numpy_jvp(at, along)[i]])
         norms = np.linalg.norm(G, axis=1)
-        if not np.all(np.isfinite(G)) or not np.all(np.isfinite(residuals)) or not norms[-1] > 0:
-            break
-        norms = np.where(norms > 0, norms, 1.0)
-        step = np.linalg.pinv(G / norms[:, None], rcond=1e-6) @ (residuals / norms)
-        q = (q - step).astype(q.dtype)
-        if np.max(np.abs(step)) <= np.finfo(q.dtype).eps ** 0.5 * np.max(np.abs(q)):
-            return q
-    return np.full_like(q, np.nan)
+        norms[:-1][norms[:-1] == 0] = 1.0  # a gap that does not change gives NaN
+        return h / norms, G / norms[:, None]
+
+    return nearest_root(scaled, q)
 
 
 def _check_rows(system: System, layout: ContactLayout, t: np.ndarray, q: np.ndarray, which: range | list[int]) -> None:
@@ -92,17 +91,16 @@ def _check_rows(system: System, layout: ContactLayout, t: np.ndarray, q: np.ndar
     for name, i in ((layout.names[i], i) for i in which):
         size = np.max(np.abs([v[i], v_0[i], v_2[i]]))
         size = size if size > 1e4 * eps else 1.0  # the velocity of a point that cannot move is a rounding error
-        if layout.has_point[i] and abs(rates[i] - v[i, 0]) > tolerance * (abs(rates[i]) + size):
-            raise ValueError(
-                f"{label}: the gap of {name!r} changes by {rates[i]:.6g}, but the velocity of its point along the "
-                f"normal is {v[i, 0]:.6g} (at speeds of size 1, near the initial coordinates). Pass the point of the "
-                "body that touches, with the velocity of its material, and the gap of this point. If the surface "
-                "turns, pass a `surface` point below this point, with the velocity of the surface there."
-            )
-        if np.any(np.abs(v_2[i] - v_0[i] + 2.0 * (v[i] - v_0[i])) > tolerance * size) or (
-            max(abs(gaps[i] - gaps_0[i]), abs(gaps_2[i] - gaps_0[i])) > tolerance * abs(gaps_0[i])
-        ):
-            raise ValueError(
-                f"{label}: {name!r} needs a gap and a normal that do not depend on the speeds, and a slip that is "
-                "affine in the speeds. Remove products, squares and abs() of speeds."
-            )
+        refuse_if(
+            layout.has_point[i] and abs(rates[i] - v[i, 0]) > tolerance * (abs(rates[i]) + size),
+            f"{label}: the gap of {name!r} changes by {rates[i]:.6g}, but the velocity of its point along the "
+            f"normal is {v[i, 0]:.6g} (at speeds of size 1, near the initial coordinates). Pass the point of the "
+            "body that touches, with the velocity of its material, and the gap of this point. If the surface "
+            "turns, pass a `surface` point below this point, with the velocity of the surface there.",
+        )
+        refuse_if(
+            np.any(np.abs(v_2[i] - v_0[i] + 2.0 * (v[i] - v_0[i])) > tolerance * size)
+            or (max(abs(gaps[i] - gaps_0[i]), abs(gaps_2[i] - gaps_0[i])) > tolerance * abs(gaps_0[i])),
+            f"{label}: {name!r} needs a gap and a normal that do not depend on the speeds, and a slip that is "
+            "affine in the speeds. Remove products, squares and abs() of speeds.",
+        )

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from .._common.lookup import checked, refuse_any
 from .._scalarjit.cache_key import version_of
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import (
@@ -86,11 +87,8 @@ class DescriptionEvaluator:
     def __init__(self, system: System, inputs: Mapping[str, Component] | None = None):
         self.system = system
         self.name = type(system).__name__
-        if batched := in_batches(system):
-            raise ValueError(
-                f"{self.name}: {', '.join(batched)} has more axes than declared. For a batch of systems, use "
-                "jax.vmap, or jaxkane.sweep.sweep for their simulations."
-            )
+        after = " has more axes than declared. For a batch of systems, use jax.vmap or jaxkane.sweep.sweep."
+        refuse_any(in_batches(system), f"{self.name}:", after)
         self.n, self.k = len(system.speeds), len(system.dependent_speeds)
         self.inputs = Inputs(checked_values(system, inputs), inputs_of(system))
         self._memory: dict[Any, Any] = {}
@@ -100,10 +98,7 @@ class DescriptionEvaluator:
         return _quantities.replay(quantity, self.system, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
 
     def motion(self, t: Component, q: Row, u: Row) -> Motion:
-        motion = self.system.motion(t, q, u)
-        if not isinstance(motion, Motion):
-            raise TypeError(f"{self.name}.motion must return a jaxkane.Motion, got {motion!r}.")
-        return motion
+        return checked(self.system.motion(t, q, u), Motion, f"{self.name}.motion must return a jaxkane.Motion")
 
     def loads_at(self, t: Component, q: Row, u: Row, motion: Motion) -> tuple[Load, ...]:
         return flatten_loads(self.system.loads(t, q, u, motion, self.inputs), f"{self.name}.loads")
@@ -155,7 +150,6 @@ class EvaluatedDescription:
         return self.evaluator.loads_at(self.t, self.q, u, self.motion)
 
     def rates(self) -> Row:
-        """q_dot (n_q,)."""
         system = self.evaluator.system
         return as_row(system.q_dot(self.t, self.q, self.u), system.coordinates, f"{self.evaluator.name}.q_dot")
 
@@ -165,7 +159,6 @@ class EvaluatedDescription:
         return [*residual_groups(residuals, f"{self.evaluator.name}: the residuals of configuration_constraints")]
 
     def configuration(self) -> Row:
-        """Residuals (h,) of the configuration constraints."""
         return tuple(x for group in self.residual_groups for x in group.components)
 
     def configuration_vectors(self) -> list[Row]:
@@ -173,7 +166,6 @@ class EvaluatedDescription:
         return [group.all for group in self.residual_groups for _ in group.components]
 
     def velocity_residuals(self) -> Row:
-        """The velocity residuals of `Motion`."""
         return self.motion.constraints
 
     def bodies(self) -> list[tuple[Component, Rows]]:
@@ -195,7 +187,6 @@ class EvaluatedDescription:
         return bodies, [load.velocity.components for load in self.loads]
 
     def momenta(self) -> list[tuple[Row, Row]]:
-        """p = m v and H = I . omega of the bodies."""
         return [
             (scale3(b.mass, b.center.velocity.components), matvec(b.inertia, b.angular_velocity.components_in(b.frame)))
             for b in self.motion.bodies
@@ -218,7 +209,6 @@ def _quantities(system: System, components: Any) -> dict[str, Any]:
 
 
 def turning_bodies(motion: Motion) -> list[Body]:
-    """The bodies that rotate relative to their frames."""
     return [body for body in motion.bodies if body.angular_velocity is not body.frame.angular_velocity]
 
 

@@ -46,9 +46,12 @@ def diagnosis(system: System, t: Component, q: Numbers, u: Numbers, inputs: Any 
     q_dot, M, f = (np.asarray(x) for x in compiled[rates_and_equations](system, t, q, u, inputs or {}))
     if not np.all(np.isfinite(M)):
         return f"{name}: the mass matrix is not finite at {place}."
-    null = _null_direction(M.astype(float), rounding_of_pivots(M.dtype))
-    if null is not None:
-        together = ", ".join(s for s, x in zip(system.speeds, null, strict=True) if abs(x) > 1e-6 * np.abs(null).max())
+    rounding, M = rounding_of_pivots(M.dtype), M.astype(float)
+    scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
+    values, vectors = np.linalg.eigh(M * scale[:, None] * scale)
+    null = vectors[:, 0] * scale / np.abs(vectors[:, 0] * scale).max()
+    if values[0] <= rounding:  # a linear combination of the speeds without kinetic energy
+        together = ", ".join(s for s, x in zip(system.speeds, null, strict=True) if abs(x) > 1e-6)
         if _moves_nothing(system, t, q, u, null):
             return (
                 f"{name}: the speeds {together} can change together without moving any body at {place}, so that their "
@@ -56,8 +59,12 @@ def diagnosis(system: System, t: Component, q: Numbers, u: Numbers, inputs: Any 
                 "motion. Choose another state, or use Euler parameters or another sequence of angles for the "
                 "orientation."
             )
-        massless = _massless(M.astype(float), system.speeds, rounding_of_pivots(M.dtype))
-        massless = massless or f"the mass matrix is singular: a combination of {together} does not move any mass"
+        # The mass of a speed is the largest entry of its row. Differences between the units are ignored.
+        rows = np.abs(M).max(axis=1)
+        alone = [speed for speed, size in zip(system.speeds, rows, strict=True) if size <= rounding * rows.max()]
+        massless = f"no mass moves with the speed{'s' * (len(alone) > 1)} {', '.join(alone)}"
+        if not alone:
+            massless = f"the mass matrix is singular: a combination of {together} does not move any mass"
         return (
             f"{name}: {massless}, so Kane's equations have no solution. Add masses, and moments of inertia about "
             "all axes of rotation (a thin rod needs one about its own axis, too), or remove the speed from the system."
@@ -89,22 +96,6 @@ def _loads_not_finite(system: System, t: Component, q: Numbers, u: Numbers, inpu
     opposite = len(places) > 1 and all(isinstance(x, Force) for x in wrong)
     hint = " (two points coincide, so the force between them has no direction)" if opposite else ""
     return f"{', '.join(places)} {'is' if len(places) == 1 else 'are'} not finite{hint}"
-
-
-def _massless(M: np.ndarray, speeds: tuple[str, ...], rounding: float) -> str:
-    """A text that names the speeds that move no mass, or "" if there are none."""
-    # The mass of a speed is the largest entry of its row. Differences between the units are ignored.
-    rows = np.abs(M).max(axis=1)
-    alone = [speed for speed, size in zip(speeds, rows, strict=True) if size <= rounding * rows.max()]
-    return f"no mass moves with the speed{'s' * (len(alone) > 1)} {', '.join(alone)}" if alone else ""
-
-
-def _null_direction(M: np.ndarray, rounding: float) -> np.ndarray | None:
-    """A linear combination of the speeds (n,) that has no kinetic energy, or None."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
-    values, vectors = np.linalg.eigh(M * scale[:, None] * scale)
-    null = vectors[:, 0] * scale
-    return null / np.abs(null).max() if values[0] <= rounding else None
 
 
 def _moves_nothing(system: System, t: Component, q: Numbers, u: Numbers, direction: np.ndarray) -> bool:

@@ -6,14 +6,16 @@ graph, so common subexpressions occur once.
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._common.lookup import refuse_any, refuse_if
 from .._scalarjit.compat import ClosedJaxpr, jaxpr_as_fun
 from .._scalarjit.components import ELIMINATE_UP_TO, as_vector, is_written_out
 from .._scalarjit.graph import Graph, NotScalarError, unrolled
@@ -45,20 +47,12 @@ class Function(NamedTuple):
     needs_states: bool = False
 
 
-def _all_rates(system, t, q, u, w, u_dep):
-    """Rates of the coordinates as a function of all speeds, including the dependent ones."""
-    evaluator = DescriptionEvaluator(system)
-    return (as_vector(evaluator.rates(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
-
-
-def _velocity_residuals(system, t, q, u, w, u_dep):
-    return (as_vector(DescriptionEvaluator(system).residuals(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
-
-
-def _configuration_residuals(system, t, q, u, w, u_dep):
-    return (as_vector(DescriptionEvaluator(system).configuration(t, as_row(q, system.coordinates, "q")), q),)
-
-
+# Derivatives of the rates (q_dot, u_dot) with respect to these kinds of arguments.
+JACOBIANS = {
+    "state_jacobian": ("q", "u"),
+    "parameter_jacobian": ("parameters",),
+    "input_jacobian": ("inputs",),
+}
 FUNCTIONS: dict[str, Function] = {
     "rates": Function(("q_dot", "u_dot"), lambda s, t, q, u, w, _: motion_rates_by_matrix(s, t, q, u, w)),
     "equations": Function(("M", "f"), lambda s, t, q, u, w, _: equations_of_motion(s, t, q, u, w)),
@@ -73,17 +67,21 @@ FUNCTIONS: dict[str, Function] = {
     "partial_velocities": Function(("V", "W"), lambda s, t, q, u, w, _: partial_velocities(s, t, q, u, w)),
     "state_rates": Function(("x_dot",), lambda s, t, q, u, w, _: (rates(s, t, q, u, w).x,), needs_states=True),
     "kinetic_energy": Function(("energy",), lambda s, t, q, u, w, _: (kinetic_energy(s, t, q, u),)),
-    "coordinate_rates": Function(("q_dot",), _all_rates),
-    "velocity_residuals": Function(("c",), _velocity_residuals, True),
-    "configuration_residuals": Function(("h",), _configuration_residuals),
 }
-# Derivatives of the rates (q_dot, u_dot) with respect to these kinds of arguments.
-JACOBIANS = {
-    "state_jacobian": ("q", "u"),
-    "parameter_jacobian": ("parameters",),
-    "input_jacobian": ("inputs",),
+OFFERED = (*FUNCTIONS, *JACOBIANS)
+# As functions of all speeds, including the dependent ones.
+FUNCTIONS |= {
+    "coordinate_rates": Function(("q_dot",), lambda *args: _read(DescriptionEvaluator.rates, *args)),
+    "velocity_residuals": Function(("c",), lambda *args: _read(DescriptionEvaluator.residuals, *args), True),
+    "configuration_residuals": Function(
+        ("h",), lambda *args: _read(lambda system, t, q, u: system.configuration(t, q), *args)
+    ),
 }
-OFFERED = (*(name for name, f in FUNCTIONS.items() if f.evaluate.__name__ == "<lambda>"), *JACOBIANS)
+
+
+def _read(quantity: Callable[..., Any], system: System, t: Any, q: Any, u: Any, w: Any, u_dep: Any) -> tuple[Any]:
+    row = as_row(q, system.coordinates, "q")
+    return (as_vector(quantity(DescriptionEvaluator(system), t, row, (*u, *u_dep)), q),)
 
 
 class Argument(NamedTuple):
@@ -118,13 +116,12 @@ class Formulas:
         refuse_multipliers(system)
         self.system, self.name, self.dtype = system, type(system).__name__, str(jnp.dtype(dtype))
         self.functions = {**FUNCTIONS, **(more or {})}
-        if self.dtype not in ("float64", "float32"):
-            raise ValueError(f"{self.name}: `dtype` must be 'float64' or 'float32', got {dtype!r}.")
-        batched = in_batches(system)
-        if batched:
-            raise ValueError(
-                f"{self.name} is a batch: {', '.join(batched)} has additional leading axes. Pass one member of it."
-            )
+        refuse_if(
+            self.dtype not in ("float64", "float32"),
+            f"{self.name}: `dtype` must be 'float64' or 'float32', got {dtype!r}.",
+        )
+        after = " has additional leading axes. Pass one member of it."
+        refuse_any(in_batches(system), f"{self.name} is a batch:", after)
         if not is_concrete(system):
             raise TypeError(f"{self.name} is traced. Call this function outside of jax.jit, vmap and grad.")
         check_system(system, 0.0, None)
@@ -158,7 +155,6 @@ class Formulas:
         self.nodes = functools.cache(self._nodes)
 
     def values(self) -> dict[str, np.ndarray]:
-        """The parameter values of the system by name."""
         floats = [x for x, is_float in zip(self.leaves, self.is_float, strict=True) if is_float]
         return {a.name: np.asarray(x, self.dtype) for a, x in zip(self.of_kind("parameters"), floats, strict=True)}
 
@@ -166,7 +162,6 @@ class Formulas:
         return [a for a in self.arguments if a.kind == kind]
 
     def names(self, kind: str) -> tuple[str, ...]:
-        """The names of all numbers of a kind, in order."""
         return tuple(name for a in self.of_kind(kind) for name in a.elements)
 
     def evaluate(self, function: str, *args: Any) -> tuple[Any, ...]:
@@ -181,24 +176,25 @@ class Formulas:
 
     def _program(self, function: str, keeps_solutions: bool = False) -> ClosedJaxpr:
         """A function as a JAX program without calls of other programs. `keeps_solutions`: see `cse`."""
-        if self.functions[function].needs_constraints and not self.system.dependent_speeds:
-            raise ValueError(f"{self.name} has no dependent speeds, so {function!r} does not exist. Omit it.")
-        if self.functions[function].needs_states and not self.system.states:
-            raise ValueError(f"{self.name} has no first-order states, so {function!r} does not exist. Omit it.")
+        refuse_if(
+            self.functions[function].needs_constraints and not self.system.dependent_speeds,
+            f"{self.name} has no dependent speeds, so {function!r} does not exist. Omit it.",
+        )
+        refuse_if(
+            self.functions[function].needs_states and not self.system.states,
+            f"{self.name} has no first-order states, so {function!r} does not exist. Omit it.",
+        )
         specs = [jax.ShapeDtypeStruct(a.shape, self.dtype) for a in self.arguments]
         with jax.enable_x64(self.dtype == "float64"):
             return cse(jax.make_jaxpr(functools.partial(self.evaluate, function))(*specs), keeps_solutions)
 
     def _nodes(self, function: str) -> dict[str, np.ndarray]:
-        """The outputs of a function by name, as nodes."""
         if function in JACOBIANS:
             blocks = self.derivatives("rates", self.directions(*JACOBIANS[function]))
             return {"jacobian": np.concatenate([*blocks.values()])}
         program = self.program(function)
-        try:
+        with self._explained(function):
             outputs = unrolled(program, self.inputs, self.graph)
-        except NotScalarError as error:
-            raise ValueError(self._refusal(function, error)) from None
         return dict(zip(self.functions[function].outputs, outputs, strict=True))
 
     def directions(self, *kinds: str) -> list[Direction]:
@@ -207,11 +203,8 @@ class Formulas:
 
     def derivatives(self, function: str, directions: Sequence[Direction]) -> dict[str, np.ndarray]:
         """The derivatives (..., d) of a function's outputs with respect to d numbers, as nodes."""
-        try:
-            with jax.enable_x64(self.dtype == "float64"):
-                outputs = jacobian(self.program(function, keeps_solutions=True), self.inputs, directions, self.graph)
-        except NotScalarError as error:
-            raise ValueError(self._refusal(function, error)) from None
+        with self._explained(function), jax.enable_x64(self.dtype == "float64"):
+            outputs = jacobian(self.program(function, keeps_solutions=True), self.inputs, directions, self.graph)
         return dict(zip(self.functions[function].outputs, outputs, strict=True))
 
     def directional_derivative(self, function: str, direction: Mapping[int, np.ndarray]) -> list[np.ndarray]:
@@ -221,12 +214,9 @@ class Formulas:
         """
         places = [i for i, nodes in direction.items() if nodes.size]
         outputs = self.nodes(function).values()
-        try:
-            with jax.enable_x64(self.dtype == "float64"):
-                program, has_tangent = tangent_program(self.program(function, keeps_solutions=True), places)
-                tangents = iter(unrolled(program, [*self.inputs, *(direction[i] for i in places)], self.graph))
-        except NotScalarError as error:
-            raise ValueError(self._refusal(function, error)) from None
+        with self._explained(function), jax.enable_x64(self.dtype == "float64"):
+            program, has_tangent = tangent_program(self.program(function, keeps_solutions=True), places)
+            tangents = iter(unrolled(program, [*self.inputs, *(direction[i] for i in places)], self.graph))
         zero = self.graph.constant(0.0, self.dtype)
         pairs = zip(has_tangent, outputs, strict=True)
         return [next(tangents) if has else np.full(nodes.shape, zero) for has, nodes in pairs]
@@ -249,21 +239,25 @@ class Formulas:
         blocks = jax.jacfwd(rates_of)([jnp.asarray(args[i]) for i in places])
         return (jnp.concatenate([block.reshape(n, -1) for block in blocks], axis=1),)
 
-    def _refusal(self, function: str, error: NotScalarError) -> str:
+    @contextlib.contextmanager
+    def _explained(self, function: str) -> Iterator[None]:
+        """**Raises:** `ValueError` for an operation that cannot be written with scalars."""
         n, k = len(self.system.speeds), len(self.system.dependent_speeds)
         if not is_written_out(n) and function not in ("equations", "coordinate_rates"):
             why = f"because the equations of a system with {n} speeds are solved by LAPACK"
             remedy = "Export M and f with functions=('equations',), and solve M u_dot = f in the other program"
         elif k > ELIMINATE_UP_TO:
-            why = f"because {k} dependent speeds are computed by LAPACK"
-            remedy = "Use fewer dependent speeds"
+            why, remedy = f"because {k} dependent speeds are computed by LAPACK", "Use fewer dependent speeds"
         else:
             why = "which its description uses"
             remedy = "Use functions of single numbers, jnp.where and constant indices"
-        return (
-            f"{self.name}: {function!r} cannot be written as formulas of single numbers: it contains {error}, {why}. "
-            f"{remedy}. Or use jaxkane.export.stablehlo, which supports every operation."
-        )
+        try:
+            yield
+        except NotScalarError as error:
+            raise ValueError(
+                f"{self.name}: {function!r} cannot be written as formulas of single numbers: it contains {error}, "
+                f"{why}. {remedy}. Or use jaxkane.export.stablehlo, which supports every operation."
+            ) from None
 
 
 def _elements(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:

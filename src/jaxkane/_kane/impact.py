@@ -33,7 +33,7 @@ import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._common.lookup import not_there
+from .._common.lookup import checked, not_there, refuse_if
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import (
     Component,
@@ -59,8 +59,8 @@ from .._system.motion import flatten_residuals
 from .._system.prints import module_text
 from .._system.system import NamedVector, System
 from .api import checked_arrays, finite_or_explained
-from .arguments import Row, as_row, is_concrete, is_one_number
-from .kanes_method import KaneEquations, mass_matrix_columns, unit
+from .arguments import Row, as_row, check_number, is_concrete
+from .kanes_method import KaneEquations, mass_matrix_columns
 from .reactions import AuxiliarySpeeds
 
 
@@ -100,23 +100,19 @@ class Impact(eqx.Module):
         label = "Impact(*velocity_residuals): the velocity residuals"
         counts = [len(flatten_residuals(each, label)) for each in velocity_residuals]
         self.residuals = flatten_residuals(velocity_residuals, label)
-        if not self.residuals:
-            raise ValueError("Impact(*velocity_residuals): pass at least one velocity residual.")
+        refuse_if(not self.residuals, "Impact(*velocity_residuals): pass at least one velocity residual.")
         self.restitution = _for_each(checked_restitution(restitution), counts)
         self.release = checked_release(release)
 
 
 def checked_restitution(value: Any, label: str = "Impact") -> Any:
-    """One coefficient of restitution, or a tuple of these."""
-    if not is_one_number(value) and not isinstance(value, (tuple, list)) and getattr(value, "ndim", 0) != 1:
-        raise TypeError(f"{label}: the restitution is one number, or one for each residual, got {value!r}.")
-    coefficients: tuple[Any, ...] = (value,) if is_one_number(value) else tuple(value)
-    for e in coefficients:
-        if not is_one_number(e):
-            raise TypeError(f"{label}: a coefficient of restitution is one number, got {e!r}.")
+    is_one = not isinstance(value, (tuple, list)) and getattr(value, "ndim", 0) != 1
+    values: Any = (value,) if is_one else value
+    for e in values:
+        check_number(e, f"{label}: a coefficient of restitution")
         if is_concrete(e) and not 0 <= float(e) <= 1:
             raise ValueError(f"{label}: the coefficient of restitution is {float(e)}. It must be between 0 and 1.")
-    return value if is_one_number(value) else coefficients
+    return value if is_one else tuple(value)
 
 
 def _for_each(restitution: Any, counts: Sequence[int]) -> tuple[Component, ...]:
@@ -124,11 +120,11 @@ def _for_each(restitution: Any, counts: Sequence[int]) -> tuple[Component, ...]:
     values = restitution if isinstance(restitution, tuple) else (restitution,) * sum(counts)
     if len(values) == len(counts) != sum(counts):  # one for each Vector
         values = [e for e, count in zip(values, counts, strict=True) for _ in range(count)]
-    if len(values) != sum(counts):
-        raise ValueError(
-            f"Impact: there are {sum(counts)} residuals, but {len(values)} coefficients of restitution. Pass a "
-            "single number, or one number for each residual."
-        )
+    refuse_if(
+        len(values) != sum(counts),
+        f"Impact: there are {sum(counts)} residuals, but {len(values)} coefficients of restitution. Pass a "
+        "single number, or one number for each residual.",
+    )
     return tuple(component(e) for e in values)
 
 
@@ -198,7 +194,9 @@ def after_impact(kane: KaneEquations, read: ReadImpact) -> ImpactSolution:
     **Returns:** the result. It is NaN if the residuals contradict each other or are not affine in the speeds, and if
     the mass matrix is singular.
     """
-    return _solved(*_equations_of(kane, read))
+    before = BeforeImpact(kane, read)
+    M = stack(kane.mass_matrix(kane.partial_velocities())).astype(kane.dtype)
+    return _solved(M, kane.jacobian(before.residuals), before.quantities())
 
 
 def impact_at(
@@ -210,38 +208,15 @@ def impact_at(
     """
     if is_written_out(len(system.speeds)):
         return _impact_written_out(system, t, q, u, inputs, read)
-    return _solved(*impulse_equations(system, t, q, u, inputs, read))
 
-
-def impulse_equations(
-    system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array], read: ReadImpactOf
-) -> tuple[Array, Array, Quantities]:
-    """The mass matrix M (n, n), the derivatives C (m, n) of the residuals, and the other quantities of an impact."""
-    if is_written_out(len(system.speeds)):
-        return _equations_written_out(system, t, q, u, inputs, read)
-
-    def column(direction: Any) -> Array:
-        return _residuals_along(system, t, q, u, inputs, read, direction)
-
+    column = functools.partial(_residuals_along, system, t, q, u, inputs, read)
     C = jax.vmap(column, out_axes=-1)(np.eye(len(system.speeds), dtype=q.dtype))
-    return mass_matrix_columns(system, t, q, u, inputs), C, _quantities(system, t, q, u, inputs, read)
-
-
-def _equations_of(kane: KaneEquations, read: ReadImpact) -> tuple[Array, Array, Quantities]:
-    before = BeforeImpact(kane, read)
-    M = stack(kane.mass_matrix(kane.partial_velocities())).astype(kane.dtype)
-    columns = [before.along(kane.with_dependent(unit(kane.n, r))) for r in range(kane.n)]
-    return M, stack(columns).astype(kane.dtype).T, before.quantities()
+    return _solved(mass_matrix_columns(system, t, q, u, inputs), C, _quantities(system, t, q, u, inputs, read))
 
 
 @ScalarFunction
 def _impact_written_out(system, t, q, u, inputs, read):
     return after_impact(KaneEquations(system, t, q, u, inputs), functools.partial(read, system))
-
-
-@ScalarFunction
-def _equations_written_out(system, t, q, u, inputs, read):
-    return _equations_of(KaneEquations(system, t, q, u, inputs), functools.partial(read, system))
 
 
 @ScalarFunction
@@ -308,18 +283,16 @@ class Permanent(NamedTuple):
         system: Any = kane.system
         if not hasattr(system, "multiplier_residuals"):
             return None
-
-        def residuals(u: Row) -> Row:
-            return system.multiplier_residuals(kane.t, kane.q, u)
-
-        columns = [kane.along_speeds(residuals, unit(kane.n, r)) for r in range(kane.n)]
-        values = stack([residuals(kane.u_all)])[0]
-        return cls(stack(columns).astype(kane.dtype).T, values.astype(kane.dtype))
+        residuals = functools.partial(system.multiplier_residuals, kane.t, kane.q)
+        return cls(kane.jacobian(residuals), stack([residuals(kane.u_all)])[0].astype(kane.dtype))
 
     def rows(self, X: Array) -> tuple[Array, Array]:
         """A (k, n) with orthonormal rows and b (k,), for which A w = b is the change X w onto the constraints."""
-        basis = RowBasis.of(self.C @ X, REDUNDANT)
+        basis = self.basis(X)
         return basis.Q, basis.solve(-self.residuals)[0]
+
+    def basis(self, X: Array) -> RowBasis:
+        return RowBasis.of(self.C @ X, REDUNDANT)
 
 
 class BeforeImpact:
@@ -328,16 +301,12 @@ class BeforeImpact:
     def __init__(self, kane: KaneEquations, read: ReadImpact):
         self.kane, self.read = kane, read
         self.rest = (0.0,) * (kane.n + kane.k)
-        self.impact = self._impact(kane.u_all)
-
-    def _impact(self, u: Row) -> Impact:
-        impact = self.read(self.kane.t, self.kane.q, u)
-        if not isinstance(impact, Impact):
-            raise TypeError(f"{self.kane.name}: an impact must be a jaxkane.Impact, got {impact!r}.")
-        return impact
+        self.impact: Impact = checked(
+            read(kane.t, kane.q, kane.u_all), Impact, f"{kane.name}: an impact must be a jaxkane.Impact"
+        )
 
     def residuals(self, u: Row) -> Row:
-        return self._impact(u).residuals
+        return self.read(self.kane.t, self.kane.q, u).residuals
 
     def along(self, direction: Row) -> Row:
         """Derivatives (m,) of the residuals along a direction (n + k,) of all speeds."""
@@ -350,17 +319,15 @@ class BeforeImpact:
         r, r0, slope = impact.residuals, self.residuals(self.rest), self.along(kane.u_all)
         deviation = [sub(sub(x, y), z) for x, y, z in zip(r, r0, slope, strict=True)]
         size = [total(map(abs, terms)) for terms in zip(r, r0, slope, strict=True)]
-        if impact.release and hasattr(kane.system, "multiplier_residuals"):
-            raise ValueError(
-                f"{kane.name}: an impact with `release` is not supported for a system with multipliers. Use the system "
-                "with dependent speeds (its attribute `inner`)."
-            )
+        refuse_if(
+            impact.release and hasattr(kane.system, "multiplier_residuals"),
+            f"{kane.name}: an impact with `release` is not supported for a system with multipliers. Use the system "
+            "with dependent speeds (its attribute `inner`).",
+        )
         released = self._released(momenta) if impact.release else None
         rows: Any = (kane.u, h, r, impact.restitution, deviation, size)
-        return Quantities(*map(self._array, rows), released=released, permanent=Permanent.of(kane))
-
-    def _array(self, row: Sequence[Component]) -> Array:
-        return stack([row])[0].astype(self.kane.dtype)
+        arrays = (self._matrix([row])[0] for row in rows)
+        return Quantities(*arrays, released=released, permanent=Permanent.of(kane))
 
     def _matrix(self, rows: Rows) -> Array:
         return stack(rows).astype(self.kane.dtype)
@@ -382,7 +349,7 @@ class BeforeImpact:
         ]
         M = self._matrix(kane.mass_matrix([partial for partial, _ in partials]))
         C = self._matrix([column for _, column in partials])
-        return Released(self._matrix(M_own).T, M, C.T, self._array(h))
+        return Released(self._matrix(M_own).T, M, C.T, self._matrix([h])[0])
 
     def _partial(self, kane: AuxiliarySpeeds, part: Point | Frame, axis: int) -> tuple[Any, Row]:
         """Partial velocities and derivatives (m,) of the residuals for one auxiliary speed of a released part."""
@@ -406,36 +373,26 @@ def _part(kane: AuxiliarySpeeds, name: str) -> Point | Frame:
     if name not in parts:
         raise not_there(name, parts, f"the points and frames of {kane.name} that an impact can release")
     part = parts[name]
-    if isinstance(part, Frame) and part.parent is None:
-        raise ValueError(f"{kane.name}: the impact releases {name!r}, which is the inertial frame. Omit it.")
-    if not kane.is_cut(part) and not kane.k:
-        raise ValueError(
-            f"{kane.name}: the impact releases {name!r}, but the position of no body is defined from this point. The "
-            "release has no effect. Release the point from which the positions of the bodies are defined."
-        )
+    refuse_if(
+        isinstance(part, Frame) and part.parent is None,
+        f"{kane.name}: the impact releases {name!r}, which is the inertial frame. Omit it.",
+    )
+    refuse_if(
+        not kane.is_cut(part) and not kane.k,
+        f"{kane.name}: the impact releases {name!r}, but the position of no body is defined from this point. The "
+        "release has no effect. Release the point from which the positions of the bodies are defined.",
+    )
     return part
 
 
-class ImpulseCoordinates(NamedTuple):
-    """The impact in coordinates w in which the mass matrix is the unit matrix. N = n + a with a auxiliary speeds.
+def _solved(M: Array, C: Array, before: Quantities) -> ImpactSolution:
+    """The impact with the mass matrix `M` (n, n) and the derivatives `C` (m, n) of the residuals.
 
-    - `X` (N, N): the change of the speeds is X w.
-    - `C` (m, N): derivatives of the residuals by all speeds.
-    - `h` (N,): generalized momenta before the impact.
-    - `undetermined` (m,): how much motions of released parts without mass change each residual; None if nothing is
-      released.
+    X (N, N) has X^T M X = 1, with the mass matrix of the N = n + a speeds and auxiliary speeds: u+ - u- = X w.
     """
-
-    X: Array
-    C: Array
-    h: Array
-    undetermined: Array | None = None
-
-    @classmethod
-    def of(cls, M: Array, C: Array, before: Quantities) -> ImpulseCoordinates:
-        X, released = _own_root(M), before.released
-        if released is None:
-            return cls(X, C, before.h)
+    n, X, h, released = len(M), _own_root(M), before.h, before.released
+    tolerance, is_determined = float(jnp.finfo(M.dtype).eps) ** 0.5, jnp.ones((), bool)
+    if released is not None:
         # M = [[M_oo, M_oa], [M_ao, M_aa]],   X^T M X = 1,   S = M_aa - M_ao M_oo^-1 M_oa
         B = X.T @ released.M_own
         S = released.M - B.T @ B
@@ -445,38 +402,27 @@ class ImpulseCoordinates(NamedTuple):
         lower = jnp.concatenate([jnp.zeros_like(released.M_own.T), X_a], axis=1)
         X = jnp.concatenate([jnp.concatenate([X, -X @ B @ X_a], axis=1), lower], axis=0)
         C, h = jnp.concatenate([C, released.C], axis=1), jnp.concatenate([before.h, released.h])
-        return cls(X, C, h, undetermined)
-
-    def energy_lost(self, w: Array) -> Array:
-        """Kinetic energy before the impact minus that after it [J]."""
-        # T(u+) - T(u-) = (change . M change) / 2 + h . change,   change = X w
-        return -(0.5 * w @ w + self.h @ (self.X @ w))
-
-
-def _solved(M: Array, C: Array, before: Quantities) -> ImpactSolution:
-    """The impact with the mass matrix `M` (n, n) and the derivatives `C` (m, n) of the residuals."""
-    coordinates = ImpulseCoordinates.of(M, C, before)
-    X, C, n = coordinates.X, coordinates.C, len(M)
+        # No residual depends on a motion of a released part that moves no mass.
+        is_determined = jnp.all(undetermined <= tolerance * jnp.sum(jnp.abs(C), axis=1))
     # C (u+ - u-) = c(u+) - c(u-) = -(1 + e) c(u-)
     b = -(1.0 + before.restitution) * before.residuals
     A, k = C @ X, 0
     if before.permanent is not None:
         rows, values = before.permanent.rows(X)
         A, b, k = jnp.concatenate([rows, A]), jnp.concatenate([values, b]), len(rows)
-    w, y, T, is_new, missing = least_norm(A, b)
-    b, y, T, is_new, missing = b[k:], y[k:], T[k:, k:], is_new[k:], missing[k:]
-    p = least_norm(T.T[::-1], y[::-1])[0]  # T^T p = y
-    size = before.size + jnp.abs(b) + jnp.abs(T) @ jnp.abs(y)
-    tolerance = float(jnp.finfo(M.dtype).eps) ** 0.5
-    is_consistent = jnp.all(jnp.abs(missing) <= tolerance * size)
+    basis = RowBasis.of(A)
+    y, missing = basis.solve(b)
+    w, T = y @ basis.Q, basis.T[k:, k:]
+    p = RowBasis.of(T.T[::-1]).least_norm(y[k:][::-1])  # T^T p = y
+    size = before.size + jnp.abs(b[k:]) + jnp.abs(T) @ jnp.abs(y[k:])
+    is_consistent = jnp.all(jnp.abs(missing[k:]) <= tolerance * size)
     is_consistent &= jnp.all((before.restitution >= 0) & (before.restitution <= 1))
-    is_determined = jnp.ones((), bool)
-    if coordinates.undetermined is not None:
-        is_determined = jnp.all(coordinates.undetermined <= tolerance * jnp.sum(jnp.abs(C), axis=1))
     is_affine = jnp.abs(before.deviation) <= tolerance * before.size
-    values = before.u + (X @ w)[:n], p, coordinates.energy_lost(w)
+    # T(u+) - T(u-) = (change . M change) / 2 + h . change
+    values = before.u + (X @ w)[:n], p, -(0.5 * w @ w + h @ (X @ w))
     u, p, energy_lost = (jnp.where(is_consistent & is_determined & jnp.all(is_affine), x, jnp.nan) for x in values)
-    return ImpactSolution(ImpactResult(u, p, energy_lost, jnp.all(is_new)), C, is_affine, is_consistent, is_determined)
+    result = ImpactResult(u, p, energy_lost, jnp.all(basis.is_new[k:]))
+    return ImpactSolution(result, C, is_affine, is_consistent, is_determined)
 
 
 def _rows(A: Array) -> list[list[Component]]:
@@ -542,7 +488,8 @@ def _inverse_root(M: Rows, sizes: Sequence[Component] | None) -> tuple[Rows, Row
 class RowBasis(NamedTuple):
     """A = T Q with orthonormal rows of Q, for A (m, n).
 
-    A row that is zero or depends linearly on the previous ones is omitted: its row of Q (m, n) and its column of T
+    As `constraints.least_change`, but with products of scalars only. A row that is zero or depends linearly on the
+    previous ones is omitted: its row of Q (m, n) and its column of T
     (m, m) are zero. `is_new` (m,): whether each row is used.
     """
 
@@ -576,23 +523,12 @@ class RowBasis(NamedTuple):
             missing.append(jnp.where(is_used, 0.0, remainder))
         return y, jnp.stack(missing)
 
-
-def least_norm(A: Array, b: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """The smallest solution w (n,) of A w = b, for A (m, n) and b (m,).
-
-    As `constraints.least_change`, but with products of scalars only.
-
-    **Returns:** w (n,), y (m,), T (m, m), whether each row is used (m,), and the part of b (m,) that the omitted rows
-    do not satisfy: see `RowBasis`.
-    """
-    basis = RowBasis.of(A)
-    y, missing = basis.solve(b)
-    return y @ basis.Q, y, basis.T, basis.is_new, missing
+    def least_norm(self, b: Array) -> Array:
+        """The smallest solution w (n,) of A w = b, without the omitted rows."""
+        return self.solve(b)[0] @ self.Q
 
 
 class _OfFunction(eqx.Module):
-    """An impact from a function of the motion."""
-
     function: Callable[..., Any]
     restitution: Any
     release: tuple[str, ...] = eqx.field(static=True)
@@ -642,11 +578,8 @@ def impact(
     **Raises:** `ValueError` if the residuals contradict each other, if a residual does not depend on the speeds or is
     not affine in them, and if the mass matrix is singular.
     """
-    if not callable(residuals):
-        raise TypeError(
-            f"impact(system, t, q, u, residuals): pass a function (t, q, u, motion) -> velocity residuals, got "
-            f"{residuals!r}."
-        )
+    what = "impact(system, t, q, u, residuals): pass a function (t, q, u, motion) -> velocity residuals"
+    checked(residuals, Callable, what)
     arrays = checked_arrays(system, t, q, u)
     coefficients = jax.tree.map(lambda e: jnp.asarray(e, arrays[2].dtype), checked_restitution(restitution))
     if jax.tree_util.all_leaves([residuals]):  # a method of a Module is a tree, and its arrays are arguments
@@ -664,7 +597,6 @@ def impact(
 
 
 def _explain(solution: ImpactSolution, arrays: Any) -> None:
-    """Raise an exception if the result is not finite."""
     if np.isfinite(solution.result.energy_lost):
         return
     name, C, is_affine = type(arrays[0]).__name__, np.asarray(solution.C), np.asarray(solution.is_affine)
@@ -676,16 +608,16 @@ def _explain(solution: ImpactSolution, arrays: Any) -> None:
                 f"{name}: the velocity residual {i} of the impact is not zero and does not depend on the speeds, so no "
                 "impulse can change it. Pass a velocity, such as motion['P'].velocity.dot(motion.N.y)."
             )
-    if not solution.is_determined:
-        raise ValueError(
-            f"{name}: a released part can move without moving a mass, and a residual of the impact depends on this "
-            "motion, so the speeds after the impact are undetermined. Give the bodies an inertia, or do not release "
-            "the part."
-        )
+    refuse_if(
+        not solution.is_determined,
+        f"{name}: a released part can move without moving a mass, and a residual of the impact depends on this "
+        "motion, so the speeds after the impact are undetermined. Give the bodies an inertia, or do not release "
+        "the part.",
+    )
     finite_or_explained(solution.result, arrays)
-    if not solution.is_consistent:
-        raise ValueError(
-            f"{name}: the velocity residuals of the impact contradict each other. There are {len(C)} residuals, and no "
-            "speeds after the impact satisfy all of them. Omit the dependent residuals, or give them the same "
-            "coefficient of restitution."
-        )
+    refuse_if(
+        not solution.is_consistent,
+        f"{name}: the velocity residuals of the impact contradict each other. There are {len(C)} residuals, and no "
+        "speeds after the impact satisfy all of them. Omit the dependent residuals, or give them the same "
+        "coefficient of restitution.",
+    )

@@ -119,6 +119,11 @@ class KaneEquations(DescriptionEvaluator):
         """The derivative of `f(u)` along a direction of the speeds. f is affine, so u = 0 is used."""
         return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (self._zero(),), (jnp.ones_like(self._zero()),))[1]
 
+    def jacobian(self, f: Callable[[Row], Any]) -> Array:
+        """The derivatives (m, n) of the affine `f(u)` (m,) by the independent speeds."""
+        columns = [self.along_speeds(f, self.with_dependent(unit(self.n, r))) for r in range(self.n)]
+        return stack(columns).astype(self.dtype).T
+
     # -- Constraints: J, J_dot and the bias of the dependent accelerations.
 
     def _constraint_rows(self) -> tuple[Rows, Rows, Row]:
@@ -143,11 +148,8 @@ class KaneEquations(DescriptionEvaluator):
         The textbook prints a minus before C_dep_dot (Example 7).
         """
         at_rest = (0.0,) * self.n
-
-        def columns(t: Component, *q: Component) -> list[Row]:
-            return KaneEquations(self.system, t, q, at_rest).J
-
-        return jvp(columns, (self.t, *self.q), (1.0, *self.q_dot))[1]
+        along = (1.0, *self.q_dot)
+        return jvp(lambda t, *q: KaneEquations(self.system, t, q, at_rest).J, (self.t, *self.q), along)[1]
 
     def bias(self) -> Row:
         """The dependent accelerations (k,) at u_dot = 0.
@@ -162,7 +164,6 @@ class KaneEquations(DescriptionEvaluator):
         return _negative(solve(self.C_dep, c_dot)[0])
 
     def dependent_accelerations(self, u_dot: Row) -> Row:
-        """u_dep_dot = J u_dot + bias."""
         if not self.k:
             return ()
         return tuple(add(dot(row, u_dot), b) for row, b in zip(zip(*self.J, strict=True), self.bias(), strict=True))
@@ -176,10 +177,8 @@ class KaneEquations(DescriptionEvaluator):
         the dependent speeds are `bias`.
         """
 
-        def momenta(t: Component, *q: Component) -> list[tuple[Row, Row]]:
-            return self.read("momenta", t, q, self.u_all)
-
-        values, rates = jvp(momenta, (self.t, *self.q), (1.0, *self.q_dot))
+        at, along = (self.t, *self.q), (1.0, *self.q_dot)
+        values, rates = jvp(lambda t, *q: self.read("momenta", t, q, self.u_all), at, along)
         if u_dot is None and self.k:
             u_dot = (*(0.0,) * self.n, *self.bias())
         if u_dot is not None:
@@ -197,7 +196,7 @@ class KaneEquations(DescriptionEvaluator):
     def partial_velocities(self) -> list[tuple[list, list]]:
         """For each independent speed, the partial velocities (V, W) of the bodies and those of the loads."""
         # V_ir = dv_i/du_r,  W_ir = domega_i/du_r, along the columns of [1; J]
-        return [self.along_speeds(self.velocities, (*unit(self.n, r), *self.J[r])) for r in range(self.n)]
+        return [self.along_speeds(self.velocities, self.with_dependent(unit(self.n, r))) for r in range(self.n)]
 
     def active_forces(self, partials: list) -> Row:
         # F_r = sum F . V_r + T . W_r
@@ -229,25 +228,16 @@ class KaneEquations(DescriptionEvaluator):
         return M
 
     def equations_by_partial_velocities(self) -> tuple[list[list[Component]], Row]:
-        """M and f of M u_dot = f."""
         partials = self.partial_velocities()
         # f = F_r + F*_r
         f = tuple(map(add, self.active_forces(partials), self.inertia_forces(partials)))
         return self.mass_matrix(partials), f
-
-    def accelerations_by_partial_velocities(self) -> Row:
-        return solve_positive(*self.equations_by_partial_velocities())
 
     # -- Formulation by transposition: all vectors are projected onto all speeds at once. For many speeds.
 
     def projected_onto_speeds(self, f: Callable[[Row], Any], cotangents: Any) -> Row:
         """The derivatives of `f(u)` with respect to the independent speeds, times `cotangents` (n,). Costs a few f."""
         return transposed(lambda *u: f(self.with_dependent(u)), (self._zero(),) * self.n, cotangents)
-
-    def mass_matrix_times(self, direction: Row) -> Row:
-        """M times a direction (n,) of the independent speeds: its momenta, projected onto all speeds. Order b."""
-        along = self.along_speeds(self.momenta, self.with_dependent(direction))
-        return self.projected_onto_speeds(lambda u: self.velocities(u)[0], along)
 
     def forcing_by_transposition(self, u_dot: Row | None = None) -> Row:
         """f (n,) of M u_dot = f. With `u_dot`, f - M u_dot."""
@@ -268,14 +258,13 @@ def motion_rates(
         return _motion_rates(system, t, q, u, inputs)
     q_dot, f = rates_and_forcing(system, t, q, u, inputs)
 
-    def times(u_dot: Array) -> Array:
-        return _mass_times(system, t, q, u, inputs, u_dot)
-
-    def solve(_: Any, f: Array) -> Array:
-        return _accelerations_under(system, t, q, u, inputs, f)
-
     # Its derivative is that of M u_dot = f (implicit function theorem). The elimination itself is never differentiated.
-    return q_dot, jax.lax.custom_linear_solve(times, f, solve, symmetric=True)
+    return q_dot, jax.lax.custom_linear_solve(
+        lambda u_dot: _mass_times(system, t, q, u, inputs, u_dot),
+        f,
+        lambda _, f: _accelerations_under(system, t, q, u, inputs, f),
+        symmetric=True,
+    )
 
 
 def motion_rates_by_matrix(
@@ -301,9 +290,7 @@ def rates_and_equations(
 def mass_matrix_columns(system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]) -> Float[Array, "n n"]:
     """M (n, n), by one batched program for all columns."""
 
-    def column(direction: Numbers) -> Array:
-        return _mass_times(system, t, q, u, inputs, direction)
-
+    column = functools.partial(_mass_times, system, t, q, u, inputs)
     return jax.vmap(column)(np.eye(len(system.speeds), dtype=q.dtype))
 
 
@@ -326,7 +313,7 @@ def _equations_at(system, t, q, u, inputs, u_dot, r):
 @functools.partial(LinearSolution, equations=_equations_at)
 def _motion_rates(system, t, q, u, inputs):
     kane = KaneEquations(system, t, q, u, inputs)
-    return as_vector(kane.q_dot, q), as_vector(kane.accelerations_by_partial_velocities(), q)
+    return as_vector(kane.q_dot, q), as_vector(solve_positive(*kane.equations_by_partial_velocities()), q)
 
 
 @ScalarFunction
@@ -350,8 +337,11 @@ def rates_and_forcing(system, t, q, u, inputs):
 
 @ScalarFunction
 def _mass_times(system, t, q, u, inputs, direction):
+    # M times a direction of the independent speeds: its momenta, projected onto all speeds. Order b.
     kane = KaneEquations(system, t, q, u, inputs)
-    return as_vector(kane.mass_matrix_times(as_row(direction, system.speeds, "direction")), q)
+    direction = kane.with_dependent(as_row(direction, system.speeds, "direction"))
+    along = kane.along_speeds(kane.momenta, direction)
+    return as_vector(kane.projected_onto_speeds(lambda u: kane.velocities(u)[0], along), q)
 
 
 def _accelerations_by_lapack(system, t, q, u, inputs, f):

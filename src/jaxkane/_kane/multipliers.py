@@ -12,42 +12,27 @@ A residual that depends linearly on the others is omitted where it does, so over
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
+from .._common.lookup import refuse_if
 from .._system.motion import Motion
-from .._system.system import System, call_with_states, has_outputs
+from .._system.system import System, call_with_states
 from .arguments import Row, check_is_system
-from .contact import has_contacts, has_multipliers
+from .contact import has_multipliers
 from .description import DescriptionEvaluator, jvp
 
 
 class _WithMultipliers(System):
-    """A system with multipliers for all velocity residuals."""
-
     inner: System
 
     @property
     def speeds(self) -> tuple[str, ...]:  # type: ignore[override]
         return (*self.inner.speeds, *self.inner.dependent_speeds)
 
-    def q_dot(self, t, q, u):
-        return self.inner.q_dot(t, q, u)
-
     def motion(self, t, q, u):
         motion = self.inner.motion(t, q, u)
         return Motion(motion.bodies, points=motion.points, frames=motion.frames)
-
-    def loads(self, t, q, u, motion, inputs):
-        return self.inner.loads(t, q, u, motion, inputs)
-
-    def state_rates(self, t, q, u, x, motion, now):
-        return self.inner.state_rates(t, q, u, x, motion, now)
-
-    def configuration_constraints(self, t, q):
-        return self.inner.configuration_constraints(t, q)
-
-    def implied_constraints(self, t, q):
-        return self.inner.implied_constraints(t, q)
 
     def events(self, t, q, u, x=()):
         return call_with_states(self.inner.events, t, q, u, x)
@@ -61,18 +46,14 @@ class _WithMultipliers(System):
         return (*c, *jvp(lambda t, *q: evaluator.configuration(t, q), (t, *q), (1.0, *rates))[1])
 
 
+def _of_inner(name: str) -> Callable[..., Any]:
+    return lambda self, *args: getattr(self.inner, name)(*args)
+
+
+for _name in ("q_dot", "loads", "state_rates", "configuration_constraints", "implied_constraints"):
+    setattr(_WithMultipliers, _name, _of_inner(_name))
 for _name in ("coordinates", "dependent_coordinates", "inputs", "states", "units", "check_inertia"):
     setattr(_WithMultipliers, _name, property(lambda self, name=_name: getattr(self.inner, name)))
-
-
-class _Outputs(System):
-    def outputs(self, t, q, u, motion, now):
-        return self.inner.outputs(t, q, u, motion, now)  # type: ignore[attr-defined]
-
-
-class _Contacts(System):
-    def contacts(self, t, q, u, motion):
-        return self.inner.contacts(t, q, u, motion)  # type: ignore[attr-defined]
 
 
 def with_multipliers(system: System) -> System:
@@ -98,15 +79,15 @@ def with_multipliers(system: System) -> System:
     name = type(system).__name__
     if has_multipliers(system):
         return system
-    if system.auxiliary_speeds:
-        raise ValueError(f"with_multipliers({name}): auxiliary speeds are not supported. Remove them.")
+    refuse_if(system.auxiliary_speeds, f"with_multipliers({name}): auxiliary speeds are not supported. Remove them.")
     kind: Any = type(system)
-    return _class_of(kind, has_outputs(system), has_contacts(system))(system)
+    return _class_of(kind)(system)
 
 
 @functools.lru_cache(maxsize=1000)
-def _class_of(inner: Any, outputs: bool, contacts: bool) -> Any:
+def _class_of(inner: type[System]) -> Any:
     """A subclass with the name of the inner class, which messages show."""
-    bases = [*([_Outputs] if outputs else []), *([_Contacts] if contacts else []), _WithMultipliers]
+    own = [name for name in ("outputs", "contacts") if getattr(inner, name) is not getattr(System, name)]
     kind: Any = type(_WithMultipliers)
-    return kind(inner.__name__, tuple(bases), {"__doc__": inner.__doc__})
+    members = {"__doc__": inner.__doc__, **{name: _of_inner(name) for name in own}}
+    return kind(inner.__name__, (_WithMultipliers,), members)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._common.lookup import as_names, refuse_unknown
+from .._common.lookup import as_names, refuse_any, refuse_unknown
 from .._scalarjit.cache import Cache
 from .._scalarjit.compat import concretely, depends_on
 from .._scalarjit.components import ZERO3, Component, Numbers, add, add3, as_vector, is_zero, mul, stack
 from .._scalarjit.scalar_function import ScalarFunction
-from .._system.kinematics import Frame, Point, Vector
+from .._system.kinematics import Point, Vector
 from .._system.motion import UNNAMED, Body, Force, Motion, parallel_axis
 from .._system.system import System
 from .arguments import Row
@@ -34,8 +34,6 @@ Bodies = str | Sequence[str] | Mapping[str, str | Sequence[str]] | None
 
 
 class BodyParameters(NamedTuple):
-    """A body whose parameters are columns of a regressor."""
-
     place: int  # index of the body in the bodies of the motion
     name: str
     about: str  # name of the point that the first moment and the inertia are about
@@ -60,7 +58,6 @@ class BodyParameters(NamedTuple):
         return tuple(f"{self.name}.{'Iacross' if i == self._across else TEN[i]}" for i in self.indices)
 
     def only(self, names: Sequence[str] | str) -> BodyParameters:
-        """The body with only these of its parameters."""
         names = as_names(names, "names")
         known = [name.rpartition(".")[2] for name in self.names]
         refuse_unknown(names, known, f"`bodies`: {self.name} has no parameter", "it has")
@@ -106,20 +103,16 @@ def regressor_model(system: System, bodies: Bodies) -> RegressorModel:
         known = [body.name for body in chosen]
         refuse_unknown(names, known, f"{type(system).__name__} has no body with a mass named", "it has")
         twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ValueError(f"`bodies` contains {', '.join(twice)} twice. Name each body once.")
+        refuse_any(twice, "`bodies` contains", " twice. Name each body once.")
         chosen = tuple(
             body if parameters.get(body.name) is None else body.only(parameters[body.name])
             for body in chosen
             if body.name in names
         )
     skew = [body.name for body in chosen if body.axis == SKEW]
-    if skew:
-        raise ValueError(
-            f"{type(system).__name__}: the body {skew[0]!r} rotates in its frame, but not about an axis of this frame. "
-            "Its moments of inertia there cannot be varied. Pass a frame that rotates with the body, or name only the "
-            "other bodies in `bodies`."
-        )
+    after = " rotates in its frame about an axis that is not one of the frame. "
+    after += "Pass a frame that rotates with the body, or name only the other bodies in `bodies`."
+    refuse_any(skew, f"{type(system).__name__}: the body", after)
     return RegressorModel(system, chosen, leaves)
 
 
@@ -145,7 +138,12 @@ def _bodies_of(system: System) -> tuple[tuple[BodyParameters, ...], tuple[int, .
     axes: list[int | None] = [None] * len(bodies)
     spinning = [b.angular_velocity is not b.frame.angular_velocity and not b.is_particle for _, b in bodies]
     if any(spinning):
-        spins = _at_random_speeds(lambda *args: masses_and_spins(*args)[1], system, n_u)
+        rng = np.random.default_rng(0)
+        point, t, q = at_random_point((system, 0.3, None), rng)
+        u = rng.uniform(0.5, 1.5, n_u).astype(q.dtype)
+        with concretely():
+            at = jax.tree.leaves(point), jnp.asarray(t, q.dtype), list(q), list(u)
+            spins = jax.device_get(jax.jit(lambda *args: masses_and_spins(*args)[1])(*at))
         axes = [_axis(spin) if spins_in_frame else None for spins_in_frame, spin in zip(spinning, spins, strict=True)]
     reads = np.array([depends_on(program, [i]) for i in range(len(leaves))], bool).reshape(len(leaves), -1)
     named = {point: name for name, point in motion.points.items()}
@@ -162,14 +160,6 @@ def _bodies_of(system: System) -> tuple[tuple[BodyParameters, ...], tuple[int, .
         about = "its mass centre" if origin is body.center else named.get(origin, origin.name)
         parameters.append(BodyParameters(i, name, about, indices, axis, not depends_on_leaves))
     return tuple(parameters), tuple(int(i) for i in np.flatnonzero(reads.any(axis=1)))
-
-
-def _at_random_speeds(f: Callable[..., Any], system: System, n_u: int) -> Any:
-    rng = np.random.default_rng(0)
-    system, t, q = at_random_point((system, 0.3, None), rng)
-    u = rng.uniform(0.5, 1.5, n_u).astype(q.dtype)
-    with concretely():
-        return jax.device_get(jax.jit(f)(jax.tree.leaves(system), jnp.asarray(t, q.dtype), list(q), list(u)))
 
 
 SKEW = -1  # the body rotates in its frame about an axis that is not one of the frame's axes
@@ -255,25 +245,18 @@ class _OriginKinematics(KaneEquations):
             for body, each in zip(bodies, parameters, strict=True):
                 body.mass = add(body.mass, added_mass) if each.has_constant_mass else body.mass
             loads = evaluator.loads_at(self.t, self.q, u, motion)
-            return [(body.mass, _at_center(body, loads)) for body in bodies]
+            at_center = [
+                [x.vector.components_in(body.frame) for x in loads if isinstance(x, Force) and x.point is body.center]
+                for body in bodies
+            ]
+            return [
+                (body.mass, functools.reduce(add3, each, ZERO3)) for body, each in zip(bodies, at_center, strict=True)
+            ]
 
         primals = [*[leaves[i] for i in places], self._zero()]
         # Use a different tangent for each parameter, so that no sum or difference of them remains constant.
         tangents = [jnp.full_like(x, 1.0 + 0.1 * i) for i, x in enumerate(primals)]
         return jvp(masses_and_weights, primals, tangents)[1]
-
-
-def _at_center(body: Body, loads: Sequence[Any]) -> Row:
-    force: Row = ZERO3
-    for load in loads:
-        if isinstance(load, Force) and load.point is body.center:
-            force = add3(force, load.vector.components_in(body.frame))
-    return force
-
-
-def _components_in(frame: Frame, own: Frame, x: Row) -> Row:
-    """The components in `frame` of a vector that is given by components in its `own` frame."""
-    return own.vector(*x).components_in(frame)
 
 
 @ScalarFunction
@@ -288,10 +271,11 @@ def regressor_kinematics(model: RegressorModel, t, q, u, inputs, u_dot) -> Regre
     V, W, a, alpha, g = [], [], [], [], []
     for i, (each, (dm, dF)) in enumerate(zip(model.bodies, kane.weights(), strict=True)):
         body = motion.bodies[each.place]
-        into = functools.partial(_components_in, body.frame, origin_of(body)[0].velocity.frame)
-        V.append([into(bodies[i][0]) for bodies, _ in partials])
+        own = origin_of(body)[0].velocity.frame
+        *v, a_i = (own.vector(*x).components_in(body.frame) for x in (*(b[i][0] for b, _ in partials), rates[i][0]))
+        V.append(v)
         W.append([bodies[i][1] for bodies, _ in partials])
-        a.append(into(rates[i][0]))
+        a.append(a_i)
         alpha.append(rates[i][1])
         dm = jnp.asarray(dm)
         reciprocal = jnp.where(dm == 0.0, 0.0, 1.0 / jnp.where(dm == 0.0, 1.0, dm))
@@ -338,10 +322,8 @@ def parameter_values(model: RegressorModel, t, q, u) -> Float[Array, " p"]:
 
 
 def _ten(body: Body) -> Row:
-    """The ten parameters of a body, about its origin."""
-    m, r = body.mass, ZERO3
-    for step in origin_of(body)[1]:
-        r = add3(r, step.components_in(body.frame))
+    m, steps = body.mass, [step.components_in(body.frame) for step in origin_of(body)[1]]
+    r = functools.reduce(add3, steps, ZERO3)
     I = parallel_axis(body.inertia, mul(-1.0, m), r)
     return (m, *(mul(m, x) for x in r), I[0][0], I[1][1], I[2][2], I[0][1], I[0][2], I[1][2])
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._common.lookup import not_there, refuse_unknown
+from .._common.lookup import checked, not_there, refuse_any, refuse_unknown
 from .._scalarjit.components import Component, Numbers, add3, as_vector, component, cross, is_exact, is_written_out
 from .._scalarjit.scalar_function import ScalarFunction, tree_of
 from .._system.kinematics import Frame, Point, Vector
@@ -52,14 +52,12 @@ class MeasurementContext(Inputs):
 
     def acceleration(self, point: Point) -> Vector:
         """Acceleration [m/s^2] of a Point in the inertial frame, as a Vector."""
-        if not isinstance(point, Point):
-            raise TypeError(f"now.acceleration(point) needs a Point, got {point!r}. For a body, pass its `center`.")
+        checked(point, Point, "now.acceleration(point) needs a Point", " For a body, pass its `center`.")
         return self._rate(point.velocity)
 
     def angular_acceleration(self, frame: Frame) -> Vector:
         """Angular acceleration [rad/s^2] of a Frame in the inertial frame, as a Vector."""
-        if not isinstance(frame, Frame):
-            raise TypeError(f"now.angular_acceleration(frame) needs a Frame, got {frame!r}.")
+        checked(frame, Frame, "now.angular_acceleration(frame) needs a Frame")
         return self._rate(frame.angular_velocity)
 
     def force(self, name: str) -> Any:
@@ -125,11 +123,11 @@ def evaluate_with_accelerations(kane: KaneEquations, u_dot: Row, method: Method)
     if not vectors:
         return result
     n_q = len(q)
-
-    def components_of_vectors(t: Component, *z: Component) -> list[Row]:
-        return [vector.components for vector in evaluate(t, z[:n_q], z[n_q:])[1]]
-
-    values, rates = jvp(components_of_vectors, (kane.t, *q, *u), (1.0, *kane.q_dot, *u_dot_all))
+    values, rates = jvp(
+        lambda t, *z: [vector.components for vector in evaluate(t, z[:n_q], z[n_q:])[1]],
+        (kane.t, *q, *u),
+        (1.0, *kane.q_dot, *u_dot_all),
+    )
     omegas = [vector.frame.angular_velocity.components for vector in vectors]
     # dv/dt in N = derivative of the components + omega x v
     rates_in_N = [add3(rate, cross(w, v)) for rate, w, v in zip(rates, omegas, values, strict=True)]
@@ -145,30 +143,22 @@ def _outputs(system: System, t: Component, q: Row, u: Row, motion: Motion, now: 
     outputs = _flat(label, system.outputs(t, q, u, motion, now))
     reserved = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
     twice = [name for name in outputs if name in reserved]
-    if twice:
-        raise ValueError(
-            f"{label}: {', '.join(twice)} is already the name of a coordinate, a speed, an input or a state. "
-            f"Trajectories are read by name, so choose another one, e.g. {'measured_' + twice[0]!r}."
-        )
+    after = " is already the name of a coordinate, a speed, an input or a state. Choose another one, e.g. measured_..."
+    refuse_any(twice, f"{label}:", after)
     return outputs
 
 
 def _flat(label: str, outputs: Any) -> dict[str, Component]:
-    if not isinstance(outputs, Mapping):
-        hint = " Does it end without a `return`?" if outputs is None else ""
-        raise TypeError(f"{label} must return a dict of numbers by name, got {outputs!r}.{hint}")
+    hint = " Does it end without a `return`?" if outputs is None else ""
     flat: dict[str, Component] = {}
-    for name, value in outputs.items():
-        if not isinstance(name, str) or not name:
-            raise TypeError(f"{label}: the name of an output must be a string, got {name!r}.")
+    for name, value in checked(outputs, Mapping, f"{label} must return a dict of numbers by name", hint).items():
+        checked(name or None, str, f"{label}: the name of an output must be a string")
         if isinstance(value, Mapping):
             items = {f"{name}.{key}": x for key, x in _flat(label, value).items()}
         else:
             items = {name: _number(label, name, value)}
-        for key, x in items.items():
-            if key in flat:
-                raise ValueError(f"{label}: two outputs have the name {key!r}. Rename one.")
-            flat[key] = x
+        refuse_any([key for key in items if key in flat], f"{label}: two outputs have the name", ". Rename one.")
+        flat |= items
     return flat
 
 
@@ -328,28 +318,17 @@ def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dic
 def _vector_field(system, t, y, inputs):
     state = unpacked(system, y)
     values = values_of(system, state.x, inputs)
-    if state.contacts is not None or has_multipliers(system):
-        return _rates_in_contact(system, t, y, values)
-    q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
-    x_dot = None
-    if system.states:
-        kane = KaneEquations(system, t, state.q, state.u, values)
+    memory, x_dot, still = state.contacts, None, None
+    if memory is not None or has_multipliers(system):
+        kane, _, forces, _ = forces_in_contact(system, layout_of(system), t, state.q, state.u, memory, values)
+        q_dot, u_dot = as_vector(kane.q_dot, y), forces.u_dot
+        still = None if memory is None else jnp.zeros_like(memory)  # contact states change at jumps only
+    else:
+        q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
+        kane = KaneEquations(system, t, state.q, state.u, values) if system.states else None
+    if kane is not None and system.states:
         x_dot = as_vector(evaluate_with_accelerations(kane, as_row(u_dot, system.speeds, "u_dot"), _state_rates), y)
-    return packed(State(q_dot, u_dot, x_dot))
-
-
-def _rates_in_contact(system: System, t: Component, y: Array, values: dict[str, Any]) -> Array:
-    """The packed rates of a state with contact states, whose rates are zero."""
-    state, layout = unpacked(system, y), layout_of(system)
-    memory = state.contacts
-    kane, _, forces, _ = forces_in_contact(system, layout, t, state.q, state.u, memory, values)
-    x_dot = None
-    if system.states:
-        u_dot = as_row(forces.u_dot, system.speeds, "u_dot")
-        x_dot = as_vector(evaluate_with_accelerations(kane, u_dot, _state_rates), y)
-    return packed(
-        State(as_vector(kane.q_dot, y), forces.u_dot, x_dot, None if memory is None else jnp.zeros_like(memory))
-    )
+    return packed(State(q_dot, u_dot, x_dot, still))
 
 
 @ScalarFunction

@@ -140,6 +140,28 @@ def equilibrated(A: Numbers) -> tuple[Any, Any, Any]:
     return A / rows[:, None] / columns[None], rows, columns
 
 
+def nearest_root(
+    f: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], q: np.ndarray, scales: Any = 1.0
+) -> np.ndarray:
+    """The nearest q (n,) with f = 0, by the Gauss-Newton method with NumPy; NaN if it does not converge.
+
+    **Arguments:**
+
+    - `f`: q -> values (m,) and their derivatives by q / scales (m, n). Both are divided by the sizes of the rows.
+    - `q`: initial guess.
+    - `scales`: of q.
+    """
+    for _ in range(20):
+        values, slopes = f(q)
+        if not np.all(np.isfinite(slopes)) or not np.all(np.isfinite(values)):
+            break
+        step = np.linalg.pinv(slopes, rcond=1e-6) @ values
+        q = (q - scales * step).astype(q.dtype)
+        if np.max(np.abs(step)) <= np.finfo(q.dtype).eps ** 0.5 * np.max(np.abs(q / scales)):
+            return q
+    return np.full_like(q, np.nan)
+
+
 def without_rounding(A: Numbers, sizes: Numbers) -> Numbers:
     """A matrix in which entries are zero if their terms, of these sizes (m, n), cancel within rounding."""
     xp: Any = np if isinstance(A, np.ndarray) else jnp

@@ -28,8 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._system.system import System
-from .impact import ImpulseCoordinates, ReadImpactOf, impulse_equations
+from .._common.lookup import refuse_if
 
 MOST_CONTACTS = 4
 """More contacts have too many combinations of states: four contacts in a plane have 256."""
@@ -85,10 +84,10 @@ def contact_impact(
     **Raises:** `ValueError` for more than four contacts.
     """
     c, d = v.shape[0], v.shape[1] - 1
-    if c > MOST_CONTACTS:
-        raise ValueError(
-            f"An impact has at most {MOST_CONTACTS} contacts, got {c}. Use MuJoCo for systems with many contacts."
-        )
+    refuse_if(
+        c > MOST_CONTACTS,
+        f"An impact has at most {MOST_CONTACTS} contacts, got {c}. Use MuJoCo for systems with many contacts.",
+    )
     rows = tuple(d if each else 0 for each in has_friction or (True,) * c)
     states, signs = _combinations(rows)
     each = _Combination(jnp.asarray(states), jnp.asarray(signs, G.dtype))
@@ -111,38 +110,6 @@ def contact_impact(
     is_only = ~jnp.any(is_admissible & jnp.any(differs, axis=(1, 2)))
     impulses, velocities = (jnp.where(is_admissible[k], x, jnp.nan) for x in (solution.impulses, solution.velocities))
     return ContactImpact(impulses, velocities, chosen.states, is_admissible[k], first.is_regular & is_only)
-
-
-def contact_impact_at(
-    system: System,
-    t: Array,
-    q: Array,
-    u: Array,
-    inputs: dict[str, Array],
-    read: ReadImpactOf,
-    friction: Float[Array, " c"],
-    closed: Bool[Array, " c"],
-    has_friction: Sequence[bool] | None = None,
-) -> tuple[Float[Array, " n"], Float[Array, ""], ContactImpact]:
-    """The speeds after an impact of unilateral contacts. All other arguments are those of `contact_impact`.
-
-    **Arguments:**
-
-    - `system`, `t`, `q`, `u`, `inputs`: checked arrays.
-    - `read`: (system, t, q, u_all) -> an `Impact`. Its residuals are the velocities of all rows, contact by contact.
-        The restitution of a contact is that of its normal row.
-
-    **Returns:** the speeds (n,), the lost kinetic energy [J] and the impulses. All are NaN if no combination of contact
-    states is admissible.
-    """
-    M, C, before = impulse_equations(system, t, q, u, inputs, read)
-    coordinates = ImpulseCoordinates.of(M, C, before)
-    A = coordinates.C @ coordinates.X
-    shape = (len(friction), len(A) // len(friction))
-    G, v, e = (A @ A.T).reshape(shape * 2), before.residuals.reshape(shape), before.restitution.reshape(shape)[:, 0]
-    result = contact_impact(G, v, e, friction, closed, has_friction)
-    w = A.T @ result.impulses.reshape(-1)
-    return u + (coordinates.X @ w)[: len(u)], coordinates.energy_lost(w), result
 
 
 class Slip(NamedTuple):
@@ -209,8 +176,6 @@ class _Solution(NamedTuple):
 
 
 class _Problem(eqx.Module):
-    """The arguments of `contact_impact`."""
-
     G: Array
     v: Array
     restitution: Array
@@ -223,7 +188,6 @@ class _Problem(eqx.Module):
         return self.v.shape[1] == 3
 
     def solved(self, combination: _Combination) -> _Solution:
-        """The solution for one combination."""
         angles = jnp.zeros_like(self.friction)
         if self.in_space:
             start = self._solution(combination, angles, friction=jnp.zeros_like(self.friction)).velocities
@@ -323,7 +287,6 @@ class _Problem(eqx.Module):
         return _Solution(L, v, size, angles, inverse, is_regular)
 
     def is_admissible(self, combination: _Combination, solution: _Solution, closed: Array) -> Array:
-        """Whether a solution satisfies all conditions."""
         eps = float(jnp.finfo(self.v.dtype).eps)
         L, v, d = solution.impulses, solution.velocities, self.v.shape[1] - 1
         rounding, inconsistent = 1e3 * eps * solution.size, eps**0.5 * solution.size

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .. import rotations
+from .._common.lookup import checked, refuse_if
 from .._scalarjit.components import (
     ZERO3,
     Component,
@@ -109,8 +110,7 @@ class Vector:
 
     def _resolve(self, frame: Frame) -> Triple:
         # Resolve frame by frame and cache each result. A vector that all links of a chain need costs one step per link.
-        if not isinstance(frame, Frame):
-            raise TypeError(f"The components of a Vector need a Frame, got {frame!r}.")
+        checked(frame, Frame, "The components of a Vector need a Frame")
         if self.frame.root is not frame.root:
             # All inertial frames are the same: `events` may call `inertial()` beside `motion`.
             if self.frame.parent is None:
@@ -169,7 +169,9 @@ class Vector:
     def dot(self, other: Vector) -> Component:
         """The scalar product."""
         check_vector(other, "dot")
-        frame = self.frame if self._is_denser_than(other) else other.frame
+        # Use the frame of the vector with more nonzero components.
+        n, n_other = (sum(not is_zero(a) for a in v.components) for v in (self, other))
+        frame = self.frame if n >= n_other else other.frame
         return dot(self.components_in(frame), other.components_in(frame))
 
     def cross(self, other: Vector) -> Vector:
@@ -199,14 +201,9 @@ class Vector:
             )
         return self if abs(length - 1.0) < 1e-15 else self / length
 
-    def _is_denser_than(self, other: Vector) -> bool:
-        n, n_other = (sum(not is_zero(a) for a in v.components) for v in (self, other))
-        return n >= n_other
 
-
-def check_vector(value: Any, verb: str) -> None:
-    if not isinstance(value, Vector):
-        raise TypeError(f"{verb} needs a Vector such as 3.0 * N.x, got {value!r}.")
+def check_vector(value: Any, verb: str) -> Vector:
+    return checked(value, Vector, f"{verb} needs a Vector such as 3.0 * N.x")
 
 
 def _meet(a: Vector, b: Vector) -> tuple[Frame, Triple, Triple]:
@@ -250,7 +247,6 @@ class Frame:
         return self._n_made
 
     def _auxiliary_speed(self) -> AuxiliarySpeed | None:
-        """The auxiliary speed of this frame, if it has one."""
         auxiliary = self.root._auxiliary if self.parent is not None else None
         return auxiliary if auxiliary is not None and auxiliary.number == self.number else None
 
@@ -345,10 +341,10 @@ class Frame:
         """
         axes = rotations.axes_of(sequence)
         angles = components(angles, len(axes), f"The sequence {sequence!r} takes {len(axes)} angles")
-        if (rates is None) == (angular_velocity is None):
-            raise ValueError(
-                "rotate_sequence: pass either the `rates` of the angles or the `angular_velocity`, not both."
-            )
+        refuse_if(
+            (rates is None) == (angular_velocity is None),
+            "rotate_sequence: pass either the `rates` of the angles or the `angular_velocity`, not both.",
+        )
         if rates is None:
             rotation = rotations.sequence_matrix(sequence, angles)
             return self._oriented(rotation, angular_velocity, name)  # type: ignore[arg-type]
@@ -402,8 +398,7 @@ class Frame:
         - `q`: the variables of the function.
         - `q_dot`: the rates of the variables.
         """
-        if not callable(orientation):
-            raise TypeError(f"rotate_by: the orientation must be a function (t, q) -> (3, 3), got {orientation!r}.")
+        checked(orientation, Callable, "rotate_by: the orientation must be a function (t, q) -> (3, 3)")
         R, R_dot = _value_and_rate(lambda t, q: jnp.asarray(orientation(t, q)), t, q, q_dot)  # (3,3) (3,3)
         if R.shape != (3, 3):
             raise ValueError(f"rotate_by: the orientation must be a (3, 3) matrix, got {R.shape}.")
@@ -426,7 +421,6 @@ class Frame:
 
 
 def _value_and_rate(function, t, q, q_dot):
-    """The value and the time derivative of `function(t, q)`."""
 
     def as_floats(tree: Any) -> PyTree:
         tree = jnp.asarray(tree) if hasattr(tree, "__jax_array__") else tree
@@ -536,10 +530,7 @@ class Point:
         - `q_dot`: the rates of the variables.
         - `frame`: the frame of the components, in which this point must be fixed. The default is the inertial frame.
         """
-        if not callable(position):
-            raise TypeError(
-                f"Point.located: the position must be a function (t, q) -> three components, got {position!r}."
-            )
+        checked(position, Callable, "Point.located: the position must be a function (t, q) -> three components")
         frame = frame or self.velocity.frame.root
         r, r_dot = _value_and_rate(lambda t, q: jnp.stack([jnp.asarray(x, float) for x in position(t, q)]), t, q, q_dot)
         return self.moving(frame.vector(*r), frame.vector(*r_dot), frame, name)
@@ -574,11 +565,11 @@ class Point:
 
 def _own_frame(r: Vector, verb: str) -> Frame:
     check_vector(r, f"Point.{verb}")
-    if r.mixed:
-        raise ValueError(
-            f"Point.{verb}: the vector is a sum of vectors of different frames, so its frame is ambiguous. Pass the "
-            f"frame: point.{verb}(r, ..., frame=B). Or use two steps, one for each frame."
-        )
+    refuse_if(
+        r.mixed,
+        f"Point.{verb}: the vector is a sum of vectors of different frames, so its frame is ambiguous. Pass the "
+        f"frame: point.{verb}(r, ..., frame=B). Or use two steps, one for each frame.",
+    )
     return r.frame
 
 

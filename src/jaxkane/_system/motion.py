@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Self
 import jax
 import numpy as np
 
-from .._common.lookup import not_there
+from .._common.lookup import checked, not_there, refuse_if
 from .._scalarjit.components import Component, Triple, add, component, dot, is_zero, mul, sub
 from .kinematics import Frame, Point, Vector
 from .prints import concrete_numbers, text_of, wrapped
@@ -59,17 +59,16 @@ class Body:
             (f"the inertia of {name!r} must be about a Point", about, Point | None),
             ("the name must be a string", name, str),
         ):
-            if not isinstance(value, kind):
-                raise TypeError(f"Body(mass, inertia, center, frame): {label}, got {value!r}.")
+            checked(value, kind, f"Body(mass, inertia, center, frame): {label}")
         self.mass = component(mass)
         self.inertia = _inertia(inertia, name)
         self.is_particle = frame is None and angular_velocity is None
         has_inertia = about is not None or not all(is_zero(x) for row in self.inertia for x in row)
-        if self.is_particle and has_inertia:
-            raise ValueError(
-                f"Body(mass, inertia, center): {name!r} has an inertia, but no frame. Pass its frame: "
-                "Body(mass, inertia, center, frame). For a particle, pass 0.0 as inertia."
-            )
+        refuse_if(
+            self.is_particle and has_inertia,
+            f"Body(mass, inertia, center): {name!r} has an inertia, but no frame. Pass its frame: "
+            "Body(mass, inertia, center, frame). For a particle, pass 0.0 as inertia.",
+        )
         self.center = center
         self.frame = center.velocity.frame.root if frame is None else frame
         self.angular_velocity = self.frame.angular_velocity if angular_velocity is None else angular_velocity
@@ -111,10 +110,7 @@ def point_of(part: Point | Body) -> Point:
 
     **Raises:** `TypeError` for other arguments.
     """
-    point = part.center if isinstance(part, Body) else part
-    if not isinstance(point, Point):
-        raise TypeError(f"Pass a Point or a Body, got {part!r}.")
-    return point
+    return checked(part.center if isinstance(part, Body) else part, Point, "Pass a Point or a Body")
 
 
 def _inertia(value: Any, name: str) -> tuple[Triple, Triple, Triple]:
@@ -153,10 +149,12 @@ class Force:
     __slots__ = ("point", "vector")
 
     def __init__(self, vector: Vector, point: Point | Body):
-        self.vector = _checked(vector, "Force")
-        if not isinstance(point, (Point, Body)):
-            raise TypeError(f"Force(vector, point): the second argument must be a Point or a Body, got {point!r}.")
-        self.point = point_of(point)
+        self.vector = checked(
+            vector, Vector, "Force(vector, ...): the first argument must be a Vector such as 3.0 * N.x"
+        )
+        self.point = point_of(
+            checked(point, (Point, Body), "Force(vector, point): the second argument must be a Point or a Body")
+        )
 
     def __repr__(self) -> str:
         return f"Force({self.vector} [N] at {self.point.name})"
@@ -184,10 +182,11 @@ class Torque:
     __slots__ = ("vector", "velocity")
 
     def __init__(self, vector: Vector, on: Frame | Body, reaction_on: Frame | Body | None = None):
-        self.vector = _checked(vector, "Torque")
+        self.vector = checked(
+            vector, Vector, "Torque(vector, ...): the first argument must be a Vector such as 3.0 * N.x"
+        )
         for part in (on, reaction_on):
-            if not isinstance(part, (Frame, Body, type(None))):
-                raise TypeError(f"Torque(vector, on): a torque must act on a Body or a Frame, got {part!r}.")
+            checked(part, Frame | Body | None, "Torque(vector, on): a torque must act on a Body or a Frame")
             if isinstance(part, Body) and part.is_particle:
                 raise ValueError(
                     f"Torque(vector, on): {part.name!r} is a particle, on which a torque has no effect. Apply it to "
@@ -199,12 +198,6 @@ class Torque:
 
     def __repr__(self) -> str:
         return f"Torque({self.vector} [N m])"
-
-
-def _checked(vector: Any, what: str) -> Vector:
-    if not isinstance(vector, Vector):
-        raise TypeError(f"{what}(vector, ...): the first argument must be a Vector such as 3.0 * N.x, got {vector!r}.")
-    return vector
 
 
 Load = Force | Torque
@@ -307,11 +300,9 @@ class Motion:
             if not isinstance(value, (kind, Iterable)) or isinstance(value, str):
                 raise TypeError(f"Motion(bodies, constraints): the {label} must be a list, got {value!r}.")
         for label, value in (("points", points), ("frames", frames)):
-            if not isinstance(value, (Mapping, type(None))):
-                raise TypeError(f"Motion: the {label} must be a dict by name, e.g. {{'P': P}}; got {value!r}.")
+            checked(value, Mapping | None, f"Motion: the {label} must be a dict by name, e.g. {{'P': P}}")
         self.bodies = _as_tuple(bodies, Body)
-        if not self.bodies:
-            raise ValueError("A Motion needs at least one Body.")
+        refuse_if(not self.bodies, "A Motion needs at least one Body.")
         self.residuals = _as_tuple(constraints, (Vector, float, int, jax.Array))  # may contain Vectors
         self.constraints = flatten_residuals(self.residuals, "Motion(bodies, constraints): the velocity residuals")
         self.points = dict(points or {})
@@ -360,10 +351,8 @@ class Motion:
         parts = [(Body, getattr(body, "name", None), body) for body in self.bodies]
         parts += [(Point, *item) for item in self.points.items()] + [(Frame, *item) for item in self.frames.items()]
         for kind, name, part in parts:
-            if not isinstance(part, kind):
-                raise TypeError(f"Motion: {part!r} is not a {kind.__name__}.")
-            if not isinstance(name, str):
-                raise TypeError(f"Motion: the name of {part!r} must be a string, got {name!r}.")
+            checked(part, kind, f"Motion: every {kind.__name__.lower()} must be a {kind.__name__}")
+            name = checked(name, str, f"Motion: the name of a {kind.__name__.lower()} must be a string")
             if name in named and not (name == UNNAMED and kind is Body):
                 kinds = " and ".join(f"a {type(each).__name__.lower()}" for each in (named[name], part))
                 raise DuplicateName(
@@ -398,8 +387,7 @@ def weight(motion: Motion, gravity: Vector) -> tuple[Force, ...]:
     - `motion`: a `Motion`.
     - `gravity`: the gravitational acceleration [m/s^2], a Vector such as `9.81 * N.z`.
     """
-    if not isinstance(motion, Motion):
-        raise TypeError(f"weight(motion, gravity): the first argument must be a Motion, got {motion!r}.")
+    checked(motion, Motion, "weight(motion, gravity): the first argument must be a Motion")
     return tuple(Force(body.mass * gravity, body.center) for body in motion.bodies)
 
 

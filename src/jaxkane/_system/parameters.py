@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import math
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._common.lookup import checked, refuse_if
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Numbers
 
@@ -41,10 +42,8 @@ def parameter(
         is a batch.
     - `unit`: the unit that tables and plots show. Values are not converted.
     """
-    if not isinstance(unit, str):
-        raise TypeError(f'parameter(unit="N m"): the unit must be a string, got {unit!r}.')
-    if not isinstance(shape, (tuple, type(None))):
-        raise TypeError(f"parameter(shape=(3,)): the shape must be a tuple of integers, got {shape!r}.")
+    checked(unit, str, 'parameter(unit="N m"): the unit must be a string')
+    checked(shape, tuple | None, "parameter(shape=(3,)): the shape must be a tuple of integers")
     if default is dataclasses.MISSING:
         return eqx.field(converter=to_float, metadata={"jaxkane": ParameterInfo(positive, shape or (), unit, within)})
     # Copy to NumPy: later changes of a list must not change the default, and importing must not initialize JAX.
@@ -71,11 +70,6 @@ def learned(default: Any = dataclasses.MISSING) -> Any:
     return eqx.field(converter=Learned, default_factory=lambda: default)
 
 
-def _in_default_precision(x: Any) -> Numbers:
-    x = to_float(x)
-    return x.astype(jnp.result_type(float)) if jnp.issubdtype(x.dtype, jnp.floating) else x
-
-
 class Learned(eqx.Module):
     """A callable pytree whose arrays are leaves and whose other fields are static."""
 
@@ -86,15 +80,14 @@ class Learned(eqx.Module):
         if isinstance(function, Learned):
             self.arrays, self.rest = function.arrays, function.rest
             return
-        if not callable(function):
-            raise TypeError(
-                f"jk.learned() needs a function with parameters, such as an equinox module; got {function!r}."
-            )
+        checked(function, Callable, "jk.learned() needs a function with parameters, such as an equinox module")
         arrays, rest = eqx.partition(function, eqx.is_array_like)
         leaves, structure = jax.tree.flatten(rest)
-        self.arrays = jax.tree.map(
-            _in_default_precision, arrays
-        )  # it may have been created in float32, before `jk.configure()`
+        # It may have been created in float32, before `jk.configure()`.
+        floats, others = eqx.partition(
+            jax.tree.map(to_float, arrays), lambda x: jnp.isrealobj(x) and eqx.is_inexact_array(x)
+        )
+        self.arrays = eqx.combine(jax.tree.map(lambda x: x.astype(jnp.result_type(float)), floats), others)
         self.rest = (tuple(leaves), structure)
 
     @property
@@ -192,12 +185,10 @@ def parameters_in(system: Any) -> list[tuple[str, Any, ParameterInfo]]:
 
 def in_batches(system: Any) -> list[str]:
     """Names of the parameters of a system, or of a part, that have more leading axes than declared."""
-    arrays = [(path, x) for path, x in jax.tree_util.tree_leaves_with_path(system) if np.ndim(x)]
-    declarations = [declared(system, path) for path, _ in arrays]
     return [
         leaf_name(path)
-        for (path, x), info in zip(arrays, declarations, strict=True)
-        if info is not ANY and np.ndim(x) > len(info.shape)
+        for path, x in jax.tree_util.tree_leaves_with_path(system)
+        if np.ndim(x) and (info := declared(system, path)) is not ANY and np.ndim(x) > len(info.shape)
     ]
 
 
@@ -227,8 +218,7 @@ def _replaced(part: Any, values: Mapping[tuple[Any, ...], Any]) -> Any:
 def to_float(value: Any) -> Numbers:
     # Keep values that are not numbers. `System.__check_init__` raises an exception with their name.
     if isinstance(value, np.ma.MaskedArray):
-        if np.ma.is_masked(value):
-            raise ValueError("Some values are masked. Fill or remove them.")
+        refuse_if(np.ma.is_masked(value), "Some values are masked. Fill or remove them.")
         value = np.asarray(value)
     if isinstance(value, (jax.Array, np.ndarray)) and jnp.issubdtype(value.dtype, jnp.inexact):
         return jnp.asarray(value)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._common.lookup import not_there, refuse_unknown
+from .._common.lookup import checked, not_there, refuse_any, refuse_if, refuse_unknown
 from .._scalarjit.cache_key import leaked_tracer
 from .._scalarjit.components import Component, Numbers
 from .motion import Motion, motion_number
@@ -43,18 +43,20 @@ class NamedVector(Sequence[Component]):
         return len(self._items)
 
     def __getitem__(self, key: Any) -> Any:
-        if isinstance(key, str):
-            return self._items[self._place(key)]
         if isinstance(key, slice):
             start, stop = (self._place(end) if isinstance(end, str) else end for end in (key.start, key.stop))
             places = slice(start, stop + 1 if isinstance(key.stop, str) else stop, key.step)  # type: ignore[operator]
             return NamedVector(self._items[places], self.names[places])
         if isinstance(key, (tuple, list)):
-            places = [self._place(k) if isinstance(k, str) else self._checked_place(k) for k in key]
+            places = [self._place(k) for k in key]
             return NamedVector([self._items[i] for i in places], [self.names[i] for i in places if self.names])
-        return self._items[self._checked_place(key)]
+        return self._items[self._place(key)]
 
-    def _checked_place(self, key: Any) -> int:
+    def _place(self, key: Any) -> int:
+        if isinstance(key, str):
+            if key not in self.names:
+                raise not_there(key, self.names, "these values")
+            return self.names.index(key)
         try:
             return range(len(self))[key]
         except IndexError:
@@ -68,18 +70,11 @@ class NamedVector(Sequence[Component]):
                 "jnp.asarray(q)[i]."
             ) from None
 
-    def _place(self, name: str) -> int:
-        if name not in self.names:
-            raise not_there(name, self.names, "these values")
-        return self.names.index(name)
-
     def __iter__(self):
         return iter(self._items)
 
     def __contains__(self, name: object) -> bool:
-        if not isinstance(name, str):
-            raise TypeError(f"`in` requires a name, such as 'roll' in q; got {name!r}.")
-        return name in self.names
+        return checked(name, str, "`in` requires a name, such as 'roll' in q") in self.names
 
     def __getattr__(self, name: str) -> Any:
         if hasattr(jax.Array, name) and not name.startswith("__"):
@@ -94,15 +89,6 @@ class NamedVector(Sequence[Component]):
     def __repr__(self) -> str:
         items = map(text_of, self._items)
         return f"Values({', '.join(map('='.join, zip(self.names, items, strict=True)) if self.names else items)})"
-
-    def __neg__(self) -> Array:
-        return -self.__jax_array__()
-
-    def __pos__(self) -> Array:
-        return self.__jax_array__()
-
-    def __abs__(self) -> Array:
-        return abs(self.__jax_array__())
 
 
 def _elementwise(name: str) -> Callable[..., Array]:
@@ -124,6 +110,8 @@ for _name in ("add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "matmul"
     setattr(NamedVector, f"__r{_name}__", _elementwise(f"__r{_name}__"))
 for _name in ("eq", "ne", "lt", "le", "gt", "ge"):
     setattr(NamedVector, f"__{_name}__", _elementwise(f"__{_name}__"))
+for _name in ("__neg__", "__pos__", "__abs__"):
+    setattr(NamedVector, _name, lambda self, name=_name: getattr(self.__jax_array__(), name)())
 
 
 METHODS = ("motion", "q_dot", "loads", "configuration_constraints", "implied_constraints", "events", "contacts")
@@ -143,23 +131,16 @@ def _prepared(system: str, name: str, value: Any) -> Any:
 
 
 def _checked_units(system: str, units: Any) -> Mapping[str, str]:
-    if not isinstance(units, Mapping):
-        raise TypeError(f'{system}.units is a dict of strings by name, such as {{"angle": "rad"}}; got {units!r}.')
-    for name, unit in units.items():
-        if not (isinstance(name, str) and isinstance(unit, str)):
-            raise TypeError(
-                f'{system}.units contains strings by name, such as {{"angle": "rad"}}; got {name!r}: {unit!r}.'
-            )
+    what = f'{system}.units must be a dict of strings by name, such as {{"angle": "rad"}}'
+    for name, unit in checked(units, Mapping, what).items():
+        checked(checked(name, str, what) and unit, str, f"{what}: {name!r}")
     return units
 
 
 def _checked_names(system: str, kind: str, names: Any) -> tuple[str, ...]:
-    if isinstance(names, str):
-        raise TypeError(f"{system}.{kind} must be a tuple of names, got the string {names!r}. Write ({names!r},).")
-    if isinstance(names, dataclasses.Field):
-        raise TypeError(f"{system}.{kind} must be a tuple of names, such as ('angle',), not a field. Rename the field.")
     if not isinstance(names, (tuple, list)) or not all(isinstance(name, str) and name for name in names):
-        raise TypeError(f"{system}.{kind} must be a tuple of names, such as ('angle',); got {names!r}.")
+        remedy = {str: f" Write ({names!r},).", dataclasses.Field: " Rename the field."}.get(type(names), "")
+        raise TypeError(f"{system}.{kind} must be a tuple of names, such as ('angle',); got {names!r}.{remedy}")
     return tuple(names)
 
 
@@ -330,7 +311,8 @@ class System(eqx.Module, metaclass=SystemMeta):
     __repr__ = module_text
 
     def __check_init__(self) -> None:
-        _check_parameter_names(self)
+        wrong = [name for name in parameter_info(self) if name in _OF_SYSTEM]
+        refuse_any(wrong, f"{type(self).__name__}: the parameter", " would replace a method of `System`. Rename it.")
         _check_names(self)
         check_fields(self)
         for name, info in parameter_info(self).items():
@@ -343,11 +325,11 @@ class System(eqx.Module, metaclass=SystemMeta):
     def q_dot(self, t: Component, q: Numbers, u: Numbers) -> Sequence[Component]:
         """Return the rates of the coordinates. By default, these are the speeds."""
         n_q, n = len(self.coordinates), len(self.speeds) + len(self.dependent_speeds)
-        if n_q != n:
-            raise ValueError(
-                f"{type(self).__name__} has {n_q} coordinates and {n} speeds, so its speeds cannot be the rates of its "
-                "coordinates: define q_dot(self, t, q, u), one rate for each coordinate."
-            )
+        refuse_if(
+            n_q != n,
+            f"{type(self).__name__} has {n_q} coordinates and {n} speeds, so its speeds cannot be the rates of its "
+            "coordinates: define q_dot(self, t, q, u), one rate for each coordinate.",
+        )
         return u[:n_q]
 
     def loads(self, t: Component, q: Numbers, u: Numbers, motion: Motion, inputs: Mapping[str, Component]) -> Any:
@@ -452,18 +434,7 @@ def names_of(system: System) -> tuple[tuple[str, ...], ...]:
 _OF_SYSTEM = frozenset(dir(System))  # without attributes of the metaclass, e.g. `register`
 
 
-def _check_parameter_names(system: System) -> None:
-    """Raise an exception for parameters named like a method: a parameter `events` would replace the method."""
-    wrong = [name for name in parameter_info(system) if name in _OF_SYSTEM]
-    if wrong:
-        raise ValueError(
-            f"{type(system).__name__}: the parameter {wrong[0]!r} would replace `System.{wrong[0]}`. Give it another "
-            "name."
-        )
-
-
 def _check_names(system: System) -> None:
-    """Raise an exception if one name has two meanings."""
     name = type(system).__name__
     names = {kind: _checked_names(name, kind, getattr(system, kind)) for kind in NAMES}
     units = _checked_units(name, system.units)
@@ -486,11 +457,9 @@ def _check_names(system: System) -> None:
             owners[each] = kind
     dependent = names["dependent_coordinates"]
     wrong = [each for i, each in enumerate(dependent) if each not in names["coordinates"] or each in dependent[:i]]
-    if wrong:
-        raise ValueError(
-            f"{name}.dependent_coordinates: {', '.join(wrong)} is not a coordinate, or is repeated. The coordinates "
-            f"are: {', '.join(names['coordinates']) or 'none'}."
-        )
+    known = ", ".join(names["coordinates"]) or "none"
+    after = f" is not a coordinate, or is repeated. The coordinates are: {known}."
+    refuse_any(wrong, f"{name}.dependent_coordinates:", after)
 
 
 def unit_of(name: str, declared: Mapping[str, str]) -> str:

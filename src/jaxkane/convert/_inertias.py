@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from .._common.lookup import refuse_if
 from .._kane.checks import ROUNDING, is_possible
 
 Choice = Literal["refuse", "nearest"]
@@ -51,8 +52,7 @@ def possible_inertias(owner: str, bodies: Sequence[FileBody], choice: Choice, ba
 
     **Raises:** `ValueError` with a table of the impossible inertias.
     """
-    if choice not in ("refuse", "nearest"):
-        raise ValueError(f'`inertias` must be "refuse" or "nearest", got {choice!r}.')
+    refuse_if(choice not in ("refuse", "nearest"), f'`inertias` must be "refuse" or "nearest", got {choice!r}.')
     used, refused, reported = [], [], []
     largest = max((np.abs(body.inertia).max() for body in bodies), default=0.0)
     for body in bodies:
@@ -72,11 +72,11 @@ def possible_inertias(owner: str, bodies: Sequence[FileBody], choice: Choice, ba
         elif not is_possible(1.0, body.inertia, True, ROUNDING):
             reported.append(line)
     why = "The largest principal moment of inertia of a body is at most the sum of the other two, and none is negative."
-    if refused:
-        raise ValueError(
-            f"{owner}: these links have impossible inertias:\n" + "\n".join(refused) + f"\n{why} Pass "
-            'inertias="nearest" to use the nearest possible inertias, or correct the file.'
-        )
+    refuse_if(
+        refused,
+        f"{owner}: these links have impossible inertias:\n" + "\n".join(refused) + f"\n{why} Pass "
+        'inertias="nearest" to use the nearest possible inertias, or correct the file.',
+    )
     if reported:
         warnings.warn(f"{owner}: inertias of the file:\n" + "\n".join(reported) + f"\n{why}", stacklevel=4)
     return used

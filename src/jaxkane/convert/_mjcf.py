@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from .. import rotations
+from .._common.lookup import refuse_if
 from ..joints import Actuator, Coupling, Joint, Link, Loop, Mechanism, Site, ball, free, hinge, mechanism, slide
 from ._reading import (
     Path,
@@ -71,20 +73,15 @@ def from_mjcf(
     body, two names that differ only by a dot, `stops` without a limit, more than four contacts, and with `strict` for
     unsupported elements.
     """
-    mujoco = _mujoco()
-    return _ModelReader(mujoco, _compiled(mujoco, model), name, stops, friction).mechanism(
-        strict, dependent, independent, pose
-    )
-
-
-def _mujoco() -> ModuleType:
     try:
         import mujoco  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError(
             "Reading MJCF files needs MuJoCo: `pip install mujoco`, or `pip install 'jaxkane[mujoco]'`."
         ) from error
-    return mujoco
+    return _ModelReader(mujoco, _compiled(mujoco, model), name, stops, friction).mechanism(
+        strict, dependent, independent, pose
+    )
 
 
 def _compiled(mujoco: ModuleType, model: Path) -> Any:
@@ -105,15 +102,22 @@ class _ModelReader:
 
     def __init__(self, mujoco: ModuleType, model: Any, name: str | None, stops: Selection, friction: Selection):
         self.m, self.kinds = model, mujoco
-        self.name = name or _model_name(model) or "Mechanism"
+        own = bytes(model.names[:200]).split(b"\0", 1)[0].decode("utf-8", "replace")
+        own = "" if own == "MuJoCo Model" else own  # the name of a file without a name
+        self.name = name or own or "Mechanism"
         self.left_out: list[str] = []
-        self.gravity: Any = [float(x) for x in model.opt.gravity]
-        if self._is_off("GRAVITY"):
-            self.gravity = (0.0, 0.0, 0.0)
+        self.gravity = (0.0, 0.0, 0.0) if self._is_off("GRAVITY") else _floats(model.opt.gravity)
         self.bodies = self._names("body", model.nbody)
         self.joints = self._names("joint", model.njnt)
-        self.stops = self._joints_with_stops(stops)
-        self.friction = self._joints_with_friction(friction)
+        self.carriers: list[str | None] = [None, *self.bodies[1:]]
+        types, off = model.jnt_type, self._is_off
+        kinds = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+        self.with_axis = [j for j in range(model.njnt) if int(types[j]) in kinds]
+        limited = [self.joints[j] for j in self.with_axis if model.jnt_limited[j]]
+        rough = [self.joints[j] for j in self.with_axis if model.dof_frictionloss[model.jnt_dofadr[j]]]
+        self.stops = selected("stops", stops, [] if off("LIMIT", "CONSTRAINT") else limited, "a range", self.name)
+        rough = [] if off("FRICTIONLOSS", "CONSTRAINT") else rough
+        self.friction = selected("friction", friction, rough, "friction", self.name)
         self.sites: list[Site] = []
         self.loops: list[Loop | Coupling] = []
 
@@ -132,24 +136,6 @@ class _ModelReader:
                 names[i] = unused_name(f"{kind}{i}", names, "_")
         return names
 
-    def _joints_with_stops(self, stops: Selection) -> list[str]:
-        """The names of the joints whose limits become contacts."""
-        m = self.m
-        limited = [] if self._is_off("LIMIT", "CONSTRAINT") else self._with_axis()
-        limited = [self.joints[j] for j in limited if m.jnt_limited[j]]
-        return selected("stops", stops, limited, "a range", self.name)
-
-    def _joints_with_friction(self, friction: Selection) -> list[str]:
-        """The names of the joints whose friction becomes dry friction."""
-        m = self.m
-        rough = [] if self._is_off("FRICTIONLOSS", "CONSTRAINT") else self._with_axis()
-        rough = [self.joints[j] for j in rough if m.dof_frictionloss[m.jnt_dofadr[j]]]
-        return selected("friction", friction, rough, "friction", self.name)
-
-    def _with_axis(self) -> list[int]:
-        types = self.kinds.mjtJoint
-        return [j for j in range(self.m.njnt) if int(self.m.jnt_type[j]) in (types.mjJNT_HINGE, types.mjJNT_SLIDE)]
-
     def mechanism(
         self,
         strict: bool,
@@ -158,13 +144,12 @@ class _ModelReader:
         pose: str | Mapping[str, float] | None,
     ) -> Mechanism:
         m = self.m
-        if not m.nv:
-            raise ValueError(f"{self.name}: the file has no joint, so nothing can move.")
+        refuse_if(not m.nv, f"{self.name}: the file has no joint, so nothing can move.")
         links = [self._link(i) for i in range(1, m.nbody)]
         used = {*self.bodies, *(f"{j} joint" for j in self.joints)}
         for i, name in enumerate(unused_names(self._names("site", m.nsite), used, "_site")):
             self.sites.append(
-                Site(name, self._carrier(m.site_bodyid[i]), _floats(m.site_pos[i]), _euler(m.site_quat[i]))
+                Site(name, self.carriers[m.site_bodyid[i]], _floats(m.site_pos[i]), _euler(m.site_quat[i]))
             )
         self._read_equalities({*used, *(site.name for site in self.sites)})
         actuators = list(self._actuators())
@@ -185,32 +170,29 @@ class _ModelReader:
         )
 
     def _poses(self) -> dict[str, dict[str, float]]:
-        """The coordinates of the file and of its key frames, by name."""
-        rows = [self.m.qpos0, *self.m.key_qpos]
-        return dict(zip(["qpos0", *self._names("key", self.m.nkey)], map(self._coordinates, rows), strict=True))
-
-    def _coordinates(self, qpos: np.ndarray) -> dict[str, float]:
-        types, values = self.kinds.mjtJoint, {}
-        for j, name in enumerate(self.joints):
-            own = qpos[int(self.m.jnt_qposadr[j]) :]
-            if int(self.m.jnt_type[j]) in (types.mjJNT_HINGE, types.mjJNT_SLIDE):
-                values[name] = float(own[0])
-                continue
-            start = 3 if int(self.m.jnt_type[j]) == types.mjJNT_FREE else 0
-            values |= {f"{name}_{x}": float(own[i]) for i, x in enumerate("xyz"[:start])}
-            values |= {f"{name}_e{i + 1}": x for i, x in enumerate(_euler(own[start : start + 4]))}
-        return values
+        poses: dict[str, dict[str, float]] = {}
+        for pose, qpos in zip(
+            ["qpos0", *self._names("key", self.m.nkey)], [self.m.qpos0, *self.m.key_qpos], strict=True
+        ):
+            values = poses.setdefault(pose, {})
+            for j, name in enumerate(self.joints):
+                own = qpos[int(self.m.jnt_qposadr[j]) :]
+                if j in self.with_axis:
+                    values[name] = float(own[0])
+                    continue
+                start = 3 if int(self.m.jnt_type[j]) == self.kinds.mjtJoint.mjJNT_FREE else 0
+                values |= {f"{name}_{x}": float(own[i]) for i, x in enumerate("xyz"[:start])}
+                values |= {f"{name}_e{i + 1}": x for i, x in enumerate(_euler(own[start : start + 4]))}
+        return poses
 
     def _pose(self, pose: str | Mapping[str, float] | None) -> Mapping[str, float] | None:
         if not isinstance(pose, str):
             return pose
         poses = self._poses()
-        if pose not in poses:
-            raise ValueError(f"{self.name}: `pose` is {pose!r}, but the poses of the file are {', '.join(poses)}.")
+        refuse_if(
+            pose not in poses, f"{self.name}: `pose` is {pose!r}, but the poses of the file are {', '.join(poses)}."
+        )
         return poses[pose]
-
-    def _carrier(self, body: int) -> str | None:
-        return None if body == 0 else self.bodies[body]
 
     def _link(self, i: int) -> Link:
         m = self.m
@@ -223,7 +205,7 @@ class _ModelReader:
         has_mass = moves and (mass > 0.0 or bool(np.any(m.body_inertia[i] > 0.0)))
         return Link(
             self.bodies[i],
-            self._carrier(m.body_parentid[i]),
+            self.carriers[m.body_parentid[i]],
             joints,
             position=(0.0, 0.0, 0.0) if is_free else _floats(m.body_pos[i]),
             orientation=None if is_free else _euler(m.body_quat[i]),
@@ -241,7 +223,7 @@ class _ModelReader:
             "stiffness": 0.0 if self._is_off("SPRING", "PASSIVE") else float(m.jnt_stiffness[j]),
         }
         types = self.kinds.mjtJoint
-        if kind in (int(types.mjJNT_HINGE), int(types.mjJNT_SLIDE)):
+        if j in self.with_axis:
             common |= {"reference": float(m.qpos0[place])}
             common |= {"rest": float(m.qpos_spring[place])} if common["stiffness"] else {}
             common |= {"stops": _floats(m.jnt_range[j])} if name in self.stops else {}
@@ -260,10 +242,7 @@ class _ModelReader:
 
     def _actuators(self) -> Iterator[Actuator]:
         m, kinds = self.m, self.kinds
-        used = {*self.joints}
-        for j, name in enumerate(self.joints):
-            if m.jnt_type[j] in (int(kinds.mjtJoint.mjJNT_HINGE), int(kinds.mjtJoint.mjJNT_SLIDE)):
-                used.add(f"{name}_rate")
+        used = {*self.joints, *(f"{self.joints[j]}_rate" for j in self.with_axis)}
         names = self._names("actuator", int(m.nu))
         for i, name in enumerate([] if self._is_off("ACTUATION") else unused_names(names, used, "_input")):
             group = int(m.actuator_group[i])
@@ -289,29 +268,25 @@ class _ModelReader:
             )
 
     def _why_not(self, i: int) -> str:
-        """Why an actuator is not supported."""
         m, kinds = self.m, self.kinds
         joint = int(m.actuator_trnid[i, 0])
         if m.actuator_trntype[i] not in (int(kinds.mjtTrn.mjTRN_JOINT), int(kinds.mjtTrn.mjTRN_JOINTINPARENT)):
             return "which does not act on a joint"
         of_ball = m.jnt_type[joint] == int(kinds.mjtJoint.mjJNT_BALL)
-        if m.jnt_type[joint] == int(kinds.mjtJoint.mjJNT_FREE):
-            return "which acts on a free joint"
-        if of_ball and m.actuator_trntype[i] == int(kinds.mjtTrn.mjTRN_JOINTINPARENT):
-            return "which acts on a ball joint along its parent's axes"
-        if m.actuator_dyntype[i] != int(kinds.mjtDyn.mjDYN_NONE) or m.actuator_actnum[i]:
-            return "which has its own state"
-        if m.actuator_gaintype[i] != int(kinds.mjtGain.mjGAIN_FIXED):
-            return "whose gain is not constant"
-        if m.actuator_biastype[i] not in (int(kinds.mjtBias.mjBIAS_NONE), int(kinds.mjtBias.mjBIAS_AFFINE)):
-            return "whose bias is not affine"
         affine = m.actuator_biastype[i] == int(kinds.mjtBias.mjBIAS_AFFINE)
-        if of_ball and affine and m.actuator_biasprm[i, 1]:
-            return "which feeds back the rotation of a ball joint"
         own_terms = [getattr(m, f"actuator_{what}", None) for what in ("damping", "dampingpoly", "armature", "delay")]
-        if any(x is not None and np.any(x[i]) for x in own_terms):
-            return "which has its own damping, armature or delay"
-        return ""
+        in_parent = m.actuator_trntype[i] == int(kinds.mjtTrn.mjTRN_JOINTINPARENT)
+        has_state = m.actuator_dyntype[i] != int(kinds.mjtDyn.mjDYN_NONE) or m.actuator_actnum[i]
+        reasons = {
+            "which acts on a free joint": m.jnt_type[joint] == int(kinds.mjtJoint.mjJNT_FREE),
+            "which acts on a ball joint along its parent's axes": of_ball and in_parent,
+            "which has its own state": has_state,
+            "whose gain is not constant": m.actuator_gaintype[i] != int(kinds.mjtGain.mjGAIN_FIXED),
+            "whose bias is not affine": not affine and m.actuator_biastype[i] != int(kinds.mjtBias.mjBIAS_NONE),
+            "which feeds back the rotation of a ball joint": of_ball and affine and m.actuator_biasprm[i, 1],
+            "which has its own damping, armature or delay": any(x is not None and np.any(x[i]) for x in own_terms),
+        }
+        return next((reason for reason, is_so in reasons.items() if is_so), "")
 
     def _read_equalities(self, used: set[str]) -> None:
         m, kinds = self.m, self.kinds.mjtEq
@@ -340,7 +315,7 @@ class _ModelReader:
                 end = unused_name(f"{name}_{k + 1}", used, "_end")
                 used.add(end)
                 names.append(end)
-                self.sites.append(Site(end, self._carrier(body), _floats(place), orientation))
+                self.sites.append(Site(end, self.carriers[body], _floats(place), orientation))
             self.loops.append(Loop(names[0], names[1], rigid))
 
     def _coupling(self, first: int, second: int, data: np.ndarray) -> Coupling:
@@ -383,11 +358,6 @@ class _ModelReader:
         return (effect for effect, is_present in effects.items() if is_present)
 
 
-def _model_name(model: Any) -> str:
-    name = bytes(model.names[:200]).split(b"\0", 1)[0].decode("utf-8", "replace")
-    return "" if name == "MuJoCo Model" else name  # the name of a file without a name
-
-
 _PLURALS = {"body": "bodies"}
 
 
@@ -404,9 +374,7 @@ def _euler(quaternion: Any) -> tuple[float, ...]:
 def _inertia(moments: Any, quaternion: Any) -> list[list[float]]:
     """Inertia along the body's axes, from principal moments in rotated axes. Entries within rounding of zero are
     zero."""
-    w, v = float(quaternion[0]), np.asarray(quaternion[1:], float)
-    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    R = np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+    R = np.array(rotations.euler_parameters_matrix(_euler(quaternion))).T
     I = R @ np.diag(np.asarray(moments, float)) @ R.T
     I = 0.5 * (I + I.T)
     I[np.abs(I) < 1e-15 * np.trace(I)] = 0.0

@@ -8,6 +8,8 @@ from collections.abc import Collection, Sequence
 from pathlib import Path as FilePath
 from typing import Any, Literal
 
+from .._common.lookup import refuse_any, refuse_if
+
 Path = str | os.PathLike[str]
 
 Selection = Sequence[str] | Literal[True]
@@ -55,12 +57,9 @@ def selected(option: str, names: Selection, possible: Sequence[str], having: str
     if isinstance(names, str):
         raise TypeError(f"{owner}: `{option}` must be a list of names, e.g. [{names!r}]; got {names!r}.")
     names = [without_dots(name) for name in names]
-    wrong = [name for name in names if name not in possible]
-    if wrong:
-        raise ValueError(
-            f"{owner}: `{option}` contains {wrong[0]!r}, which is not a hinge or a slider with {having}. Those with "
-            f"{having} are: {', '.join(possible) or 'none'}."
-        )
+    wrong, known = [name for name in names if name not in possible], ", ".join(possible) or "none"
+    after = f", which is not a hinge or a slider with {having}. Those with {having} are: {known}."
+    refuse_any(wrong, f"{owner}: `{option}` contains", after)
     return names
 
 
@@ -70,10 +69,10 @@ def report_left_out(owner: str, left_out: Collection[str], strict: bool, stackle
     **Raises:** `ValueError` with `strict`.
     """
     unique = tuple(dict.fromkeys(left_out))
-    if unique and strict:
-        raise ValueError(
-            f"{owner}: these elements are not supported: {'; '.join(unique)}. Pass strict=False to omit them."
-        )
+    refuse_if(
+        unique and strict,
+        f"{owner}: these elements are not supported: {'; '.join(unique)}. Pass strict=False to omit them.",
+    )
     if unique:
         warnings.warn(
             f"{owner}: omitted, because not supported: {'; '.join(unique)}.", UserWarning, stacklevel=stacklevel + 1

@@ -12,23 +12,24 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from .._common.lookup import as_names, hint
+from .._common.lookup import as_names, refuse_any, refuse_if, refuse_unknown
+from .._kane.description import jvp
 from .._kane.right_hand_side import parameters_read
-from .._scalarjit.components import ZERO3, Component, Scalar, add, dot, is_exact, is_zero, mul, sub
+from .._scalarjit.components import ZERO3, Component, Scalar, dot, is_exact, is_zero, sub
 from .._system.kinematics import Frame, Point, Vector, inertial
 from .._system.motion import Body, Force, Motion, Torque
 from .._system.parameters import parameter
 from .._system.system import System
-from ._sympy_expressions import (
+from ._sympy_model import (
     ExtractedModel,
     ExtractedVector,
     Extractor,
     function,
     imported,
+    model_data,
     name_of,
     prescribed_motions,
 )
-from ._sympy_model import model_data
 
 
 def from_sympy(
@@ -77,11 +78,11 @@ def from_sympy(
     sympy = imported()
     motions = prescribed_motions(sympy, prescribed or {}, name)
     data = model_data(sympy, model, as_names(dependent, "dependent"), name, tuple(motions))
-    if origin is not None and not data.bodies:
-        raise ValueError(
-            f"{name}: positions from {origin} are not available, because this Lagrangian has no bodies. Omit `origin`, "
-            "or pass the bodies: LagrangesMethod(L, qs, bodies=bodies, frame=N, ...)."
-        )
+    refuse_if(
+        origin is not None and not data.bodies,
+        f"{name}: positions from {origin} are not available, because this Lagrangian has no bodies. Omit `origin`, "
+        "or pass the bodies: LagrangesMethod(L, qs, bodies=bodies, frame=N, ...).",
+    )
     extractor = Extractor(sympy, data, origin if origin is not None else data.origin, motions)
     model = extractor.model()
     values = _values(extractor, model, parameters)
@@ -95,17 +96,11 @@ def _values(extractor: Extractor, model: ExtractedModel, parameters: Mapping[Any
     if missing:
         numbers |= dict.fromkeys(_unread(model, missing), 0.0)
         missing = [name for name in missing if name not in numbers]
-    if missing:
-        raise ValueError(f"{model.name}: no value for {', '.join(missing)}. `parameters` needs a number per symbol.")
-    unknown = [name for name in numbers if name not in names]
-    if unknown:
-        raise ValueError(f"{model.name} has no symbol {unknown[0]!r}; {hint(unknown[0], names, 'it has')}")
+    refuse_if(missing, f"{model.name}: no value for {', '.join(missing)}. `parameters` needs a number per symbol.")
+    refuse_unknown(numbers, names, f"{model.name} has no symbol", "it has")
     reserved = [name for name in names if hasattr(SympySystem, name) or "." in name]
-    if reserved:
-        raise ValueError(
-            f"{model.name}: {reserved[0]!r} cannot be the name of a parameter, because it is an attribute of systems "
-            "or contains a dot. Rename the symbol in the SymPy model, e.g. with `subs`."
-        )
+    after = " cannot be the name of a parameter, because it is an attribute of systems or contains a dot. Rename it."
+    refuse_any(reserved, f"{model.name}:", after)
     basic = extractor.sympy.Basic
     return {name: float(numbers[name]) if isinstance(numbers[name], basic) else numbers[name] for name in names}
 
@@ -214,7 +209,12 @@ class SympySystem(System):
         along = [_exact(values[force]) for force in model.forces]
         if model.inertia:
             of_motion = self._read(q, u, t)
-            C_dot = _cholesky(_rows(of_motion, model.inertia), _rows(values, model.inertia_rates))[1]
+            M, M_dot = _rows(of_motion, model.inertia), _rows(values, model.inertia_rates)
+
+            def factors(*entries: Component) -> list[list[Component]]:
+                return _cholesky([entries[i * (i + 1) // 2 :][: i + 1] for i in range(len(M))])
+
+            C_dot = jvp(factors, [x for row in M for x in row], [x for row in M_dot for x in row])[1]
             w = self._inertia_velocities(of_motion, u)
             along = [sub(force, dot(row, w[: len(row)])) for force, row in zip(along, C_dot, strict=True)]
         loads += [Torque(force * motion.N.x, body) for force, body in zip(along, motion.along_speeds, strict=True)]
@@ -226,8 +226,7 @@ class SympySystem(System):
         Kane's method gives C dw/dt for these n particles. With forces along the speeds this becomes the left side of
         Lagrange's equations in momentum form, because d/dt (C w) = C dw/dt + dC/dt w.
         """
-        M = _rows(values, self._model.inertia)
-        C, _ = _cholesky(M, [[0.0] * len(row) for row in M])
+        C = _cholesky(_rows(values, self._model.inertia))
         return [dot([row[i] for row in C[i:]], list(u)[i : len(C)]) for i in range(len(C))]
 
 
@@ -298,25 +297,15 @@ def class_of(model: ExtractedModel) -> type[System]:
     return cls
 
 
-def _cholesky(M: Rows, M_dot: Rows) -> tuple[list[list[Component]], list[list[Component]]]:
-    """C of M = C C^T and dC/dt, lower triangular; exact zeros stay exact. NaN if M is not positive definite."""
+def _cholesky(M: Rows) -> list[list[Component]]:
+    """C of M = C C^T, lower triangular; exact zeros stay exact. NaN if M is not positive definite."""
     C: list[list[Component]] = []
-    C_dot: list[list[Component]] = []
-    for i, (row, row_dot) in enumerate(zip(M, M_dot, strict=True)):
+    for i, row in enumerate(M):
         C.append([])
-        C_dot.append([])
         for j in range(i + 1):
-            entry, rate = row[j], row_dot[j]
-            for k in range(j):
-                entry = sub(entry, mul(C[i][k], C[j][k]))
-                rate = sub(rate, add(mul(C_dot[i][k], C[j][k]), mul(C[i][k], C_dot[j][k])))
-            if j < i:
-                C[i].append(_quotient(entry, C[j][j]))
-                C_dot[i].append(_quotient(sub(rate, mul(C[i][j], C_dot[j][j])), C[j][j]))
-            else:
-                C[i].append(_root(entry))
-                C_dot[i].append(_quotient(mul(0.5, rate), C[i][i]))
-    return C, C_dot
+            entry = sub(row[j], dot(C[i][:j], C[j][:j]))
+            C[i].append(_quotient(entry, C[j][j]) if j < i else _root(entry))
+    return C
 
 
 def _root(x: Component) -> Component:

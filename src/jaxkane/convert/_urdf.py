@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._common.lookup import not_there
+from .._common.lookup import not_there, refuse_if
 from ..joints import Coupling, Joint, Link, Mechanism, ball, free, hinge, mechanism, planar, slide
 from ._inertias import Choice, FileBody, possible_inertias
 from ._reading import Path, Selection, report_left_out, selected, text_of
@@ -70,12 +70,13 @@ def from_urdf(
     """
     file = read_urdf(text_of(model))
     file = _without_massless_joints(file._replace(name=name or file.name))
-    if not floating and all(joint.kind == "fixed" for joint in file.joints):
-        raise ValueError(
-            f"{file.name}: no joint moves a mass, so nothing can move. Pass floating=True if the root link is free."
-        )
-    if floating and file.root == "world":
-        raise ValueError(f"{file.name}: the root link 'world' is the ground: omit floating=True.")
+    refuse_if(
+        not floating and all(joint.kind == "fixed" for joint in file.joints),
+        f"{file.name}: no joint moves a mass, so nothing can move. Pass floating=True if the root link is free.",
+    )
+    refuse_if(
+        floating and file.root == "world", f"{file.name}: the root link 'world' is the ground: omit floating=True."
+    )
     reader = _UrdfReader(file, floating, stops, friction)
     links = reader.links(inertias, merge_fixed)
     couplings = reader.couplings()
@@ -98,8 +99,6 @@ class _Group:
 
 
 class _UrdfReader:
-    """Makes links of a mechanism."""
-
     def __init__(self, file: UrdfFile, floating: bool, stops: Selection, friction: Selection):
         self.file, self.floating = file, floating
         simple = [x for x in file.joints if x.kind in ("revolute", "continuous", "prismatic")]
@@ -111,7 +110,6 @@ class _UrdfReader:
         self.groups = self._groups()
 
     def _groups(self) -> dict[str, _Group]:
-        """The group of each link."""
         root = _Group(self.file.root, self.floating, None if self.floating else np.zeros(3))
         groups = {root.head: root}
         for joint in self.file.joints:
@@ -127,10 +125,11 @@ class _UrdfReader:
 
     def links(self, inertias: Choice, merge_fixed: bool) -> list[Link]:
         bodies = self._bodies(merge_fixed)
-        in_file = [
-            FileBody(label, inertial.inertia, _turned_back(self.groups[link], link))
-            for link, (label, inertial) in bodies.items()
-        ]
+        in_file = []
+        for link, (label, inertial) in bodies.items():
+            group = self.groups[link]
+            axis = None if group.axis is None else group.placements[link][1].T @ group.axis  # in the link
+            in_file.append(FileBody(label, inertial.inertia, axis))
         used = possible_inertias(self.file.name, in_file, inertias, self.file.balance)
         matrices = dict(zip(bodies, used, strict=True))
         carriers = {joint.child: joint for joint in self.file.joints}
@@ -201,11 +200,11 @@ class _UrdfReader:
                 )
             chain = [joint.name]
             while (last := self.simple.get(chain[-1])) is not None and last.mimic is not None:
-                if last.mimic[0] in chain:
-                    raise ValueError(
-                        f"{self.file.name}: the joints {', '.join(chain)} mimic each other in a circle. Remove one "
-                        "<mimic>."
-                    )
+                refuse_if(
+                    last.mimic[0] in chain,
+                    f"{self.file.name}: the joints {', '.join(chain)} mimic each other in a circle. Remove one "
+                    "<mimic>.",
+                )
                 chain.append(last.mimic[0])
             found.append(Coupling(joint.name, followed, (offset, factor)))
         return found
@@ -253,11 +252,6 @@ def _axis_of_child(parent: np.ndarray | None, R: np.ndarray, joint: FileJoint) -
     if not inherited.any():
         return own
     return own if np.linalg.norm(np.cross(own, inherited)) < 1e-9 else None
-
-
-def _turned_back(group: _Group, link: str) -> np.ndarray | None:
-    """The axis of a group, in one of its links."""
-    return None if group.axis is None else group.placements[link][1].T @ group.axis
 
 
 def _merged(heavy: dict[str, Inertial], placements: dict[str, tuple[np.ndarray, np.ndarray]], first: str) -> Inertial:

@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .._common.lookup import not_there
+from .. import rotations
+from .._common.lookup import not_there, refuse_any, refuse_if
 from ._reading import check_distinct, without_dots
 
 Element = ElementTree.Element
@@ -85,23 +86,21 @@ def read_urdf(text: str) -> UrdfFile:
     robot = _robot(text)
     name = robot.get("name") or "Mechanism"
     links, joints = robot.findall("link"), robot.findall("joint")
-    if not links:
-        raise ValueError(f"{name}: the URDF has no link.")
+    refuse_if(not links, f"{name}: the URDF has no link.")
     for kinds, elements in (("links", links), ("joints", joints)):
-        unnamed = [x for x in elements if not x.get("name")]
-        if unnamed:
-            raise ValueError(f"{name}: one of the {kinds} has no name: {_excerpt(unnamed[0])}")
+        unnamed = [ElementTree.tostring(x, encoding="unicode").strip()[:80] for x in elements if not x.get("name")]
+        refuse_any(unnamed[:1], f"{name}: one of the {kinds} has no name:", "")
         check_distinct(name, kinds, [x.get("name", "") for x in elements])
     inertials = {without_dots(x.get("name", "")): _inertial(x, f"{name}, link {x.get('name')!r}") for x in links}
     read = [_joint(x, f"{name}, joint {x.get('name')!r}") for x in joints]
     root = _root(name, list(inertials), read)
-    return UrdfFile(name, root, inertials, _in_order(name, root, read), _is_balanced(robot), _left_out(robot))
+    is_balanced = any(x.get("balanceinertia") == "true" for x in robot.findall("mujoco/compiler"))
+    return UrdfFile(name, root, inertials, _in_order(name, root, read), is_balanced, _left_out(robot))
 
 
 def _robot(text: str) -> Element:
     """The root element. Its tags have no namespaces."""
-    if "<xacro:" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
-        raise ValueError(_XACRO)
+    refuse_if("<xacro:" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL), _XACRO)
     try:
         # Extensions may have an undeclared prefix.
         robot = ElementTree.fromstring(re.sub(r"<(/?)\w+:", r"<\1", text.lstrip()))
@@ -109,19 +108,16 @@ def _robot(text: str) -> Element:
         raise ValueError(f"The model is not a URDF: {error}. Check whether the file is complete.") from error
     for element in robot.iter():
         element.tag = element.tag.rpartition("}")[2]
-    if robot.tag != "robot":
-        raise ValueError(f"The model is not a URDF: its root must be <robot>, got <{robot.tag}>.")
+    refuse_if(robot.tag != "robot", f"The model is not a URDF: its root must be <robot>, got <{robot.tag}>.")
     # Other elements, such as those of ros2_control, are not read.
     read = [x for part in (*robot.findall("link"), *robot.findall("joint")) for x in part.iter()]
-    if any("${" in value for x in (robot, *read) for value in x.attrib.values()):
-        raise ValueError(_XACRO)
+    refuse_if(any("${" in value for x in (robot, *read) for value in x.attrib.values()), _XACRO)
     return robot
 
 
 def _inertial(link: Element, label: str) -> Inertial | None:
     found = link.findall("inertial")
-    if len(found) > 1:
-        raise ValueError(f"{label}: the link has {len(found)} <inertial>. Keep one.")
+    refuse_if(len(found) > 1, f"{label}: the link has {len(found)} <inertial>. Keep one.")
     if not found:
         return None
     inertial = found[0]
@@ -130,8 +126,7 @@ def _inertial(link: Element, label: str) -> Inertial | None:
         missing = "mass" if mass is None else "inertia"
         raise ValueError(f"{label}: <inertial> has no <{missing}>. Add it, or omit <inertial> for a link without mass.")
     m = _number(mass, "value", label)
-    if m < 0.0:
-        raise ValueError(f"{label}: the mass is {m} kg; it must not be negative.")
+    refuse_if(m < 0.0, f"{label}: the mass is {m} kg; it must not be negative.")
     I = np.zeros((3, 3))
     for i, a in enumerate("xyz"):
         for j, b in enumerate("xyz"[i:], start=i):
@@ -146,22 +141,21 @@ def _turned(I: np.ndarray, R: np.ndarray) -> np.ndarray:
 
 def _joint(joint: Element, label: str) -> FileJoint:
     kind = joint.get("type", "")
-    if kind not in KINDS:
-        raise ValueError(f"{label}: the type must be one of {', '.join(KINDS)}; got {kind!r}.")
+    refuse_if(kind not in KINDS, f"{label}: the type must be one of {', '.join(KINDS)}; got {kind!r}.")
     parent, child = (_end(joint, end, label) for end in ("parent", "child"))
     position, orientation = _placement(joint, label)
     axis, dynamics, mimic = joint.find("axis"), joint.find("dynamics"), joint.find("mimic")
     direction = np.array([1.0, 0.0, 0.0]) if axis is None else _numbers(axis, "xyz", label, (1.0, 0.0, 0.0))
-    if kind not in ("fixed", "floating") and not direction.any():
-        raise ValueError(f"{label}: the axis is zero. Give it a direction, or make the joint fixed.")
+    refuse_if(
+        kind not in ("fixed", "floating") and not direction.any(),
+        f"{label}: the axis is zero. Give it a direction, or make the joint fixed.",
+    )
     damping, friction = (0.0 if dynamics is None else _number(dynamics, x, label, 0.0) for x in ("damping", "friction"))
     for what, value in (("damping", damping), ("friction", friction)):
-        if value < 0.0:
-            raise ValueError(f"{label}: the {what} is {value}; it must not be negative.")
+        refuse_if(value < 0.0, f"{label}: the {what} is {value}; it must not be negative.")
     follows = None
     if mimic is not None:
-        if not mimic.get("joint"):
-            raise ValueError(f'{label}: <mimic joint="..."/> names no joint.')
+        refuse_if(not mimic.get("joint"), f'{label}: <mimic joint="..."/> names no joint.')
         factor, offset = (_number(mimic, x, label, default) for x, default in (("multiplier", 1.0), ("offset", 0.0)))
         follows = without_dots(mimic.get("joint", "")), factor, offset
     return FileJoint(
@@ -191,11 +185,11 @@ def _limits(joint: Element, kind: str, label: str) -> tuple[float, float] | None
     if limit is None or kind not in ("revolute", "prismatic") or not {"lower", "upper"} & limit.attrib.keys():
         return None
     lower, upper = (_number(limit, x, label, 0.0, infinite=True) for x in ("lower", "upper"))
-    if kind == "revolute" and (lower in _DEGREES or upper in _DEGREES):
-        raise ValueError(
-            f"{label}: the limits {lower:g} and {upper:g} are in degrees, but a URDF has radians. Convert the angles "
-            "of the file."
-        )
+    refuse_if(
+        kind == "revolute" and (lower in _DEGREES or upper in _DEGREES),
+        f"{label}: the limits {lower:g} and {upper:g} are in degrees, but a URDF has radians. Convert the angles "
+        "of the file.",
+    )
     return lower, upper
 
 
@@ -215,16 +209,13 @@ def _placement(element: Element, label: str) -> tuple[np.ndarray, np.ndarray]:
     if origin is None:
         return np.zeros(3), np.eye(3)
     position, angles = (_numbers(origin, x, label, (0.0, 0.0, 0.0)) for x in ("xyz", "rpy"))
-    if np.abs(angles).max() > 2.0 * math.pi + 0.01:
-        raise ValueError(
-            f'{label}: rpy="{origin.get("rpy")}" exceeds a full turn. A URDF has radians. Convert the angles of the '
-            "file if they are in degrees."
-        )
-    c, s = np.cos(angles), np.sin(angles)
-    about_x = np.array([[1, 0, 0], [0, c[0], -s[0]], [0, s[0], c[0]]])
-    about_y = np.array([[c[1], 0, s[1]], [0, 1, 0], [-s[1], 0, c[1]]])
-    about_z = np.array([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
-    return position, about_z @ about_y @ about_x
+    refuse_if(
+        np.abs(angles).max() > 2.0 * math.pi + 0.01,
+        f'{label}: rpy="{origin.get("rpy")}" exceeds a full turn. A URDF has radians. Convert the angles of the '
+        "file if they are in degrees.",
+    )
+    # Rotations about the fixed axes x, y and z are those about the turned axes z, y and x.
+    return position, np.array(rotations.sequence_matrix("3-2-1", angles[::-1].tolist())).T
 
 
 def _number(
@@ -265,7 +256,7 @@ def _root(name: str, links: list[str], joints: list[FileJoint]) -> str:
             raise ValueError(
                 f"{name}: the joints {carrier[joint.child].name!r} and {joint.name!r} both carry the link "
                 f"{joint.child!r}. A URDF is a tree. For a closed loop, use `jaxkane.joints.Loop`, or an MJCF "
-                "file with <equality>."
+                "file with <equality>.",
             )
         carrier[joint.child] = joint
     roots = [link for link in links if link not in carrier]
@@ -285,13 +276,8 @@ def _in_order(name: str, root: str, joints: list[FileJoint]) -> list[FileJoint]:
         ordered.append(waiting.pop())
         waiting += reversed(children.get(ordered[-1].child, []))
     circular = [joint.name for joint in joints if joint not in ordered]
-    if circular:
-        raise ValueError(f"{name}: the joints {', '.join(circular)} form a loop. Remove one of them.")
+    refuse_if(circular, f"{name}: the joints {', '.join(circular)} form a loop. Remove one of them.")
     return ordered
-
-
-def _is_balanced(robot: Element) -> bool:
-    return any(x.get("balanceinertia") == "true" for x in robot.findall("mujoco/compiler"))
 
 
 def _left_out(robot: Element) -> list[str]:
@@ -307,7 +293,3 @@ def _left_out(robot: Element) -> list[str]:
         *found,
         *(f"{x} of MuJoCo's compiler" for x in sorted(changes & {"boundmass", "boundinertia", "settotalmass"})),
     ]
-
-
-def _excerpt(element: Element) -> str:
-    return ElementTree.tostring(element, encoding="unicode").strip()[:80]

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import rotations
+from .._common.lookup import refuse_if
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, Triple, is_zero, mul, sub
 from .._system.kinematics import Frame, Point
@@ -22,8 +23,7 @@ def unit_vector(axis: Any, name: str) -> Triple:
     """A direction as three floats of length 1. Components within rounding of zero or one are made exact."""
     a = exact_numbers(axis, f"The axis of {name!r}")
     length = float(np.linalg.norm(a)) if a.shape == (3,) else 0.0
-    if not length > 0.0:
-        raise ValueError(f"The axis of {name!r} must be three numbers that are not all zero, got {axis!r}.")
+    refuse_if(not length > 0.0, f"The axis of {name!r} must be three numbers that are not all zero, got {axis!r}.")
     return tuple(exact(x) for x in a / length)  # type: ignore[return-value]
 
 
@@ -42,8 +42,10 @@ def exact_numbers(values: Any, what: str) -> np.ndarray:
     except (TypeError, ValueError):
         numbers = np.array(None)
     # text is refused, also if it could be converted to a number
-    if numbers.dtype.kind not in "iuf" or not np.all(np.isfinite(numbers)):
-        raise ValueError(f"{what} must be finite numbers, got {values!r}.")
+    refuse_if(
+        numbers.dtype.kind not in "iuf" or not np.all(np.isfinite(numbers)),
+        f"{what} must be finite numbers, got {values!r}.",
+    )
     return numbers.astype(float)
 
 
@@ -61,8 +63,7 @@ def is_structural_zero(value: Any) -> bool:
 
 def components(name: str, values: Any) -> dict[str, Any]:
     """Three numbers as parameters `name.x`, `name.y`, `name.z`."""
-    if not hasattr(values, "__len__") or len(values) != 3:
-        raise ValueError(f"{name} must have three components, got {values!r}.")
+    refuse_if(not hasattr(values, "__len__") or len(values) != 3, f"{name} must have three components, got {values!r}.")
     return {f"{name}.{end}": x for end, x in zip("xyz", values, strict=True) if not is_structural_zero(x)}
 
 
@@ -105,7 +106,7 @@ class JointType:
 
     def displacement(self, q: Sequence[Component], rest: Sequence[Component]) -> tuple[Component, ...]:
         """The displacement of the joint from the rest position of its spring, along each speed."""
-        raise NotImplementedError
+        return (sub(q[0], rest[0]),)
 
     def loads(self, at: JointKinematics, forces: Sequence[Component]) -> tuple[Load, ...]:
         """Forces along each speed [N or N m], with their reactions on the parent."""
@@ -140,9 +141,6 @@ class Hinge(JointType):
         G = F.rotate(F.vector(*self.axis), angle, u[0], f"{self.name} joint")
         return JointKinematics(F, P, G, _about(P, F, G, anchor))
 
-    def displacement(self, q, rest):
-        return (sub(q[0], rest[0]),)
-
     def loads(self, at, forces):
         return (Torque(forces[0] * at.child_frame.vector(*self.axis), at.child_frame, at.parent_frame),)
 
@@ -154,9 +152,6 @@ class Slide(JointType):
     def kinematics(self, F, P, q, u, anchor):
         axis = F.vector(*self.axis)
         return JointKinematics(F, P, F, P.moving(sub(q[0], self.reference) * axis, u[0] * axis, F))
-
-    def displacement(self, q, rest):
-        return (sub(q[0], rest[0]),)
 
     def loads(self, at, forces):
         push = forces[0] * at.parent_frame.vector(*self.axis)
@@ -280,9 +275,7 @@ def hinge(
         contacts.
     """
     values = _numbers(name, damping=damping, stiffness=stiffness, rest=rest, armature=armature, friction=friction)
-    has_stops, limits = _limits(stops, name)
-    hinge_type = Hinge(name, unit_vector(axis, name), _reference(reference, name), has_stops, _is_rough(values))
-    return Joint((hinge_type,), values | limits | components(f"anchor.{name}", anchor))
+    return _with_axis(Hinge, name, axis, reference, stops, values | components(f"anchor.{name}", anchor))
 
 
 def slide(
@@ -303,13 +296,16 @@ def slide(
     `stops` [m], `friction` [N].
     """
     values = _numbers(name, damping=damping, stiffness=stiffness, rest=rest, armature=armature, friction=friction)
+    return _with_axis(Slide, name, axis, reference, stops, values)
+
+
+def _with_axis(
+    kind: type[JointType], name: str, axis: Any, reference: float, stops: Any, values: Mapping[str, Any]
+) -> Joint:
     has_stops, limits = _limits(stops, name)
-    slide_type = Slide(name, unit_vector(axis, name), _reference(reference, name), has_stops, _is_rough(values))
-    return Joint((slide_type,), values | limits)
-
-
-def _is_rough(values: Mapping[str, Any]) -> bool:
-    return any(name.startswith("friction.") for name in values)
+    origin = float(exact_numbers(reference, f"The reference of {name!r}"))
+    joint = kind(name, unit_vector(axis, name), origin, has_stops, f"friction.{name}" in values)
+    return Joint((joint,), {**values, **limits})
 
 
 def _limits(stops: Any, name: str) -> tuple[tuple[bool, bool], dict[str, Any]]:
@@ -325,10 +321,6 @@ def _limits(stops: Any, name: str) -> tuple[tuple[bool, bool], dict[str, Any]]:
     ):
         raise ValueError(f"The stops of {name!r} must be a lower and a larger upper limit, or None; got {stops!r}.")
     return (lower is not None, upper is not None), _numbers(name, **limits)
-
-
-def _reference(value: Any, name: str) -> float:
-    return float(exact_numbers(value, f"The reference of {name!r}"))
 
 
 def ball(
@@ -381,10 +373,10 @@ def fixed() -> Joint:
 
 def universal(name: str, axes: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **options: Any) -> Joint:
     """Two hinges about two axes, `name_1` on the parent and `name_2` on the link; `options` of `hinge`, for both."""
-    if len(axes) != 2:
-        raise ValueError(
-            f"A universal joint needs two axes, but {name!r} has {len(axes)}. Pass several hinges to the link instead."
-        )
+    refuse_if(
+        len(axes) != 2,
+        f"A universal joint needs two axes, but {name!r} has {len(axes)}. Pass several hinges to the link instead.",
+    )
     return _chain([hinge(f"{name}_{i + 1}", axis, **options) for i, axis in enumerate(axes)])
 
 

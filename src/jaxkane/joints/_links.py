@@ -10,12 +10,12 @@ import jax
 import numpy as np
 
 from .. import rotations
-from .._common.lookup import not_there
+from .._common.lookup import checked, refuse_any, refuse_if, refuse_unknown
 from .._kane.unilateral import MOST_CONTACTS
 from .._scalarjit.compat import Tracer
 from ..rotations import Matrix
 from ._joints import Hinge, Joint, JointType, Slide, components, exact, exact_numbers, is_structural_zero
-from ._loops import LoopChoices, with_dependent
+from ._loops import with_dependent
 from ._mechanism import (
     MOMENTS,
     ActuatorStructure,
@@ -185,8 +185,7 @@ def mechanism(
     for what, names in (("dependent", dependent), ("independent", independent)):
         if isinstance(names, str):
             raise TypeError(f"mechanism: `{what}` must be a list of names, e.g. [{names!r}]; got {names!r}.")
-    if not isinstance(name, str):
-        raise TypeError(f"mechanism: `name` must be a string, got {name!r}.")
+    checked(name, str, "mechanism: `name` must be a string")
     values: dict[str, Any] = components("gravity", gravity)
     links = _in_order([_checked(link, Link) for link in links])
     link_structures = tuple(_link(link, values) for link in links)
@@ -199,10 +198,11 @@ def mechanism(
         tuple(_actuator(_checked(actuator, Actuator), joints, values) for actuator in actuators),
         left_out=tuple(left_out),
     )
-    if not joints:
-        raise ValueError(f"{name}: no link has a joint, so nothing can move. Pass Link(..., joints=hinge(...)).")
-    if not any(link.has_mass for link in link_structures):
-        raise ValueError(f"{name}: no movable link has a mass. Pass Link(..., mass=1.0).")
+    refuse_if(not joints, f"{name}: no link has a joint, so nothing can move. Pass Link(..., joints=hinge(...)).")
+    refuse_if(
+        not any(link.has_mass for link in link_structures),
+        f"{name}: no movable link has a mass. Pass Link(..., mass=1.0).",
+    )
     _check_names(structure)
     _check_stops(structure)
     closures = [_loop(loop, structure, joints) for loop in loops]
@@ -211,7 +211,7 @@ def mechanism(
         couplings=tuple(x for x in closures if isinstance(x, CouplingStructure)),
     )
     fields = tuple(_field(name, joints) for name in values)
-    structure = with_dependent(structure, fields, values, LoopChoices(dependent, independent, pose))
+    structure = with_dependent(structure, fields, values, dependent, independent, pose)
     return class_of(structure._replace(poses=_poses(structure, poses or {})), fields)(**values)
 
 
@@ -225,18 +225,14 @@ def _poses(structure: Structure, poses: Mapping[str, Mapping[str, float]]) -> tu
 
 
 def _checked(part: Any, kind: type) -> Any:
-    if not isinstance(part, kind):
-        raise TypeError(f"mechanism: this is not a {kind.__name__}: {part!r}.")
-    return part
+    return checked(part, kind, f"mechanism needs a {kind.__name__}")
 
 
 def _in_order(links: list[Link]) -> list[Link]:
-    """Sort parents before their children, otherwise in the given order."""
     names = [link.name for link in links]
     for link in links:
         _check_name(link.name, "link")
-        if names.count(link.name) > 1:
-            raise ValueError(f"Two links have the name {link.name!r}.")
+        refuse_if(names.count(link.name) > 1, f"Two links have the name {link.name!r}.")
         if link.parent is not None:
             _check_known(f"The parent of the link {link.name!r}", link.parent, names, "the links")
     ordered: dict[str, Link] = {}
@@ -261,25 +257,22 @@ def _check_name(name: Any, what: str) -> None:
 
 
 def _check_known(label: str, name: Any, known: Iterable[str], where: str) -> None:
-    if name not in known:
-        raise ValueError(f"{label}: {not_there(name, known, where).args[0]}")
+    refuse_unknown([name], known, f"{label} is not among {where}:")
 
 
 def _link(link: Link, values: dict[str, Any]) -> LinkStructure:
-    if not isinstance(link.joints, (Joint, list, tuple)):
-        raise TypeError(
-            f"The joints of the link {link.name!r} must be a Joint or a list of Joints, got {link.joints!r}."
-        )
+    what = f"The joints of the link {link.name!r} must be a Joint or a list of Joints"
+    checked(link.joints, (Joint, list, tuple), what)
     types: list[JointType] = []
     for joint in [link.joints] if isinstance(link.joints, Joint) else link.joints:
         types += _checked(joint, Joint).types
         values |= joint.values
     values |= components(f"position.{link.name}", link.position)
-    if any(len(joint.speeds) == 6 for joint in types) and (link.parent is not None or len(types) > 1):
-        raise ValueError(
-            f"The link {link.name!r} has a free joint, which must be its only joint and needs the ground as parent "
-            "(parent=None). For free motion relative to a moving link, chain three sliders and a ball joint."
-        )
+    refuse_if(
+        any(len(joint.speeds) == 6 for joint in types) and (link.parent is not None or len(types) > 1),
+        f"The link {link.name!r} has a free joint, which must be its only joint and needs the ground as parent "
+        "(parent=None). For free motion relative to a moving link, chain three sliders and a ball joint.",
+    )
     if link.mass is not None:
         moments = _moments(link)
         if not (moments and is_structural_zero(link.mass)):  # a gimbal may have moments of inertia only
@@ -293,8 +286,10 @@ def _link(link: Link, values: dict[str, Any]) -> LinkStructure:
 def _moments(link: Link) -> dict[str, Any]:
     rows = link.inertia
     lengths = [np.shape(row) for row in rows] if hasattr(rows, "__len__") else []
-    if lengths not in ([()] * 3, [(3,)] * 3):
-        raise ValueError(f"The inertia of {link.name!r} must be three moments or a (3, 3) matrix, got {rows!r}.")
+    refuse_if(
+        lengths not in ([()] * 3, [(3,)] * 3),
+        f"The inertia of {link.name!r} must be three moments or a (3, 3) matrix, got {rows!r}.",
+    )
     if lengths[0] == ():
         entries = dict(zip(MOMENTS, (*rows, 0.0, 0.0, 0.0), strict=True))
     else:
@@ -303,8 +298,11 @@ def _moments(link: Link) -> dict[str, Any]:
             a, b = rows[i][j], rows[j][i]
             if isinstance(a, Tracer) or isinstance(b, Tracer):
                 continue
-            if np.any(np.abs(np.subtract(a, b)) > 1e-9 * (np.abs(a) + np.abs(b))):  # more than rounding errors
-                raise ValueError(f"The inertia matrix of {link.name!r} is not symmetric: {a} and {b}.")
+            # more than rounding errors
+            refuse_if(
+                np.any(np.abs(np.subtract(a, b)) > 1e-9 * (np.abs(a) + np.abs(b))),
+                f"The inertia matrix of {link.name!r} is not symmetric: {a} and {b}.",
+            )
     return {f"inertia.{link.name}.{ij}": x for ij, x in entries.items() if not is_structural_zero(x)}
 
 
@@ -321,20 +319,20 @@ def _actuator(actuator: Actuator, joints: Mapping[str, JointType], values: dict[
     _check_known(f"The actuator {actuator.name!r}", actuator.joint, joints, "the joints")
     joint = joints[actuator.joint]
     gear = tuple(float(x) for x in np.atleast_1d(exact_numbers(actuator.gear, f"The gear of {actuator.name!r}")))
-    if len(gear) != len(joint.speeds):
-        raise ValueError(
-            f"The gear of the actuator {actuator.name!r} must be {len(joint.speeds)} numbers, one for each speed of "
-            f"{joint.name!r}; got {actuator.gear!r}."
-        )
+    refuse_if(
+        len(gear) != len(joint.speeds),
+        f"The gear of the actuator {actuator.name!r} must be {len(joint.speeds)} numbers, one for each speed of "
+        f"{joint.name!r}; got {actuator.gear!r}.",
+    )
     for kind in ("gain", "offset", "position_gain", "velocity_gain"):
         value = getattr(actuator, kind)
         if not is_structural_zero(value):
             values[f"{kind}.{actuator.name}"] = value
-    if f"position_gain.{actuator.name}" in values and len(gear) > 1:
-        raise ValueError(
-            f"The actuator {actuator.name!r}: `position_gain` needs a joint with one speed, but {joint.name!r} has "
-            "several. Omit `position_gain`."
-        )
+    refuse_if(
+        f"position_gain.{actuator.name}" in values and len(gear) > 1,
+        f"The actuator {actuator.name!r}: `position_gain` needs a joint with one speed, but {joint.name!r} has "
+        "several. Omit `position_gain`.",
+    )
     return ActuatorStructure(actuator.name, joint.name, gear)
 
 
@@ -343,21 +341,22 @@ def _loop(loop: Any, structure: Structure, joints: Mapping[str, JointType]) -> L
         sites = [site.name for site in structure.sites]
         for end in (loop.first, loop.second):
             _check_known("A loop", end, sites, "the sites")
-        if loop.first == loop.second:
-            raise ValueError(f"Loop({loop.first!r}, {loop.second!r}): the sites are equal. Name two different sites.")
+        refuse_if(
+            loop.first == loop.second,
+            f"Loop({loop.first!r}, {loop.second!r}): the sites are equal. Name two different sites.",
+        )
         return LoopStructure(loop.first, loop.second, bool(loop.rigid), tuple(range(6 if loop.rigid else 3)))
     _checked(loop, Coupling)
     for end in [loop.first, *([] if loop.second is None else [loop.second])]:
         if not isinstance(joints.get(end), (Hinge, Slide)):
             raise ValueError(f"Coupling: {end!r} is not a hinge or a slider of the mechanism. Name one of these.")
-    if loop.first == loop.second:
-        raise ValueError(
-            f"Coupling({loop.first!r}, {loop.second!r}): a joint cannot follow itself. Name two different joints."
-        )
+    refuse_if(
+        loop.first == loop.second,
+        f"Coupling({loop.first!r}, {loop.second!r}): a joint cannot follow itself. Name two different joints.",
+    )
     what = f"The coefficients of the coupling of {loop.first!r}"
     coefficients = tuple(float(a) for a in np.atleast_1d(exact_numbers(loop.coefficients, what)))
-    if not coefficients:
-        raise ValueError(f"{what} must be at least one number, got none.")
+    refuse_if(not coefficients, f"{what} must be at least one number, got none.")
     return CouplingStructure(loop.first, loop.second, coefficients, True)
 
 
@@ -371,8 +370,7 @@ def _check_names(structure: Structure) -> None:
         ("actuators", [actuator.name for actuator in structure.actuators]),
     ):
         twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ValueError(f"Two {what} have the name {twice[0]!r}.")
+        refuse_any(twice, f"Two {what} have the name", ".")
 
 
 def _check_stops(structure: Structure) -> None:
@@ -418,14 +416,16 @@ def _matrix(orientation: Any, name: str) -> Matrix | None:
     exact_numbers([x for x in jax.tree.leaves(orientation) if not isinstance(x, str)], f"The orientation of {name!r}")
     try:
         if len(orientation) == 2 and isinstance(orientation[0], str):
-            R = np.array(_numpy_sequence(*orientation))
+            R = np.array(rotations.sequence_matrix(orientation[0], [float(x) for x in orientation[1]]))
         elif np.shape(orientation) == (4,):
             e = np.asarray(orientation, float)
             R = np.array(rotations.euler_parameters_matrix([float(x) for x in e / np.linalg.norm(e)]))
         else:
             R = np.asarray(orientation, float).T  # columns are the axes
-        if R.shape != (3, 3) or not (np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0):
-            raise ValueError("not a rotation matrix")
+        refuse_if(
+            R.shape != (3, 3) or not (np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0),
+            "not a rotation matrix",
+        )
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"{name!r}: the orientation must be four Euler parameters (scalar last), a sequence with its angles, e.g. "
@@ -435,14 +435,3 @@ def _matrix(orientation: Any, name: str) -> Matrix | None:
     R = R if np.abs(U @ Vt - R).max() < 1e-15 else U @ Vt
     R = np.array([[exact(x) for x in row] for row in R])
     return None if np.array_equal(R, np.eye(3)) else tuple(tuple(float(x) for x in row) for row in R)  # type: ignore
-
-
-def _numpy_sequence(sequence: str, angles: Sequence[float]) -> np.ndarray:
-    R = np.eye(3)
-    for axis, angle in zip(rotations.axes_of(sequence), angles, strict=True):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        turn = np.eye(3)
-        turn[i, i] = turn[j, j] = np.cos(angle)
-        turn[i, j], turn[j, i] = np.sin(angle), -np.sin(angle)
-        R = turn @ R
-    return R

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 import scipy.linalg
 
-from .._common.lookup import as_names, not_there, real_number
+from .._common.lookup import as_names, checked, real_number, refuse_any, refuse_if, refuse_unknown
 from .._scalarjit.compat import Tracer
 from ._joints import JointType
 from ._mechanism import Field, LinkStructure, LoopStructure, Structure, class_of, loop_residuals, polynomial
@@ -22,36 +22,48 @@ to its plane is not exactly redundant. As a constraint, it would lock the loop."
 _ATTEMPTS = 6
 
 
-class LoopChoices(NamedTuple):
-    """How loops are solved.
+def with_dependent(
+    structure: Structure,
+    fields: tuple[Field, ...],
+    values: dict[str, Any],
+    dependent: Sequence[str] | None = None,
+    independent: Sequence[str] = (),
+    pose: Mapping[str, float] | None = None,
+) -> Structure:
+    """The structure with its dependent speeds and coordinates, and with the independent residuals.
 
+    **Arguments:**
+
+    - `structure`, `fields`, `values`: of the mechanism.
     - `dependent`: hinges and sliders that are solved for. None: the best-conditioned choice.
     - `independent`: joints that must not be solved for.
     - `pose`: coordinates by name, at which the choice is made. None: near the reference.
+
+    **Raises:** `ValueError` for unknown names.
     """
-
-    dependent: Sequence[str] | None = None
-    independent: Sequence[str] = ()
-    pose: Mapping[str, float] | None = None
-
-
-def with_dependent(
-    structure: Structure, fields: tuple[Field, ...], values: dict[str, Any], choices: LoopChoices
-) -> Structure:
-    """The structure with its dependent speeds and coordinates, and with the independent residuals."""
     norms = [joint.name + joint.coordinates[-1][0] for joint in structure.joints if len(joint.coordinates) > 1]
-    choices = _checked_choices(structure, choices)
+    coordinates = [name for joint in structure.joints for name in joint.names(joint.coordinates)]
+    independent = as_names(independent, "independent")
+    dependent = None if dependent is None else as_names(dependent, "dependent")
+    checked(pose, Mapping | None, "`pose` must be a dict of coordinates by name")
+    for what, names, known, kind in (
+        ("independent", independent, [joint.name for joint in structure.joints], "the joints"),
+        ("pose", pose or (), coordinates, "the coordinates"),
+    ):
+        refuse_unknown(names, known, f"`{what}` names what is not among {kind}:")
+    for name, value in (pose or {}).items():
+        number = real_number(value, f"`pose`: {name!r}")
+        refuse_if(not np.isfinite(number), f"`pose`: {name!r} = {value!r} is not finite.")
+    both = [name for name in dependent or () if name in independent]
+    refuse_any(both, "`dependent` and `independent` both name", ". Name it in one of them.")
     if not (structure.loops or structure.couplings):
-        if choices.dependent:
-            raise ValueError(
-                f"`dependent` names {', '.join(choices.dependent)}, but the mechanism has no loop. Omit `dependent`."
-            )
+        refuse_any(dependent or (), "`dependent` names", ", but the mechanism has no loop. Omit `dependent`.")
         return structure._replace(dependent_coordinates=tuple(norms))
     with jax.ensure_compile_time_eval():  # trial numbers must be concrete also inside `jax.jit`
         trial = _Trial(structure, fields, values)
         is_concrete = not any(isinstance(x, Tracer) or np.ndim(x) for x in values.values())
-        q, rows, redundant = _independent_residuals(trial, choices.pose, is_concrete)
-        speeds, coordinates = _dependent_names(trial, q, rows, choices, norms)
+        q, rows, redundant = _independent_residuals(trial, pose, is_concrete)
+        speeds, coordinates = _dependent_names(trial, q, rows, dependent, independent, norms)
     if len(rows) == len(trial.speeds):
         warnings.warn(
             f"{structure.name}: no independent speed: {len(rows)} speeds, and {len(rows)} independent residuals of the "
@@ -62,8 +74,8 @@ def with_dependent(
     first, loops = 0, []
     for loop in structure.loops:
         own = range(first, first + loop.size)
-        independent, dropped = (tuple(i - first for i in own if i in places) for places in (rows, redundant))
-        loops.append(loop._replace(independent=independent, dropped=dropped))
+        kept, dropped = (tuple(i - first for i in own if i in places) for places in (rows, redundant))
+        loops.append(loop._replace(independent=kept, dropped=dropped))
         first += loop.size
     return structure._replace(
         loops=tuple(loops),
@@ -71,30 +83,6 @@ def with_dependent(
         dependent_speeds=tuple(name for name in trial.speeds if name in speeds),
         dependent_coordinates=tuple(name for name in trial.coordinates if name in coordinates),
     )
-
-
-def _checked_choices(structure: Structure, choices: LoopChoices) -> LoopChoices:
-    """**Raises:** `ValueError` for unknown names."""
-    choices = choices._replace(independent=as_names(choices.independent, "independent"))
-    if choices.pose is not None and not isinstance(choices.pose, Mapping):
-        raise TypeError(f"`pose` must be a dict of coordinates by name, got {choices.pose!r}.")
-    coordinates = [name for joint in structure.joints for name in joint.names(joint.coordinates)]
-    joints = [joint.name for joint in structure.joints]
-    for what, names, known, kind in (
-        ("independent", choices.independent, joints, "the joints"),
-        ("pose", choices.pose or (), coordinates, "the coordinates"),
-    ):
-        wrong = [name for name in names if name not in known]
-        if wrong:
-            raise ValueError(f"`{what}`: " + str(not_there(wrong[0], known, kind).args[0]))
-    for name, value in (choices.pose or {}).items():
-        if not np.isfinite(real_number(value, f"`pose`: {name!r}")):
-            raise ValueError(f"`pose`: {name!r} = {value!r} is not finite.")
-    dependent = None if choices.dependent is None else as_names(choices.dependent, "dependent")
-    both = [name for name in dependent or () if name in choices.independent]
-    if both:
-        raise ValueError(f"`dependent` and `independent` both name {both[0]!r}. Name it in one of them.")
-    return choices._replace(dependent=dependent)
 
 
 def _independent_residuals(
@@ -132,28 +120,33 @@ def _independent_residuals(
 
 
 def _dependent_names(
-    trial: _Trial, q: np.ndarray, rows: list[int], choices: LoopChoices, norms: list[str]
+    trial: _Trial,
+    q: np.ndarray,
+    rows: list[int],
+    dependent: Sequence[str] | None,
+    independent: Sequence[str],
+    norms: list[str],
 ) -> tuple[list[str], list[str]]:
     """Speeds and coordinates for which the residuals can be solved, including those for the `norms` of Euler
     parameters."""
     structure, C = trial.structure, trial.velocity_slopes(q)[rows]  # (k,n)
-    if choices.dependent is not None:
-        return _named_dependent(trial, C, choices.dependent, norms)
+    if dependent is not None:
+        return _named_dependent(trial, C, dependent, norms)
     follows = [f"{x.first}_rate" for x in structure.couplings]
     # The first joint of a coupling follows the second one, so its rate should be the dependent one.
     preferred = C * [1e3 if name in follows else 1.0 for name in trial.speeds]
-    groups = _by_joints(structure, trial.speeds, lambda joint: joint.speeds, choices.independent)
+    groups = _by_joints(structure, trial.speeds, lambda joint: joint.speeds, independent)
     chosen = _best_columns(preferred, groups)
-    if len(chosen) < len(rows):
-        raise ValueError(
-            f"{structure.name}: the loops have {len(rows)} independent residuals, and cannot be solved without the "
-            f"joints that `independent` names: {', '.join(choices.independent)}. Name fewer."
-        )
+    refuse_if(
+        len(chosen) < len(rows),
+        f"{structure.name}: the loops have {len(rows)} independent residuals, and cannot be solved without the "
+        f"joints that `independent` names: {', '.join(independent)}. Name fewer.",
+    )
     speeds = [trial.speeds[i] for i in chosen]
     if all(name.endswith("_rate") for name in speeds):
         return speeds, [*(name.removesuffix("_rate") for name in speeds), *norms]
     G = np.concatenate([trial.slopes(q)[rows], trial.norm_slopes(q)])
-    groups = _by_joints(structure, trial.coordinates, lambda joint: joint.coordinates, choices.independent)
+    groups = _by_joints(structure, trial.coordinates, lambda joint: joint.coordinates, independent)
     # The norms of Euler parameters of an independent ball joint remain constraints.
     groups.append([i for i, name in enumerate(trial.coordinates) if name in norms])
     return speeds, [trial.coordinates[i] for i in _best_columns(G, groups)]
@@ -163,18 +156,18 @@ def _named_dependent(
     trial: _Trial, C: np.ndarray, dependent: Sequence[str], norms: list[str]
 ) -> tuple[list[str], list[str]]:
     simple = [joint.name for joint in trial.structure.joints if len(joint.speeds) == 1]
-    wrong = [name for name in dependent if name not in simple]
-    if wrong:
-        raise ValueError("`dependent`: " + str(not_there(wrong[0], simple, "the hinges and sliders").args[0]))
-    if len(set(dependent)) != len(C):
-        raise ValueError(
-            f"`dependent` names {len(set(dependent))} joints, but the loops have {len(C)} independent residuals. Name "
-            "one joint for each."
-        )
+    refuse_unknown(dependent, simple, "`dependent` names what is not among the hinges and sliders:")
+    refuse_if(
+        len(set(dependent)) != len(C),
+        f"`dependent` names {len(set(dependent))} joints, but the loops have {len(C)} independent residuals. Name "
+        "one joint for each.",
+    )
     speeds = [f"{name}_rate" for name in dependent]
     columns = C[:, [trial.speeds.index(name) for name in speeds]]
-    if np.linalg.svd(columns, compute_uv=False)[-1] < 1e-9 * np.abs(C).max():
-        raise ValueError(f"`dependent`: the loops cannot be solved for {', '.join(dependent)}. Name other joints.")
+    refuse_if(
+        np.linalg.svd(columns, compute_uv=False)[-1] < 1e-9 * np.abs(C).max(),
+        f"`dependent`: the loops cannot be solved for {', '.join(dependent)}. Name other joints.",
+    )
     return speeds, [*dependent, *norms]
 
 
@@ -236,7 +229,6 @@ _KINEMATIC = ("position", "anchor", "site")
 
 
 def _chain_to(links: Mapping[str, LinkStructure], name: str | None) -> list[str]:
-    """The names of the links from the ground to a link."""
     chain: list[str] = []
     while name is not None:
         chain.append(name)
@@ -275,18 +267,16 @@ class _Trial:
         places += [abs(joint.reference) for joint in structure.joints if joint.coordinates[0][1] == "m"]
         self.length = max(places, default=0.0) or 1.0  # [m]
 
-        def in_unit(unit: str) -> float:
-            return self.length if unit in ("m", "m/s") else 1.0
-
-        self.coordinate_units = np.array([in_unit(unit) for joint in structure.joints for _, unit in joint.coordinates])
-        self.speed_units = np.array([in_unit(unit) for joint in structure.joints for _, unit in joint.speeds])
+        sizes, joints = {"m": self.length, "m/s": self.length}, structure.joints
+        self.coordinate_units = np.array([sizes.get(unit, 1.0) for joint in joints for _, unit in joint.coordinates])
+        self.speed_units = np.array([sizes.get(unit, 1.0) for joint in joints for _, unit in joint.speeds])
         self.closures = [_Closure(structure, fields, numbers, loop) for loop in structure.loops]
         self.in_q = [[self.coordinates.index(name) for name in closure.coordinates] for closure in self.closures]
         self.in_u = [[self.speeds.index(name) for name in closure.speeds] for closure in self.closures]
         loops = [closure.length if i < 3 else 1.0 for closure in self.closures for i in range(closure.size)]
         first = [self.coordinate_units[self.coordinates.index(x.first)] for x in structure.couplings]
         self.residual_units = np.array([*loops, *first])
-        joints = [joint for joint in structure.joints if len(joint.coordinates) > 1]
+        joints = [joint for joint in joints if len(joint.coordinates) > 1]
         last = [self.coordinates.index(joint.name + joint.coordinates[-1][0]) for joint in joints]
         self.euler_parameters = [slice(i - 3, i + 1) for i in last]
 

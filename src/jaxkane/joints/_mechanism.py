@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from .._common.lookup import hint, not_there
+from .._common.lookup import not_there, refuse_any, refuse_unknown
 from .._kane.contact import Contact, DryFriction
 from .._scalarjit.components import (
     ZERO3,
@@ -108,8 +108,8 @@ _OWNERS = {
 class NamedParameters(dict[str, Any]):
     """Parameters by name. A structural zero is not a parameter; looking it up raises an exception."""
 
-    def __init__(self, of: str, structure: Structure):
-        super().__init__()
+    def __init__(self, of: str, structure: Structure, values: Iterable[tuple[str, Any]] = ()):
+        super().__init__(values)
         self.of, self.structure = of, structure
 
     def __missing__(self, name: str) -> Any:
@@ -130,9 +130,7 @@ def _flat(named: NamedParameters) -> tuple[list[tuple[Any, Any]], tuple[Any, ...
 
 def _from_flat(static: tuple[Any, ...], values: Any) -> NamedParameters:
     of, structure, *names = static
-    named = NamedParameters(of, structure)
-    named.update(zip(names, values, strict=True))
-    return named
+    return NamedParameters(of, structure, zip(names, values, strict=True))
 
 
 jax.tree_util.register_pytree_with_keys(NamedParameters, _flat, _from_flat)
@@ -158,11 +156,22 @@ class Mechanism(System):
 
     def __init__(self, **values: Any):
         for field in dataclasses.fields(self):  # names with a dot cannot be keyword arguments
-            setattr(self, field.name, values.pop(field.name) if field.name in values else _default(self, field))
+            value = values.pop(field.name, dataclasses.MISSING)
+            if value is dataclasses.MISSING:  # a parameter that a subclass of a mechanism's class adds
+                factory = field.default_factory
+                value = field.default if factory is dataclasses.MISSING else factory()
+            if value is dataclasses.MISSING:
+                raise TypeError(f"{type(self).__name__}: the parameter {field.name} is missing and has no default.")
+            setattr(self, field.name, value)
         if values:
             raise TypeError(f"{type(self).__name__} has no parameter {', '.join(values)}.")
 
     def __reduce__(self) -> Any:
+        if equipment := vars(type(self)).get("equipment"):
+            kind, outputs, names = equipment
+            own = {name: getattr(self, name) for name in names}
+            rest = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in own}
+            return Mechanism.with_outputs, (kind(**rest), outputs, own)
         if type(self) is not class_of(self.structure, _fields(type(self))):  # a class that inherits from it
             return super().__reduce__()
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
@@ -171,9 +180,7 @@ class Mechanism(System):
     def replace(self, values: Mapping[str, Any]) -> Mechanism:
         """A copy with other parameters, by name. **Raises:** `ValueError` for an unknown name."""
         names = [field.name for field in dataclasses.fields(self)]
-        wrong = [name for name in values if name not in names]
-        if wrong:
-            raise ValueError(f"{type(self).__name__} has no parameter {wrong[0]!r}; {hint(wrong, names, 'it has')}")
+        refuse_unknown(values, names, f"{type(self).__name__} has no parameter", "it has")
         return dataclasses.replace(self, **values)
 
     def with_outputs(self, outputs: Callable[..., Any], parameters: Mapping[str, Any] | None = None) -> Mechanism:
@@ -195,8 +202,7 @@ class Mechanism(System):
         """
         extra = dict(parameters or {})
         twice = [name for name in extra if hasattr(self, name) or not name.isidentifier()]
-        if twice:
-            raise ValueError(f"{type(self).__name__}: {twice[0]!r} cannot be the name of an additional parameter.")
+        refuse_any(twice, f"{type(self).__name__}:", " cannot be the name of an additional parameter.")
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         kind: Any = type(self)
         return _equipped(kind, outputs, tuple(extra))(**values, **extra)
@@ -219,12 +225,9 @@ class Mechanism(System):
             carried[link.name] = F, P
         return carried, joints
 
-    def sites_at(self, q: Any, u: Any) -> dict[str, tuple[Frame, Point]]:
-        """The frames and points of the sites."""
-        return self._sites(self._tree(q, u)[0])
-
-    def _sites(self, carried: dict[str | None, tuple[Frame, Point]]) -> dict[str, tuple[Frame, Point]]:
-        sites = {}
+    def sites_at(self, q: Any, u: Any, carried: Any = None) -> dict[str, tuple[Frame, Point]]:
+        """The frames and points of the sites. `carried`: those of the links, if known."""
+        carried, sites = self._tree(q, u)[0] if carried is None else carried, {}
         for site in self.structure.sites:
             F, P = carried[site.link]
             point = P.fixed(F.vector(*_triple(self, f"site.{site.name}")))
@@ -245,7 +248,7 @@ class Mechanism(System):
             armature = _read(self, f"armature.{joint.name}")
             if not is_zero(armature):
                 bodies += joint.rotors(N, joints[joint.name].child_point, armature, _own(joint, q, u)[1])
-        sites = self._sites(carried)
+        sites = self.sites_at(q, u, carried)
         points |= {name: point for name, (_, point) in sites.items()}
         frames = {
             at.child_frame.name: at.child_frame for at in joints.values() if at.child_frame is not at.parent_frame
@@ -267,10 +270,8 @@ class Mechanism(System):
 
     def configuration_constraints(self, t, q):
 
-        def own(joint: JointType) -> list[Component]:
-            return [q[name] for name in joint.names(joint.coordinates)]
-
-        norms = [x for joint in self.structure.joints for x in joint.norm(own(joint))]
+        own = [[q[name] for name in joint.names(joint.coordinates)] for joint in self.structure.joints]
+        norms = [x for joint, values in zip(self.structure.joints, own, strict=True) for x in joint.norm(values)]
         if not (self.structure.loops or self.structure.couplings):
             return norms
         loops = self._loops_at_rest(t, q, independent=True)
@@ -287,13 +288,10 @@ class Mechanism(System):
         """The limits and the dry friction of the joints: the `contacts` of a mechanism that has these."""
         contacts: dict[str, Contact | DryFriction] = {}
         for joint in self.structure.joints:
-            has_lower, has_upper = joint.has_stops
-            if has_lower:
-                gap = sub(q[joint.name], _read(self, f"lower.{joint.name}"))
-                contacts[f"{joint.name} lower"] = Contact(gap=gap)
-            if has_upper:
-                gap = sub(_read(self, f"upper.{joint.name}"), q[joint.name])
-                contacts[f"{joint.name} upper"] = Contact(gap=gap)
+            for end, sign, has in zip(("lower", "upper"), (1.0, -1.0), joint.has_stops, strict=True):
+                if has:
+                    gap = mul(sign, sub(q[joint.name], _read(self, f"{end}.{joint.name}")))
+                    contacts[f"{joint.name} {end}"] = Contact(gap=gap)
             if joint.has_friction:
                 friction = _read(self, f"friction.{joint.name}")
                 contacts[f"{joint.name} friction"] = DryFriction(u[f"{joint.name}_rate"], friction)
@@ -317,7 +315,6 @@ def _triple(mechanism: Mechanism, name: str) -> Triple:
 
 
 def _own(joint: JointType, q: Any, u: Any) -> tuple[list[Component], list[Component]]:
-    """The joint's own coordinates and speeds."""
     return [q[name] for name in joint.names(joint.coordinates)], [u[name] for name in joint.names(joint.speeds)]
 
 
@@ -359,15 +356,6 @@ class MechanismMotion(Motion):
 
     joints: dict[str, JointKinematics]
     sites: dict[str, tuple[Frame, Point]]
-
-
-def _default(mechanism: Mechanism, field: dataclasses.Field[Any]) -> Any:
-    """The default of a parameter that a subclass of a mechanism's class adds."""
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    if field.default is not dataclasses.MISSING:
-        return field.default
-    raise TypeError(f"{type(mechanism).__name__}: the parameter {field.name} is missing and has no default.")
 
 
 def _view(kind: str) -> property:
@@ -498,29 +486,16 @@ def class_of(structure: Structure, fields: tuple[Field, ...]) -> type[Mechanism]
 
 @functools.lru_cache(maxsize=1000)
 def _equipped(kind: type[Mechanism], outputs: Callable[..., Any], names: tuple[str, ...]) -> type[Mechanism]:
-    """A class of mechanisms with outputs, and parameters that these read."""
     members: dict[str, Any] = {
         "__module__": __name__,
         "__doc__": kind.__doc__,
         "__annotations__": dict.fromkeys(names, Scalar),
         "__init__": Mechanism.__init__,
-        "__reduce__": _reduced_with_outputs,
         "outputs": outputs,
         "equipment": (kind, outputs, names),
         **{name: parameter() for name in names},
     }
     return type(Mechanism)(kind.__name__, (kind,), members)  # pyright: ignore
-
-
-def _reduced_with_outputs(self: Any) -> Any:
-    kind, outputs, names = type(self).equipment
-    own = {name: getattr(self, name) for name in names}
-    rest = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in own}
-    return _restored_with_outputs, (kind(**rest), outputs, own)
-
-
-def _restored_with_outputs(mechanism: Mechanism, outputs: Callable[..., Any], own: dict[str, Any]) -> Mechanism:
-    return mechanism.with_outputs(outputs, own)
 
 
 def _restored(structure: Structure, fields: tuple[Field, ...], values: dict[str, Any]) -> Mechanism:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from .._common.lookup import checked
 from .._scalarjit.components import Component, component, is_zero, mul, positive
 from .._system.kinematics import Frame, Point, Vector, check_vector
 from .._system.motion import Body, Force, Torque, point_of
@@ -76,7 +77,8 @@ def torsional_spring(
     - `angle`: angle of `on` relative to `reaction_on` about the axis, from rest [rad].
     - `stiffness`: [N m/rad], or a function angle [rad] -> torque [N m].
     """
-    return (Torque(-_law(stiffness, angle) * _direction(axis), on, reaction_on),)
+    axis = check_vector(axis, "The axis of a hinge").normalize()
+    return (Torque(-_law(stiffness, angle) * axis, on, reaction_on),)
 
 
 def torsional_damper(on: Frame | Body, reaction_on: Frame | Body | None, axis: Vector, damping: Law) -> tuple[Torque]:
@@ -89,8 +91,11 @@ def torsional_damper(on: Frame | Body, reaction_on: Frame | Body | None, axis: V
     - `on`, `reaction_on`, `axis`: as `torsional_spring`.
     - `damping`: [N m s/rad], or a function rate [rad/s] -> torque [N m].
     """
-    axis = _direction(axis)
-    return (Torque(-_law(damping, _rate(on, reaction_on).dot(axis)) * axis, on, reaction_on),)
+    axis = check_vector(axis, "The axis of a hinge").normalize()
+    for part, kind in ((on, Frame | Body), (reaction_on, Frame | Body | None)):
+        checked(part, kind, "A hinge connects Frames or Bodies")
+    rate = on.angular_velocity if reaction_on is None else on.angular_velocity - reaction_on.angular_velocity
+    return (Torque(-_law(damping, rate.dot(axis)) * axis, on, reaction_on),)
 
 
 def friction(
@@ -174,11 +179,6 @@ def drag(
     return (Force(-(linear + component(coefficient) * smooth_abs(v, speed)) * v, P),)
 
 
-def _direction(axis: Vector) -> Vector:
-    check_vector(axis, "The axis of a hinge")
-    return axis.normalize()
-
-
 def _law(law: Law, x: Component) -> Component:
     return law(x) if callable(law) else component(law) * x
 
@@ -196,13 +196,6 @@ class ElementForce(Force):
 def _pair(kind: str, pull: Vector, P: Point, Q: Point) -> tuple[Force, Force]:
     """`pull` acts on P towards Q, and its reaction on Q."""
     return ElementForce(kind, pull, P, Q), Force(-pull, Q)
-
-
-def _rate(on: Frame | Body, reaction_on: Frame | Body | None) -> Vector:
-    for part in (on, reaction_on):
-        if not isinstance(part, (Frame, Body, type(None))) or on is None:
-            raise TypeError(f"A hinge connects Frames or Bodies, got {part!r}.")
-    return on.angular_velocity if reaction_on is None else on.angular_velocity - reaction_on.angular_velocity
 
 
 def rotor(
@@ -234,10 +227,8 @@ def rotor(
 
     **Raises:** `TypeError` for arguments of a wrong type. `ValueError` for a particle as carrier.
     """
-    if not isinstance(axis, Vector):
-        raise TypeError(f"rotor(inertia, axis, ...): the axis is a Vector such as A.x, got {axis!r}.")
-    if not isinstance(carrier, (Frame, Body)):
-        raise TypeError(f"rotor(inertia, axis, rate, carrier, ...): the carrier is a Frame or a Body, got {carrier!r}.")
+    checked(axis, Vector, "rotor(inertia, axis, ...): the axis is a Vector such as A.x")
+    checked(carrier, (Frame, Body), "rotor(inertia, axis, rate, carrier, ...): the carrier is a Frame or a Body")
     if isinstance(carrier, Body) and carrier.is_particle:
         raise ValueError(
             f"rotor: {carrier.name!r} is a particle, which has no frame. Pass the frame that carries {name!r}."
@@ -246,8 +237,9 @@ def rotor(
     axis = axis.normalize()
     a = axis.components_in(frame)
     moments = tuple(tuple(mul(inertia, mul(x, y)) for y in a) for x in a)
-    omega = frame.angular_velocity + rate * axis
-    return Body(mass, moments, at.center if isinstance(at, Body) else at, frame, omega, name=name)
+    return Body(
+        mass, moments, at.center if isinstance(at, Body) else at, frame, frame.angular_velocity + rate * axis, name=name
+    )
 
 
 def dc_motor(voltage: Component, rate: Component, constant: Component, resistance: Component) -> Component:

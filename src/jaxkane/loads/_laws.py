@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from .._common.lookup import refuse_if
 from .._scalarjit.components import Component, positive
 from .._system.kinematics import Vector
 
@@ -124,8 +125,7 @@ def dead_zone(x: Component, lower: Component | None, upper: Component | None, *,
     check_numbers(
         "dead_zone", x=x, width=width, **{k: e for k, e in (("lower", lower), ("upper", upper)) if e is not None}
     )
-    if lower is None and upper is None:
-        raise ValueError("dead_zone(x, lower, upper): pass at least one of `lower` and `upper`.")
+    refuse_if(lower is None and upper is None, "dead_zone(x, lower, upper): pass at least one of `lower` and `upper`.")
     ends = [float(x) for x in (lower, upper) if isinstance(x, (int, float))]
     if not all(map(math.isfinite, ends)) or (len(ends) == 2 and ends[0] > ends[1]):
         raise ValueError(
