@@ -19,7 +19,7 @@ from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
 from .._system.system import System
 from ._figures import COLORS, Figure, Record, bodies_and_points, figure_of, record
-from ._scene import FIXED, UPRIGHT, Builder, Scene, project, turned_by, upward_axis, view_of
+from ._scene import FIXED, UPRIGHT, Builder, Scene, angles_of, project, turned_by, upward_axis, view_of
 
 _FRAMES_PER_SECOND = 50.0
 _MOST_FRAMES = 3000
@@ -71,15 +71,14 @@ def animate(
 
     **Raises:** `ValueError` for a batch, for a trajectory of another system, and if no body has a position.
     """
-    if up is not None and up not in UPRIGHT:
-        raise ValueError(f"animate: `up` must be one of {', '.join(UPRIGHT)}, got {up!r}.")
-    if theme not in _THEMES:
-        raise ValueError(f"animate: `theme` must be one of {', '.join(_THEMES)}, got {theme!r}.")
+    for label, value, allowed in (("up", "z" if up is None else up, UPRIGHT), ("theme", theme, _THEMES)):
+        if value not in tuple(allowed):
+            raise ValueError(f"animate: `{label}` must be one of {', '.join(allowed)}, got {value!r}.")
     positive_number(speed, "animate: `speed`")
     positive_number(height, "animate: `height`")
-    figure = figure or figure_of(system)
+    angles, figure = angles_of(azimuth, elevation), figure or figure_of(system)
     scene = _scene(record(system, trajectory, figure), figure, speed, up, follow, ground, title, type(system).__name__)
-    scene = dataclasses.replace(scene, view=scene.view.seen_from(azimuth, elevation))
+    scene = dataclasses.replace(scene, view=dataclasses.replace(scene.view, **angles))
     return Animation(scene, speed, theme, height)
 
 
@@ -151,10 +150,6 @@ class Animation:
 
     def html(self) -> str:
         """The page: one canvas and its script. It does not load anything."""
-        return self._page
-
-    @functools.cached_property
-    def _page(self) -> str:
         page = resources.files("jaxkane._animate").joinpath("viewer.html").read_text(encoding="utf-8")
         scene = json.dumps(_compact(self.scene, self.speed), separators=(",", ":")).replace("<", "\\u003c")
         for mark, text in (("theme", self.theme), ("title", html.escape(self.scene.title)), ("scene", scene)):
@@ -239,7 +234,7 @@ def _write_gif(
     """Write into the open file; see `Animation.save`."""
     from PIL import Image, ImageDraw
 
-    view = scene.view.seen_from(azimuth, elevation)
+    view = dataclasses.replace(scene.view, **angles_of(azimuth, elevation))
     seconds = None if seconds is None else positive_number(seconds, "Animation.save: `seconds`")
     # A GIF has delays in hundredths of a second; browsers need at least two.
     hundredths = max(2, round(100.0 / positive_number(fps, "Animation.save: `fps`")))
@@ -253,7 +248,11 @@ def _write_gif(
         target, span = (center_of_mass[i], view.span_following) if view.follow else (view.center, view.span)
         image = Image.new("RGB", (size[0] * _FINE, size[1] * _FINE), painter.color("paper"))
         to_page = functools.partial(project, target=target, view=view, span=span)
-        painter.paint(ImageDraw.Draw(image, "RGBA"), i, x, to_page, _grid(target, span))
+        # Centre, step [m] and number of lines to each side of the grid, which does not move with the view
+        step = 10.0 ** np.floor(np.log10(0.3 * span))
+        step *= max(k for k in (1, 2, 5) if k * step <= 0.3 * span)
+        grid = np.round(target[:2] / step) * step, step, 8
+        painter.paint(ImageDraw.Draw(image, "RGBA"), i, x, to_page, grid)
         images.append(image.resize(size, Image.Resampling.LANCZOS))
     # One palette for all frames, because changing palettes flicker: every colour, blended in steps with the background.
     palette = Image.new("P", (1, 1))
@@ -341,11 +340,3 @@ def zigzag(ends: list[tuple[float, float]]) -> list[Any]:
     start, axis = np.array(ends[0]), np.subtract(ends[1], ends[0])
     across = _FINE * np.array([-axis[1], axis[0]]) / (np.linalg.norm(axis) or 1.0)
     return [tuple(start + s * axis + a * across) for s, a in _SPRING]
-
-
-def _grid(target: np.ndarray, span: float) -> tuple[np.ndarray, float, int]:
-    """Centre (2,), step [m] and number of lines to each side of the grid on the ground. The grid does not move with the
-    view."""
-    step = 10.0 ** np.floor(np.log10(0.3 * span))
-    step *= max(k for k in (1, 2, 5) if k * step <= 0.3 * span)
-    return np.round(target[:2] / step) * step, step, 8

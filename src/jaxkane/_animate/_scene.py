@@ -27,17 +27,18 @@ class View:
     follow: bool
     span_following: float
 
-    def seen_from(self, azimuth: float | None, elevation: float | None) -> View:
-        """The view from other angles [degrees]; None keeps an angle.
 
-        **Raises:** `ValueError` for an angle that is not finite.
-        """
-        angles = {"azimuth": azimuth, "elevation": elevation}
-        angles = {key: real_number(x, f"`{key}`") for key, x in angles.items() if x is not None}
-        wrong = [key for key, x in angles.items() if not np.isfinite(x)]
-        if wrong:
-            raise ValueError(f"`{wrong[0]}` must be finite, got {angles[wrong[0]]}.")
-        return dataclasses.replace(self, **{key: float(np.deg2rad(x)) for key, x in angles.items()})
+def angles_of(azimuth: float | None, elevation: float | None) -> dict[str, float]:
+    """The angles of a `View` from angles [degrees]; None keeps an angle.
+
+    **Raises:** `ValueError` for an angle that is not finite.
+    """
+    angles = {"azimuth": azimuth, "elevation": elevation}
+    angles = {key: float(np.deg2rad(real_number(x, f"`{key}`"))) for key, x in angles.items() if x is not None}
+    wrong = [key for key, x in angles.items() if not np.isfinite(x)]
+    if wrong:
+        raise ValueError(f"`{wrong[0]}` must be finite, got {angles[wrong[0]]}.")
+    return angles
 
 
 UPRIGHT = {
@@ -203,7 +204,10 @@ class Builder:
                 self._add_vertices(local.mean(axis=0), "part", k)
                 return
         if x.shape[1] == 1:
-            self._add_vertices(np.zeros((1, 3)), "path", self._path(x[:, 0]))
+            same = [k for k, path in enumerate(self.paths) if np.abs(path - x[:, 0]).max() <= self.tolerance]
+            if not same:
+                self.paths.append(x[:, 0])
+            self._add_vertices(np.zeros((1, 3)), "path", same[0] if same else len(self.paths) - 1)
         elif not self._turn_about_the_first(x):
             for i in range(x.shape[1]):
                 self.moving(x[:, i : i + 1])
@@ -224,13 +228,6 @@ class Builder:
     @staticmethod
     def _components(R: np.ndarray, origin: np.ndarray, x: np.ndarray) -> np.ndarray:
         return np.einsum("tji,tnj->tni", R, x - origin[:, None])
-
-    def _path(self, x: np.ndarray) -> int:
-        for k, path in enumerate(self.paths):
-            if np.abs(path - x).max() <= self.tolerance:
-                return k
-        self.paths.append(x)
-        return len(self.paths) - 1
 
     def _add_vertices(self, vertices: np.ndarray, kind: str, number: int) -> None:
         self.vertices.extend(np.asarray(vertices, dtype=float))

@@ -80,13 +80,9 @@ def falling(quantity: Component, *, then: Any = None, when: Component | None = N
 
 
 def _stages(then: Any) -> tuple[Any, ...]:
-    if then is None:
-        return ()
-    if isinstance(then, (tuple, list)):
-        if not then:
-            raise ValueError("`then` is an empty tuple. Pass at least one stage, or omit `then` to end the simulation.")
-        return tuple(then)
-    return (then,)
+    if isinstance(then, (tuple, list)) and not then:
+        raise ValueError("`then` is an empty tuple. Pass at least one stage, or omit `then` to end the simulation.")
+    return tuple(then) if isinstance(then, (tuple, list)) else () if then is None else (then,)
 
 
 def first_crossing(
@@ -270,34 +266,30 @@ def crossings(system: System, t: Component, q: Any, u_all: Any, x: Any, dtype: D
     events = call_with_states(system.events, t, q, u_all, x)
     if not isinstance(events, Mapping):
         raise TypeError(f"{type(system).__name__}.events must return a dict of quantities by name; got {events!r}.")
-    unnamed = [name for name in events if not isinstance(name, str)]
-    if unnamed:
-        raise TypeError(f"{type(system).__name__}.events: the name of an event must be a string; got {unnamed[0]!r}.")
-    reserved = [name for name in events if name.replace("_", " ") in REASONS]
+    reserved = [name for name in events if not isinstance(name, str) or name.replace("_", " ") in REASONS]
     if reserved:
-        raise ValueError(f"{type(system).__name__}: the event name {reserved[0]!r} is reserved. Use another name.")
-    return {name: _as_crossing(name, events[name], dtype) for name in sorted(events)}
-
-
-def _as_crossing(name: str, event: Any, dtype: DTypeLike) -> Crossing:
-    if not isinstance(event, Crossing):
-        return Crossing(_as_float(name, event, dtype), 0)
-    when = None if event.when is None else _as_float(name, event.when, dtype, is_condition=True)
-    return dataclasses.replace(event, value=_as_float(name, event.value, dtype), when=when)
+        raise ValueError(
+            f"{type(system).__name__}: the event name {reserved[0]!r} is reserved, or not a string. Use another name."
+        )
+    found = {}
+    for name in sorted(events):
+        is_crossing = isinstance(events[name], Crossing)
+        event = events[name] if is_crossing else Crossing(_as_float(name, events[name], dtype), 0)
+        when = None if event.when is None else _as_float(name, event.when, dtype, is_condition=True)
+        found[name] = dataclasses.replace(event, value=_as_float(name, event.value, dtype), when=when)
+    return found
 
 
 def _as_float(name: str, event: Any, dtype: DTypeLike, is_condition: bool = False) -> Any:
     value, part = jnp.asarray(event), ": `when`" if is_condition else ""
-    if is_condition and value.dtype == bool:
-        raise TypeError(
-            f"The event {name!r}: `when` is a boolean. Pass a number that is positive where the event may occur, e.g. "
-            "when=q['x'] instead of when=q['x'] > 0."
-        )
     if value.dtype == bool:
-        raise TypeError(
-            f"The event {name!r} is a boolean. Return a smooth, signed quantity that is zero at the event, e.g. "
-            "q['h'] instead of q['h'] < 0. jaxkane.falling and jaxkane.rising select the direction of the crossing."
+        advice = (
+            "a number that is positive where the event may occur, e.g. when=q['x'] instead of when=q['x'] > 0"
+            if is_condition
+            else "a smooth, signed quantity that is zero at the event, e.g. q['h'] instead of q['h'] < 0. "
+            "jaxkane.falling and jaxkane.rising select the direction of the crossing"
         )
+        raise TypeError(f"The event {name!r}{part} is a boolean. Return {advice}.")
     if value.shape:
         raise TypeError(
             f"The event {name!r}{part} has the shape {value.shape}. Return one number per name, e.g. one event for "

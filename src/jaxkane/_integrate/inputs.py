@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from .._common.lookup import not_there, refuse_unknown
+from .._common.lookup import by_name, refuse_unknown
 from .._kane.arguments import checked_inputs, is_numeric
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import Tracer, on_device
@@ -70,8 +70,8 @@ class Samples(eqx.Module):
             raise ValueError(f"Samples: `ts` and `values` must have the same length of at least two; got {n} and {m}.")
         if not isinstance(self.ts, Tracer) and not np.all(np.diff(np.asarray(self.ts)) > 0):
             raise ValueError("Samples: `ts` must increase and be finite.")
-        _check_finite("Samples: `ts`", self.ts)
-        _check_finite("Samples: `values`", self.values)
+        check_finite("Samples: `ts`", self.ts)
+        check_finite("Samples: `values`", self.values)
 
     def __repr__(self) -> str:
         ts, values = concrete_numbers(self.ts), concrete_numbers(self.values)
@@ -101,7 +101,7 @@ class Samples(eqx.Module):
         return x0 + (x1 - x0) * w
 
 
-def _check_finite(label: str, values: Array) -> None:
+def check_finite(label: str, values: Array) -> None:
     if not isinstance(values, Tracer) and not np.all(np.isfinite(np.asarray(values))):
         raise ValueError(f"{label} contains values that are not finite: fill the gaps, or cut the record there.")
 
@@ -182,14 +182,11 @@ class InputState(eqx.Module):
     system: System
 
     def __getitem__(self, name: str) -> Component:
-        system = self.system
-        for names, values in ((system.coordinates, self.q), (system.speeds, self.u), (system.states, self.x)):
-            if values is not None and name in names:
-                return values[names.index(name)]
+        system, u_dep = self.system, None
         if name in system.dependent_speeds:
-            u_dep = KaneEquations(system, self.t, self.q, self.u).u_dep
-            return jnp.asarray(u_dep[system.dependent_speeds.index(name)])
-        raise not_there(name, [each for names in names_of(system) for each in names], "the state")
+            u_dep = jnp.stack([jnp.asarray(x) for x in KaneEquations(system, self.t, self.q, self.u).u_dep])
+        groups = zip(names_of(system), (self.q, self.u, u_dep, self.x), strict=True)
+        return by_name(name, groups, {}, "the state")
 
 
 def inputs_at(
@@ -216,8 +213,6 @@ def inputs_at(
     context = InputState(state.q, state.u, state.x, now, system)
     if callable(signals):
         values: Any = called(CONTROLLER, signals, now, context)
-        if not isinstance(values, Mapping):
-            raise TypeError(f"{CONTROLLER} must return a dict by name, got {values!r}.")
     else:
         values = {
             name: f.piece(t, at)
@@ -361,12 +356,11 @@ def _as_signal(label: str, value: Any, ts: Array) -> Any:
             "value for each of the times `ts`, with linear interpolation between them. For other times pass "
             "jaxkane.Samples(times, values)."
         )
-    _check_finite(label, array)
+    check_finite(label, array)
     return Samples(ts, array) if array.ndim else array
 
 
 def samples_of(signals: Any) -> list[Samples]:
-    """The signals that are samples."""
     return [x for x in jax.tree.leaves(signals, is_leaf=is_samples) if is_samples(x)]
 
 

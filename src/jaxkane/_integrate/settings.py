@@ -51,7 +51,6 @@ class Settings(eqx.Module):
 
     @property
     def is_forward(self) -> bool:
-        """Whether only forward mode is supported."""
         return isinstance(self.adjoint, diffrax.ForwardMode)
 
 
@@ -78,8 +77,7 @@ def settings_for(
     **Raises:** `ValueError` or `TypeError` for invalid or contradictory options.
     """
     for label, flag in (("project", project), ("progress", progress)):
-        if not isinstance(flag, (bool, np.bool_)):
-            raise TypeError(f"`{label}` must be True or False, got {flag!r}.")
+        _check_kind(label, flag, (bool, np.bool_), "True or False", may_be_omitted=False)
     _check_kind("solver", solver, diffrax.AbstractSolver, "a solver of diffrax, e.g. diffrax.Tsit5()")
     controllers = "a controller of diffrax, e.g. diffrax.PIDController(rtol=1e-6, atol=1e-6)"
     _check_kind("controller", controller, diffrax.AbstractStepSizeController, controllers)
@@ -186,7 +184,6 @@ def _changed(solver: Any, changes: Callable[[Any], dict[str, Any]]) -> Any:
 
 
 def _check_kind(label: str, value: Any, kind: Any, expected: str, may_be_omitted: bool = True) -> None:
-    """**Raises:** `TypeError` if a value is not of this kind."""
     if isinstance(value, type) and issubclass(value, kind):
         raise TypeError(f"`{label}` must be an instance, not a class: {label}=diffrax.{value.__name__}().")
     if not isinstance(value, kind) and not (value is None and may_be_omitted):
@@ -204,10 +201,11 @@ def _check_number(label: str, value: Any, is_allowed: Callable[[float], bool], a
 
 def with_array_tolerances(settings: Settings, dtype: DTypeLike) -> Settings:
     """The same with arrays as tolerances and step, so that other values do not cause a recompilation."""
-
-    def array(x: Any) -> Any:
-        # Convert a number by NumPy, which compiles nothing.
-        return x.astype(dtype) if isinstance(x, jax.Array) else jax.device_put(np.asarray(x, dtype))
-
     values = {name: getattr(settings, name) for name in ("rtol", "atol", "step", "max_step")}
-    return dataclasses.replace(settings, **{name: x if x is None else array(x) for name, x in values.items()})
+    # Convert a number by NumPy, which compiles nothing.
+    arrays = {
+        name: x.astype(dtype) if isinstance(x, jax.Array) else jax.device_put(np.asarray(x, dtype))
+        for name, x in values.items()
+        if x is not None
+    }
+    return dataclasses.replace(settings, **arrays)

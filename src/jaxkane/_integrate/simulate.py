@@ -1,4 +1,4 @@
-"""`simulate`: it checks its arguments and passes them to `solve`."""
+"""`simulate`: it checks its arguments and passes them to `solve`. `ode_term`: the equations for diffrax."""
 
 from __future__ import annotations
 
@@ -20,14 +20,24 @@ from .._kane.constraint_residuals import check_state
 from .._kane.contact import layout_of
 from .._kane.contact_checks import check_contacts
 from .._kane.diagnosis import diagnosis
-from .._kane.right_hand_side import reads_time, values_of
+from .._kane.right_hand_side import reads_time, values_of, vector_field
 from .._scalarjit.cache_key import captured_tracers
 from .._scalarjit.compat import Tracer, on_device
 from .._scalarjit.components import Inputs
 from .._scalarjit.configure import warn_of_float32
-from .._system.system import State, System
+from .._system.system import State, System, packed, unpacked
 from .events import events_of
-from .inputs import as_signals, inputs_at, is_coarse, is_samples, share_times, since, time_array, times_since
+from .inputs import (
+    as_signals,
+    check_finite,
+    inputs_at,
+    is_coarse,
+    is_samples,
+    share_times,
+    since,
+    time_array,
+    times_since,
+)
 from .integrate import refuse_captured, solve
 from .settings import settings_for, with_array_tolerances
 from .status import Status
@@ -99,7 +109,6 @@ def simulate(
     refuse_captured(system)
     warn_of_float32()
     state = checked_state(system, state)
-    refuse_not_finite(system, state)
     dtype = state.q.dtype
     ts = checked_times(ts, dtype)
     signals = as_signals(inputs, system.inputs, ts, type(system).__name__)
@@ -182,8 +191,7 @@ def checked_discontinuities(times: Any, start: Any, dtype: DTypeLike) -> Array |
     times = time_array(times, "`discontinuities`", dtype)
     if times.ndim != 1:
         raise ValueError(f"`discontinuities` must be an array (n,) of times; got the shape {times.shape}.")
-    if not isinstance(times, Tracer) and not np.all(np.isfinite(np.asarray(times))):
-        raise ValueError("`discontinuities` contains times that are not finite. Remove or correct them.")
+    check_finite("`discontinuities`", times)
     return times_since(start, times, dtype)
 
 
@@ -225,7 +233,7 @@ def on_clock(ts: Any, trajectory: Trajectory) -> dict[str, Any]:
 
 
 def checked_state(system: System, state: Any) -> State:
-    """A state of the right shape for a system."""
+    """A state of the right shape for a system. In a batch, the member's status reports values that are not finite."""
     check_is_system(system)
     name = type(system).__name__
     if not isinstance(state, State):
@@ -234,17 +242,18 @@ def checked_state(system: System, state: Any) -> State:
         )
     state = as_state(system, state)
     parts = [("q", state.q, system.coordinates), ("u", state.u, system.speeds), ("x", state.x, system.states)]
+    parts.append(("contacts", state.contacts, ("the contacts",) * layout_of(system).memory_size))
     for label, value, names in parts:
         if value is not None and value.shape != (len(names),):
             raise ValueError(
-                f"{name}: state.{label} must have the shape ({len(names)},) for {', '.join(names)}; got {value.shape}."
-                + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
+                f"{name}: state.{label} must have the shape ({len(names)},) for {', '.join(dict.fromkeys(names))}; got "
+                f"{value.shape}." + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
             )
-    if state.contacts is not None and state.contacts.shape != (size := (layout_of(system).memory_size,)):
-        raise ValueError(
-            f"{name}: state.contacts must have the shape {size}, got {state.contacts.shape}. Omit it, or pass a state "
-            "of a trajectory of this system."
-        )
+        if label != "contacts" and value is not None and is_concrete(value) and not np.all(np.isfinite(value)):
+            i = int(np.argmin(np.isfinite(value)))
+            raise ValueError(
+                f"{name}: state.{label}: {names[i]} = {float(value[i])} is not finite. Pass finite initial values."
+            )
     return state
 
 
@@ -277,14 +286,36 @@ def as_state(system: System, state: State) -> State:
     return State(arrays[0], arrays[1], arrays[2] if system.states else None, contacts)
 
 
-def refuse_not_finite(system: System, state: State) -> None:
-    """**Raises:** `ValueError` for a state that is not finite, by name. In a batch, the member's status reports this
-    instead."""
-    groups = (("q", state.q, system.coordinates), ("u", state.u, system.speeds), ("x", state.x, system.states))
-    for label, values, names in groups:
-        if values is not None and is_concrete(values) and not np.all(np.isfinite(np.asarray(values))):
-            i = int(np.argmin(np.isfinite(np.asarray(values))))
-            raise ValueError(
-                f"{type(system).__name__}: state.{label}: {names[i]} = {float(values[i])} is not finite. Pass finite "
-                "initial values."
-            )
+def ode_term(system: System, inputs: Inputs = None) -> tuple[diffrax.ODETerm, Any]:
+    """The equations of motion as a term of diffrax, and the arguments to pass with it.
+
+        term, args = jk.ode_term(system, {"push": 1.0})
+        solution = diffrax.diffeqsolve(term, diffrax.Tsit5(), 0.0, 1.0, 0.01, state, args)
+        solution.ys.q  # (1, n_q)
+
+    The solution is a `State`. The system and the state are not checked. Steps do not end at discontinuities or events.
+    Pass `stepsize_controller=diffrax.ClipStepSizeController(...)` and `event=diffrax.Event(...)`, or use `simulate`.
+
+    **Arguments:**
+
+    - `system`: a `System`.
+    - `inputs`: a dict with a number, `Samples` or a function (t, state) -> number for each input; or one function
+        (t, state) -> dict.
+
+    **Returns:**
+
+    - a `diffrax.ODETerm` of (t, y, args), in which y is a `State` with arrays, as from `assemble`.
+    - args: the system and its inputs. Solutions can be differentiated with respect to them.
+
+    **Raises:** `ValueError` for an unknown input, or for an array of samples without times.
+    """
+    check_is_system(system)
+    no_times: Any = np.zeros(0)
+    signals = as_signals(inputs, system.inputs, no_times, type(system).__name__)
+
+    def rates(t: Any, y: State, args: Any) -> State:
+        system, signals = args
+        t = jnp.asarray(t, y.q.dtype)
+        return unpacked(system, vector_field(system, t, packed(y), inputs_at(system, signals, t, y)))
+
+    return diffrax.ODETerm(rates), (system, signals)  # pyright: ignore[reportArgumentType]

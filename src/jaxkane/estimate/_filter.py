@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import refuse_unknown
 from .._integrate.jumps import refuse_jumps
-from .._integrate.simulate import checked_state, refuse_not_finite
+from .._integrate.simulate import checked_state
 from .._kane.api import dependent_speeds
 from .._kane.arguments import (
     check_is_system,
@@ -237,7 +237,6 @@ def begin(filter: Filter, state: State, deviation: Mapping[str, float], t: float
     """
     names, state = filter.names, checked_state(filter.system, state)
     check_time("begin", t)
-    refuse_not_finite(filter.system, state)
     check_state(filter.system, t, state.q)
     if is_concrete(t) and (step := float(np.spacing(np.abs(np.asarray(t, state.q.dtype))))) > 1e-3:
         raise ValueError(
@@ -391,10 +390,7 @@ def nees(belief: Belief, truth: Float[Array, " n"], age: int = 0) -> Array:
             f"nees: `truth` must be an array ({n},) in the order of `filter.names`, got {got}. The order is "
             "coordinates, speeds, states, parameters. For a State, pass jnp.concatenate([state.q, state.u])."
         )
-    return _of_rank(belief.covariance(age), truth - belief.mean[age])
-
-
-def _of_rank(P: Array, error: Array) -> Array:
+    P, error = belief.covariance(age), truth - belief.mean[age]
     # Use the rank of the correlations. With metres and nanometres, eigenvalues of P cannot be compared.
     deviation = jnp.sqrt(jnp.where(jnp.diagonal(P) > 0, jnp.diagonal(P), 1.0))
     values, vectors = jnp.linalg.eigh(P / jnp.outer(deviation, deviation))

@@ -44,14 +44,12 @@ def fits(
     """
     names = list(fit.trial_names)
     if trials is None:
-        chosen = _spread(len(names))
+        chosen = np.unique(np.linspace(0, len(names) - 1, min(len(names), _TRIALS)).astype(int)).tolist()
     else:
         chosen = [_number(names, trial) for trial in ([trials] if isinstance(trials, (str, int)) else trials)]
     all_channels = list(fit.problem.channels)
     channels = all_channels if channels is None else list(as_names(channels, "channels"))
     refuse_unknown(channels, all_channels, "fits: the fit has no channel")
-    if not channels:
-        raise ValueError(f"fits: `channels` is empty; {hint([], all_channels)}")
     units_by_name = {
         channel: unit_of(channel, units_of(fit.problem.system) | dict(units or {})) for channel in channels
     }
@@ -94,10 +92,6 @@ def _number(names: list[str], trial: str | int) -> int:
     if not isinstance(trial, str) and -len(names) <= trial < len(names):
         return range(len(names))[trial]
     raise ValueError(f"fits: the fit has no trial {trial!r}; {hint(str(trial), names)}")
-
-
-def _spread(n: int) -> list[int]:
-    return np.unique(np.linspace(0, n - 1, min(n, _TRIALS)).astype(int)).tolist()
 
 
 def residuals(
