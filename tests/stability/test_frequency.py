@@ -73,7 +73,7 @@ def test_irregular_and_unequal_sampling_is_interpolated():
 def test_invalid_arguments_raise():
     model = model_of(2.0)
     (trial,) = trials_of(model, 1, 10.0, 0.0)
-    for names, message in ((("torque", "x"), "no input 'torque'"), (("force", "y"), "no output 'y'")):
+    for names, message in ((("torque", "x"), "no input torque"), (("force", "y"), "no output y")):
         with pytest.raises(ValueError, match=message):
             frequency_response(model, trial, *names)
     with pytest.raises(ValueError, match=r"1 segment of 10 s; at least two are needed. Pass longer trials"):

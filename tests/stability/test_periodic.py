@@ -339,7 +339,7 @@ def test_a_hopf_point_starts_a_family_of_limit_cycles():
     found = family(orbit.system, orbit, towards={"mu": 1}, until={"mu": 0.5}, step=0.5, max_step=2.0)
     np.testing.assert_allclose(found["x"] ** 2 + found["v"] ** 2, found["mu"], rtol=1e-9)
     np.testing.assert_allclose(found.multipliers[-1, 0], 0.04321391826377225, rtol=1e-9)
-    with pytest.raises(ValueError, match="there is no parameter 'nu'"):
+    with pytest.raises(ValueError, match="there is no parameter nu"):
         limit_cycle(system, equilibrium(system), {"x": 0.1}, parameter="nu")
     with pytest.raises(ValueError, match="`amplitude` must be one of x, v"):
         limit_cycle(system, equilibrium(system), {"y": 0.1}, parameter="mu")
@@ -569,11 +569,11 @@ def test_an_orbit_under_a_trace_has_the_multipliers_of_all_states_that_events_us
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"section": "tap"}, "there is no event 'tap'; did you mean 'top'"),
+        ({"section": "tap"}, "there is no event tap; did you mean 'top'"),
         ({"section": "both"}, "'both' has no direction"),
         ({"section": "far"}, "the simulation of the guess ends at 0.04[0-9]* s: top"),
-        ({"period": 0.0}, "`period` must be positive and finite .s.; got 0"),
-        ({"period": float("nan")}, "`period` must be positive"),
+        ({"period": 0.0}, "`period` must be a positive .* got 0"),
+        ({"period": float("nan")}, "`period` must be a positive"),
         ({"autonomous": False}, "pass the period of the force"),
         ({"autonomous": False, "period": 6.6, "section": "top"}, "Omit `section`"),
         ({"hold": ("z",)}, "unknown: z; there are x, v"),

@@ -194,9 +194,9 @@ def test_insufficient_or_invalid_hold_conditions_raise():
         steady_turn(BIKE, {"roll": 0.1, "steer": 0.05}, {"rear_wheel_rate": -20.0})
     with pytest.raises(ValueError, match="no steady motion was found from this guess"):
         steady_turn(TOP, {}, {"precession_rate": 2.0}, hold={"nutation": 0.5, "spin_rate": 100.0})
-    with pytest.raises(ValueError, match="no lean to hold; it has roll"):
+    with pytest.raises(ValueError, match="no coordinate or speed lean; it has roll"):
         steady_turn(BIKE, hold={"lean": 0.1})
-    with pytest.raises(ValueError, match="no input torque to find"):
+    with pytest.raises(ValueError, match="no input torque"):
         steady_turn(BIKE, find=("torque",))
     none = jax.jit(lambda s: steady_turn(TOP, {}, {"precession_rate": 2.0}, hold={"nutation": 0.5, "spin_rate": s}).u)
     assert np.isnan(none(100.0)).all()

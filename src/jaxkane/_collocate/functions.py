@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -15,6 +16,7 @@ from .._integrate.events import crossings, events_of
 from .._integrate.inputs import inputs_at
 from .._integrate.jumps import stages_of, state_after
 from .._kane.api import _dependent_speeds
+from .._kane.arguments import is_one_number
 from .._kane.constraint_residuals import configuration_residual
 from .._kane.kanes_method import KaneEquations
 from .._kane.right_hand_side import outputs_at, values_of, vector_field
@@ -48,9 +50,9 @@ class Now:
         system, state = self.system, self.state
         if name in self._inputs:
             return self._inputs[name]
-        for names, values in ((system.coordinates, state.q), (system.speeds, state.u), (system.states, state.x)):
-            if name in names:
-                return values[names.index(name)]  # type: ignore[index]
+        entries = (*system.coordinates, *system.speeds, *system.states)
+        if name in entries:
+            return self._y[entries.index(name)]
         if name in system.dependent_speeds:
             u_dep = _dependent_speeds(system, self.t, state.q, state.u, {})
             return u_dep[system.dependent_speeds.index(name)]
@@ -263,27 +265,19 @@ def number(label: str, value: Any, dtype: Any) -> Array:
 
     **Raises:** `TypeError` for truth values, which have no derivative, and for anything else that is not one number.
     """
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError):  # text, None, containers
-        array = None
-    if array is not None and array.dtype.kind == "b":
+    if not is_one_number(value):
+        got = f"the shape {value.shape} and the type {value.dtype}" if isinstance(value, jax.Array) else repr(value)
         raise TypeError(
-            f"The function `{label}` returns a truth value. Return a smooth signed number, such as `x - 1` instead of "
-            "`x > 1`."
+            f"The function `{label}` must return one real number, got {got}. For a truth value, return a smooth signed "
+            "number, such as `x - 1` instead of `x > 1`."
         )
-    if array is None or array.shape != () or array.dtype.kind not in "iuf":
-        got = repr(value) if array is None else f"the shape {array.shape} and the type {array.dtype}"
-        raise TypeError(f"The function `{label}` must return one real number, got {got}.")
-    return array.astype(dtype)
+    return jnp.asarray(value, dtype)
 
 
 def numbers(label: str, values: Any, dtype: Any) -> dict[str, Array]:
     """The values by name that a function of constraints returned, as numbers or as (number, lower, upper)."""
-    found = {}
-    for name, item in named(label, values).items():
-        found[name] = number(f"{label}` of `{name}", item[0] if isinstance(item, tuple) else item, dtype)
-    return found
+    items = {name: x[0] if isinstance(x, tuple) and x else x for name, x in named(label, values).items()}
+    return {name: number(f"{label}` of `{name}", x, dtype) for name, x in items.items()}
 
 
 def bounds_of(label: str, value: Any) -> Bound:
@@ -291,19 +285,17 @@ def bounds_of(label: str, value: Any) -> Bound:
 
     **Raises:** `ValueError` if the lower bound is greater than the upper one, or not a number.
     """
-    if isinstance(value, (tuple, list)):
-        if len(value) != 2:
-            raise ValueError(f"Problem: {label} must be a number or (lower, upper), got {value!r}.")
-        low, high = (
-            infinite if x is None else real_number(x, f"Problem: {label}")
-            for x, infinite in zip(value, (-math.inf, math.inf), strict=True)
-        )
+    label, is_pair = f"Problem: {label}", isinstance(value, (tuple, list))
+    if is_pair and len(value) == 2:
+        pairs = zip(value, (-math.inf, math.inf), strict=True)
+        low, high = (none if x is None else real_number(x, label) for x, none in pairs)
     else:
-        low = high = real_number(value, f"Problem: {label}")
-        if not math.isfinite(low):
-            raise ValueError(f"Problem: {label} is {value!r}. Pass a finite number, or leave the name out.")
-    if not low <= high:
-        raise ValueError(f"Problem: {label} is {value!r}: the lower bound is greater than the upper one, or is NaN.")
+        low = high = real_number(value, label)
+    if not low <= high or (not is_pair and math.isinf(low)):
+        raise ValueError(
+            f"{label} is {value!r}: the lower bound is greater than the upper one, or a number is not finite. "
+            "Leave the name out if there is no bound."
+        )
     return low, high
 
 
@@ -312,12 +304,10 @@ def constraints_of(label: str, values: Any, is_equality: bool) -> dict[str, Boun
 
     **Raises:** `ValueError` or `TypeError` for bounds that are not concrete numbers.
     """
-    found = {}
-    for name, item in named(label, values).items():
-        if not isinstance(item, tuple):
-            found[name] = (0.0, 0.0 if is_equality else math.inf)
-            continue
-        if len(item) != 3:
-            raise ValueError(f"`{label}`: {name!r} must be a number or (number, lower, upper), got {item!r}.")
-        found[name] = bounds_of(f"`{label}` of {name!r}", item[1:])
-    return found
+    default = (0.0, 0.0 if is_equality else math.inf)
+    return {
+        name: bounds_of(f"`{label}` of {name!r}, as (number, lower, upper),", item[1:])
+        if isinstance(item, tuple)
+        else default
+        for name, item in named(label, values).items()
+    }

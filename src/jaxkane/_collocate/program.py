@@ -173,15 +173,17 @@ class NonlinearProgram:
     ):
         self.m, self.n = linear.shape
         self.x_scale, self.g_scale, self.f_scale = x_scale, g_scale, f_scale
-        self.x_bounds, self.g_bounds = x_bounds, g_bounds
+        # bounds (n,) and (n_g,) of the scaled variables and constraints
+        self.lower, self.upper = x_bounds.lower / x_scale, x_bounds.upper / x_scale
+        self.g_lower, self.g_upper = g_bounds.lower / g_scale, g_bounds.upper / g_scale
         self._blocks = list(blocks)
         sizes = [b.B * b.block.size for b in self._blocks]
         for k, w, S in zip(sizes, weights, constraints, strict=True):
             assert w is None or len(w) == k, "The weights have another number of values than their block."
             assert S is None or S.shape == (self.m, k), "The constraints have another shape than their block."
         self._weights = [np.zeros(k) if w is None else w for k, w in zip(sizes, weights, strict=True)]
-        self._S = [scipy.sparse.csr_matrix((self.m, k)) if S is None else S for k, S in zip(sizes, constraints)]
-        self._S = [scipy.sparse.csr_matrix(S) for S in self._S]
+        of_blocks = zip(sizes, constraints, strict=True)
+        self._S = [scipy.sparse.csr_matrix((self.m, k) if S is None else S) for k, S in of_blocks]
         self._A: Any = scipy.sparse.csr_matrix(linear)
         self._memory: dict[Callable[..., Any], tuple[bytes, list[np.ndarray]]] = {}
         self._map_jacobian()
@@ -189,27 +191,22 @@ class NonlinearProgram:
 
     def _map_jacobian(self) -> None:
         """Each entry of the Jacobian of g, and of the gradient of f, is a sum of entries of the blocks."""
-        A = scipy.sparse.coo_matrix(self._A)
+        A, total = scipy.sparse.coo_matrix(self._A), 0
         rows, columns, sources, factors = [A.row], [A.col], [], []
-        self._gradient_maps, places = [], []
-        total = 0
+        self._gradient_maps = []
         for b, S, w in zip(self._blocks, self._S, self._weights, strict=True):
-            e = len(b.pattern.rows)
+            n = b.B * len(b.pattern.rows)
             entry_rows = (np.arange(b.B)[:, None] * b.block.size + np.array(b.pattern.rows, int)).ravel()
             entry_columns = b.columns[: b.B][:, np.array(b.pattern.columns, int)].ravel()
-            picks = scipy.sparse.csr_matrix(
-                (np.ones(b.B * e), (entry_rows, np.arange(b.B * e))), (b.B * b.block.size, b.B * e)
-            )
+            picks = scipy.sparse.csr_matrix((np.ones(n), (entry_rows, np.arange(n))), (b.B * b.block.size, n))
             used = scipy.sparse.coo_matrix(S @ picks)
             rows.append(used.row)
             columns.append(entry_columns[used.col])
             sources.append(used.col + total)
             factors.append(used.data)
-            self._gradient_maps.append(
-                scipy.sparse.csr_matrix((w[entry_rows], (entry_columns, np.arange(b.B * e))), (self.n, b.B * e))
-            )
-            places.append((total, total + b.B * e))
-            total += b.B * e
+            gradient = scipy.sparse.csr_matrix((w[entry_rows], (entry_columns, np.arange(n))), (self.n, n))
+            self._gradient_maps.append(gradient)
+            total += n
         row, column = np.concatenate(rows).astype(np.int64), np.concatenate(columns).astype(np.int64)
         keys, inverse = np.unique(column * self.m + row, return_inverse=True)
         self.jacobian_structure = (keys % self.m if self.m else keys), (keys // self.m if self.m else keys)
@@ -223,42 +220,17 @@ class NonlinearProgram:
 
     def _map_hessian(self) -> None:
         """Each entry of the lower triangle of the Hessian is a sum of entries of the blocks."""
-        rows, columns = [], []
-        for b in self._blocks:
-            place = b.columns[: b.B]
-            one, other = (
-                place[:, np.array(b.pattern.hessian_rows, int)],
-                place[:, np.array(b.pattern.hessian_columns, int)],
-            )
-            rows.append(np.maximum(one, other).ravel())
-            columns.append(np.minimum(one, other).ravel())
-        row, column = (np.concatenate([*x, []]).astype(np.int64) for x in (rows, columns))
+        triangles = [np.array([b.pattern.hessian_rows, b.pattern.hessian_columns], int) for b in self._blocks]
+        pairs = [b.columns[: b.B][:, x] for b, x in zip(self._blocks, triangles, strict=True)]  # (B, 2, entries)
+        row, column = (
+            np.concatenate([*(f(p, axis=1).ravel() for p in pairs), []]).astype(np.int64) for f in (np.max, np.min)
+        )
         keys, inverse = np.unique(column * self.n + row, return_inverse=True)
         self.hessian_structure = keys % self.n, keys // self.n
         scale = self.x_scale[self.hessian_structure[0]] * self.x_scale[self.hessian_structure[1]]
         self._hessian_map = scipy.sparse.csr_matrix(
             (scale[inverse], (inverse, np.arange(len(row)))), (len(keys), len(row))
         )
-
-    @property
-    def lower(self) -> np.ndarray:
-        """Lower bounds (n,) of the scaled variables."""
-        return self.x_bounds.lower / self.x_scale
-
-    @property
-    def upper(self) -> np.ndarray:
-        """Upper bounds (n,) of the scaled variables."""
-        return self.x_bounds.upper / self.x_scale
-
-    @property
-    def g_lower(self) -> np.ndarray:
-        """Lower bounds (n_g,) of the scaled constraints."""
-        return self.g_bounds.lower / self.g_scale
-
-    @property
-    def g_upper(self) -> np.ndarray:
-        """Upper bounds (n_g,) of the scaled constraints."""
-        return self.g_bounds.upper / self.g_scale
 
     def objective(self, z: np.ndarray) -> float:
         """The scaled cost at scaled variables."""

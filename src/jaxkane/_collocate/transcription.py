@@ -81,6 +81,11 @@ class PhaseProblem:
         q = jax.ShapeDtypeStruct((len(self.system.coordinates),), jnp.float64)
         return n_configuration_constraints(self.system, jnp.zeros(()), q)
 
+    def sizes_of(self, name: str) -> list[float]:
+        """The finite bounds of a state or control, and its finite values at the ends."""
+        given = [self.limits.get(name), *(self.ends[label].get(name) for label in ("start", "end"))]
+        return [b for v in given if v is not None for b in bounds_of(name, v) if math.isfinite(b)]
+
     def variables(self) -> Variables:
         """How the variables of a node are read."""
         signals = self.signals
@@ -161,6 +166,13 @@ class Layout:
         states = self.first + k[..., None] * n_y + np.arange(n_y)
         controls = self.first + self.K * n_y + i[..., None] * n_w + np.arange(n_w)
         return np.concatenate([states, controls], axis=-1)
+
+    @property
+    def by_name(self) -> dict[str, np.ndarray]:
+        """The indices (K,) of each state and control at the nodes, and (1,) of the duration if it is free."""
+        names = (*self.problem.names, *self.variables.controls)
+        found = dict(zip(names, self.node(np.arange(self.K)).T, strict=True))
+        return found if self.duration is None else found | {"duration": np.array([self.duration])}
 
     @property
     def size(self) -> int:
@@ -321,20 +333,16 @@ class Transcription:
     def _variable_bounds(self) -> Bounds:
         lower, upper = np.full(self.n, -math.inf), np.full(self.n, math.inf)
         for layout in self.layouts:
-            problem = layout.problem
-            names = (*problem.names, *layout.variables.controls)
-            for name, (low, high) in problem.limits.items():
-                if name in names:
-                    at = layout.node(np.arange(layout.K))[:, names.index(name)]
-                    lower[at], upper[at] = low, high
-            for label, k in (("start", 0), ("end", layout.K - 1)):
+            problem, at = layout.problem, layout.by_name
+            limits = problem.limits | ({} if layout.duration is None else {"duration": problem.durations})
+            for name, bounds in limits.items():
+                if name in at:
+                    lower[at[name]], upper[at[name]] = bounds
+            for label, k in (("start", 0), ("end", -1)):
                 for name, value in problem.ends[label].items():
-                    if name in names:
-                        at = int(layout.node(k)[names.index(name)])
-                        low, high = bounds_of(name, value)
-                        lower[at], upper[at] = max(low, lower[at]), min(high, upper[at])
-            if layout.duration is not None:
-                lower[layout.duration], upper[layout.duration] = problem.durations
+                    if name in at:
+                        i, (low, high) = at[name][k], bounds_of(name, value)
+                        lower[i], upper[i] = max(low, lower[i]), min(high, upper[i])
         return Bounds(lower, upper)
 
     def _check_finite_dynamics(self, blocks: Sequence[EvaluatedBlock]) -> None:
@@ -621,11 +629,8 @@ def scales_of(layout: Layout, block: EvaluatedBlock, x: np.ndarray) -> np.ndarra
     units = units_of(problem.system)
     values = x[layout.node(np.arange(layout.K))]
     sizes = np.max(np.abs(values), axis=0)
-    limits = problem.limits
     for i, name in enumerate(names):
-        given = [limits.get(name), *(problem.ends[label].get(name) for label in ("start", "end"))]
-        numbers = [abs(b) for v in given if v is not None for b in bounds_of(name, v) if math.isfinite(b)]
-        sizes[i] = max([sizes[i], *numbers])
+        sizes[i] = max([sizes[i], *map(abs, problem.sizes_of(name))])
     # Without units, a place of 1 and a force of 1e18 are not comparable, but the forces are.
     groups = (*names_of(problem.system), variables.controls)
     kinds = [(next(i for i, group in enumerate(groups) if name in group), units.get(name, "")) for name in names]

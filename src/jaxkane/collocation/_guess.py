@@ -41,7 +41,12 @@ def guess_of(problem: Problem, guess: Any, s: np.ndarray) -> Motion:
         )
     names, controls = problem.names, tuple(problem.bounds_of_controls)
     refuse_unknown(given, [*names, *controls, "duration"], f"solve: `guess`: {problem.title} has no", "it has")
-    duration = _duration(problem, given.get("duration"))
+    low, high = problem.durations
+    duration = real_number(given.get("duration", 0.5 * (low + high)), "solve: `guess` of 'duration'")
+    if not low <= duration <= high:
+        raise ValueError(
+            f"solve: `guess` of 'duration' is {duration:.6g} s, but it must be from {low:g} to {high:g} s."
+        )
     Y, W = _automatic(problem, s, duration)
     for name, value in given.items():
         if name != "duration":
@@ -63,27 +68,9 @@ def detours(problem: Problem, count: int, seed: int = 0) -> list[np.ndarray | No
     rng, units = np.random.default_rng(seed), units_of(problem.system)
     sizes = []
     for name in problem.system.coordinates:
-        given = [problem.limits.get(name), *(problem.ends[label].get(name) for label in ("start", "end"))]
-        numbers = [b for v in given if v is not None for b in bounds_of(name, v) if math.isfinite(b)]
-        spread = max(numbers, default=0.0) - min(numbers, default=0.0)
-        is_angle = units.get(name, "") in ("", "rad")
-        sizes.append(1.0 if is_angle else spread)
-    every: list[np.ndarray | None] = [None]
-    for _ in range(count - 1):
-        every.append(
-            np.concatenate([rng.normal(size=(len(sizes), 1)) for _ in range(3)], axis=1) * np.array(sizes)[:, None]
-        )
-    return every
-
-
-def _duration(problem: Problem, given: Any) -> float:
-    low, high = problem.durations
-    if given is None:
-        return 0.5 * (low + high)
-    number = real_number(given, "solve: `guess` of 'duration'")
-    if not low <= number <= high:
-        raise ValueError(f"solve: `guess` of 'duration' is {number:.6g} s, but it must be from {low:g} to {high:g} s.")
-    return number
+        spread = np.ptp([*problem.sizes_of(name), *[0.0] * (not problem.sizes_of(name))])
+        sizes.append(1.0 if units.get(name, "") in ("", "rad") else spread)
+    return [None, *(rng.normal(size=(3, len(sizes))).T * np.array(sizes)[:, None] for _ in range(count - 1))]
 
 
 def _middle(value: Condition | None, otherwise: float) -> float:
@@ -91,9 +78,7 @@ def _middle(value: Condition | None, otherwise: float) -> float:
     if value is None:
         return otherwise
     low, high = bounds_of("the guess", value)
-    if math.isfinite(low) and math.isfinite(high):
-        return 0.5 * (low + high)
-    return min(max(otherwise, low), high)
+    return 0.5 * (low + high) if math.isfinite(high - low) else min(max(otherwise, low), high)
 
 
 def _automatic(problem: Problem, s: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
@@ -132,10 +117,9 @@ def _rates(problem: Problem, y: np.ndarray, w: np.ndarray) -> np.ndarray:
     variables = problem.variables()
     x = jnp.concatenate([jnp.asarray(y), jnp.asarray(w)])
     tail = jnp.zeros(problem.has_free_duration + (0 if variables.parameters is None else variables.parameters.size))
-    sampled = {} if callable(problem.signals) else problem.signals
-    node = {"s": jnp.zeros(()), "inputs": {k: sampled[k](0.0) for k in sampled if k not in (variables.signals or {})}}
-    if callable(variables.signals):
-        node["inputs"] = {}
+    known = {} if callable(problem.signals) else problem.signals
+    samples = {k: f for k, f in known.items() if k not in variables.signals}
+    node = {"s": jnp.zeros(()), "inputs": {k: f(0.0) for k, f in samples.items()}}
     system, _, t, y_now, inputs = variables.at(node, jnp.concatenate([x, tail]))
     return np.asarray(vector_field(system, t, y_now, inputs))
 
@@ -150,25 +134,18 @@ def _values(problem: Problem, name: str, value: Any, s: np.ndarray, duration: fl
             raise ValueError(
                 f"{label} must be a number, an array (n,) of samples, or a function of time; got {value!r}."
             )
-        found = np.interp(s, np.linspace(0, 1, array.size), array.ravel()) if array.size > 1 else np.full(len(s), array)
-    if not np.all(np.isfinite(found)):
-        raise ValueError(f"{label} contains values that are not finite.")
-    low, high = problem.limits.get(name, (-math.inf, math.inf))
-    slack = 1e-9 * max(abs(x) for x in (*found, 0.0, *(b for b in (low, high) if math.isfinite(b))))
-    for k, bounds in ((None, (low, high)), (0, problem.ends["start"].get(name)), (-1, problem.ends["end"].get(name))):
-        if bounds is None:
-            continue
-        a, b = bounds_of(label, bounds)
-        part = found if k is None else found[[k]]
-        wrong = (part < a - slack) | (part > b + slack)
-        if wrong.any():
-            where = (
-                f"{s[int(np.argmax(wrong))] * duration:.6g} s" if k is None else ("the start" if k == 0 else "the end")
-            )
-            raise ValueError(
-                f"{label} is {part[int(np.argmax(wrong))]:.6g} at {where}, but the problem requires "
-                f"{f'{a:g}' if a == b else f'{a:g} to {b:g}'}."
-            )
+        found = np.interp(s, np.linspace(0, 1, array.size), array) if array.size > 1 else np.full(len(s), array)
+    low, high = (np.full(len(s), b) for b in problem.limits.get(name, (-math.inf, math.inf)))
+    for end, k in (("start", 0), ("end", -1)):
+        if name in problem.ends[end]:
+            low[k], high[k] = bounds_of(label, problem.ends[end][name])
+    slack = 1e-9 * np.max(np.abs([*found, *low, *high]), where=np.isfinite([*found, *low, *high]), initial=0.0)
+    wrong = ~np.isfinite(found) | (found < low - slack) | (found > high + slack)
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        where = {0: "the start", len(s) - 1: "the end"}.get(k, f"{s[k] * duration:.6g} s")
+        required = f"{low[k]:g}" if low[k] == high[k] else f"{low[k]:g} to {high[k]:g}"
+        raise ValueError(f"{label} is {found[k]:.6g} at {where}, but the problem requires {required}.")
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -16,7 +17,6 @@ from .._collocate.lobatto import Lobatto
 from .._collocate.program import Block, EvaluatedBlock, padded
 from .._collocate.transcription import Layout, Motion
 from .._integrate.simulate import simulate
-from .._scalarjit.cache import Cache
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Component
 from .._system.system import State, System, packed, unpacked, with_class
@@ -86,13 +86,10 @@ def local_errors(
     # program: a second problem with ends ten times as far compiled for 2.5 s.
     rtol = 10.0 ** math.floor(math.log10(max(1e-2 * tolerance, 1e-12)))
     atol = 1e3 ** math.floor(math.log(rtol * float(np.min(scales[:n_y])), 1e3))
-    reached = []
+    reached, of_system = [], (system, layout.problem.signals, layout.variables.controls)
     for i in range(0, len(times), _CHUNK):
         place = np.minimum(np.arange(i, i + _CHUNK), len(times) - 1)
-        arguments = times[place], starts[place], coefficients[place]
-        reached.append(
-            _simulated(system, layout.problem.signals, layout.variables.controls, *arguments, rtol, atol)
-        )  # fmt: skip
+        reached.append(_simulated(*of_system, times[place], starts[place], coefficients[place], rtol, atol))
     ends = np.concatenate(reached)[: len(times)]
     # A guess of coordinates alone tells little of speeds: their range in the solution may be fifty times as large.
     sizes = np.maximum(scales[:n_y], 0.5 * np.ptp(motion.Y, axis=0))
@@ -115,35 +112,23 @@ def _simulated(
     atol: float,
 ) -> Array:
     def one(ts: Array, y: Array, C: Array) -> Array:
-        polynomials = {name: ControlPolynomial(ts, C[None, :, i]) for i, name in enumerate(controls)}
-        inputs = with_controls(signals, polynomials)
-        return packed_end(system, y, ts, inputs, rtol, atol)
+        inputs = with_controls(signals, {k: ControlPolynomial(ts, C[None, :, i]) for i, k in enumerate(controls)})
+        alone = without_events(system)
+        ride = simulate(alone, unpacked(alone, y), ts, inputs, rtol=rtol, atol=atol, max_steps=4096)
+        return packed(State(ride.q[-1], ride.u[-1], ride.x[-1] if system.states else None))
 
     return jax.vmap(one)(times, starts, coefficients)
 
 
-def packed_end(system: System, y: Array, ts: Array, inputs: Any, rtol: float, atol: float) -> Array:
-    state = unpacked(without_events(system), y)
-    ride = simulate(without_events(system), state, ts, inputs, rtol=rtol, atol=atol, max_steps=4096)
-    return packed(State(ride.q[-1], ride.u[-1], ride.x[-1] if system.states else None))
-
-
 def without_events(system: System) -> System:
     """The system without its events: a planned motion ends where the problem states it."""
-    own = type(system)
-    if own.events is System.events:
-        return system
-    key: Any = own
-    return with_class(system, _EVENTLESS.get(key, lambda: _eventless(own)))
+    own: Any = type(system)
+    return system if own.events is System.events else with_class(system, _eventless(own))
 
 
-_EVENTLESS = Cache()  # a class for each class, so that compiled programs are used again
-
-
+@functools.cache  # a class for each class, so that compiled programs are used again
 def _eventless(own: Any) -> Any:
-    changed = type(own)(own.__name__, (own,), {"events": System.events})
-    changed.__qualname__ = own.__qualname__
-    return changed
+    return type(own)(own.__name__, (own,), {"events": System.events, "__qualname__": own.__qualname__})
 
 
 def with_controls(signals: Any, polynomials: dict[str, Any]) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 
 from .._collocate.functions import Bound, Condition, Now, bounds_of
 from .._collocate.transcription import PhaseProblem
-from .._common.lookup import as_names, real_number, refuse_unknown
+from .._common.lookup import as_names, refuse_unknown
 from .._integrate.inputs import as_signals, is_samples
 from .._integrate.jumps import names_of_jumps
 from .._kane.arguments import check_is_system, is_concrete, refuse_multipliers
@@ -22,7 +22,7 @@ from .._kane.constraint_residuals import check_state, configuration_residual
 from .._kane.contact import has_contacts
 from .._kane.right_hand_side import output_names
 from .._system.parameters import in_batches
-from .._system.system import State, System, names_of
+from .._system.system import State, System, packed
 from ..fit.problem.from_declarations import parameters_of
 from ..fit.problem.parameters import Parameters
 
@@ -94,38 +94,38 @@ class Problem(PhaseProblem):
             if f is not None and not callable(f):
                 raise TypeError(f"Problem: `{name}` must be a function, got {f!r}.")
         shortest, longest = self.durations
-        if not (0 <= shortest <= longest < math.inf and longest > 0):
+        if shortest < 0 or not 0 < longest < math.inf:
             raise ValueError(
                 f"Problem: `duration` must be a positive number of seconds, or (least, greatest) with "
                 f"0 <= least < greatest; got {self.duration!r}."
             )
-        refuse_unknown(self.bounds_of_controls, system.inputs, f"Problem: {self.title} has no input", "it has")
-        if not callable(self.inputs):
-            both = [name for name in self.inputs or {} if name in self.bounds_of_controls]
-            if both:
-                raise ValueError(f"Problem: {both[0]!r} is in `controls` and in `inputs`. Omit it in one of them.")
+        controls = self.bounds_of_controls
+        refuse_unknown(controls, system.inputs, f"Problem: {self.title} has no input", "it has")
+        if not callable(self.inputs) and (both := controls.keys() & (self.inputs or {})):
+            raise ValueError(f"Problem: {', '.join(both)} is in `controls` and in `inputs`. Omit it in one of them.")
         self._check_names()
         self.signals  # noqa: B018  raises an exception for wrong inputs
         self.parameters  # noqa: B018  the same for parameters
 
     def _check_system(self) -> None:
-        if has_contacts(self.system):
-            raise ValueError(
-                f"Problem: {self.title} has contacts, which change their state at unknown times. Describe the motion "
-                "between two changes by a system without contacts, and link such phases (`Phases`)."
-            )
-        refuse_multipliers(self.system)
-        if in_batches(self.system):
-            raise ValueError(f"Problem: {self.title} is a batch. Pass one member of it.")
-        if not is_concrete(self.system):
-            raise TypeError(f"Problem: {self.title} is traced. Call this outside of jax.jit, vmap and grad.")
-        if jnp.result_type(float) != jnp.float64 or any(
-            x.dtype == jnp.float32 for x in jax.tree.leaves(self.system) if hasattr(x, "dtype")
+        system, leaves = self.system, jax.tree.leaves(self.system)
+        refuse_multipliers(system)
+        for is_wrong, reason in (
+            (
+                has_contacts(system),
+                "has contacts, which change their state at unknown times. Describe the motion between two changes by a "
+                "system without contacts, and link such phases (`Phases`).",
+            ),
+            (in_batches(system), "is a batch. Pass one member of it."),
+            (not is_concrete(system), "is traced. Call this outside of jax.jit, vmap and grad."),
+            (
+                jnp.result_type(float) != jnp.float64 or any(getattr(x, "dtype", None) == jnp.float32 for x in leaves),
+                "needs float64 for collocation. Call jaxkane.configure() first, and create the system after it.",
+            ),
         ):
-            raise ValueError(
-                "Problem: collocation needs float64. Call jaxkane.configure() first, and create the system after it."
-            )
-        check_system(self.system, 0.0, None)
+            if is_wrong:
+                raise (ValueError if is_concrete(system) else TypeError)(f"Problem: {self.title} {reason}")
+        check_system(system, 0.0, None)
 
     def _check_names(self) -> None:
         known = [*self.names, *self.system.dependent_speeds, *self.bounds_of_controls, *output_names(self.system)]
@@ -147,30 +147,22 @@ class Problem(PhaseProblem):
 
     def _check_start(self) -> None:
         """The configuration constraints determine the dependent coordinates at the start, and thereby at the end."""
-        n_q, n_h = len(self.system.coordinates), self.n_constraints
-        if isinstance(self.start, State):
-            check_state(self.system, 0.0, jnp.asarray(self.start.q))
-        speeds, dependent_speeds = self.system.speeds, self.system.dependent_speeds
+        coordinates, n_h, n_u = self.system.coordinates, self.n_constraints, len(self.system.speeds)
         for label in ("start", "end"):
-            values = self.ends[label]
-            given = [name for name in (*speeds, *dependent_speeds) if name in values and _is_number(values[name])]
-            if len(given) > len(speeds):
-                raise ValueError(
-                    f"Problem: `{label}` sets {', '.join(given)}, but only {len(speeds)} speeds are independent. Leave "
-                    f"out {', '.join(name for name in given if name in dependent_speeds)}."
-                )
-            fixed = [name for name in self.system.coordinates if name in values and _is_number(values[name])]
-            if label == "start" and len(fixed) == n_q and n_h:
-                if not isinstance(self.start, State):
-                    check_state(
-                        self.system, 0.0, jnp.array([bounds_of(c, values[c])[0] for c in self.system.coordinates])
-                    )
+            values = {name: x for name, x in self.ends[label].items() if not isinstance(x, (tuple, list))}
+            given = [name for name in (*self.system.speeds, *self.system.dependent_speeds) if name in values]
+            fixed = [name for name in coordinates if name in values]
+            wrong, of, more = [], "", ""
+            if len(given) > n_u:
+                wrong = [name for name in given if name in self.system.dependent_speeds]
+                of, more = ", ".join(given), f"only {n_u} speeds are independent"
+            elif n_h and label == "start" and len(fixed) == len(coordinates):
+                check_state(self.system, 0.0, jnp.array([float(values[c]) for c in coordinates]))
             elif n_h and self._is_overdetermined(fixed):
-                raise ValueError(
-                    f"Problem: `{label}` sets {', '.join(fixed)}, but {n_h} of these follow from the others by the "
-                    f"configuration constraints. Leave out "
-                    f"{', '.join(c for c in self.system.dependent_coordinates if c in fixed) or 'a dependent one'}."
-                )
+                wrong = [c for c in self.system.dependent_coordinates if c in fixed] or ["a dependent one"]
+                of, more = ", ".join(fixed), f"{n_h} of these follow from the others by the configuration constraints"
+            if wrong:
+                raise ValueError(f"Problem: `{label}` sets {of}, but {more}. Leave out {', '.join(wrong)}.")
 
     def _is_overdetermined(self, fixed: Sequence[str]) -> bool:
         """Whether the configuration constraints relate coordinates that are fixed, at a random configuration."""
@@ -186,14 +178,7 @@ class Problem(PhaseProblem):
     @property
     def durations(self) -> Bound:
         """The least and the greatest duration [s]."""
-        given = self.duration
-        if isinstance(given, (tuple, list)):
-            if len(given) != 2:
-                raise ValueError(f"Problem: `duration` must be a number or (least, greatest), got {given!r}.")
-            low, high = (real_number(x, "Problem: `duration`") for x in given)
-            return low, high
-        number = real_number(given, "Problem: `duration`")
-        return number, number
+        return bounds_of("`duration`", self.duration)
 
     @property
     def bounds_of_controls(self) -> dict[str, Bound]:
@@ -201,8 +186,6 @@ class Problem(PhaseProblem):
         given = self.controls
         if isinstance(given, Mapping):
             return {name: _pair(f"`controls` of {name!r}", b or (None, None)) for name, b in given.items()}
-        if not isinstance(given, (str, Sequence)):
-            raise TypeError(f"Problem: `controls` must be names, or a dict from names to bounds; got {given!r}.")
         names = as_names(given, "controls")
         if len(set(names)) < len(names):
             raise ValueError(f"Problem: `controls` contains a name twice: {', '.join(names)}.")
@@ -227,25 +210,17 @@ class Problem(PhaseProblem):
         for label in ("start", "end"):
             given = getattr(self, label)
             if isinstance(given, State):
-                given = self._by_name(given, label)
+                y = np.asarray(packed(given), float)
+                if y.shape != (len(self.names),) or not np.all(np.isfinite(y)):
+                    raise ValueError(
+                        f"Problem: `{label}` must be a State with finite numbers for {', '.join(self.names)}; got "
+                        f"{given}."
+                    )
+                given = dict(zip(self.names, y.tolist(), strict=True))
+                if label == "end" and self.n_constraints:
+                    given = {k: v for k, v in given.items() if k not in self.system.dependent_coordinates}
             found[label] = dict(given or {})
         return found
-
-    def _by_name(self, state: State, label: str) -> dict[str, Condition]:
-        rows = zip(names_of(self.system)[:2] + names_of(self.system)[3:], (state.q, state.u, state.x), strict=True)
-        values: dict[str, Condition] = {}
-        for names, row in rows:
-            numbers = np.zeros(0) if row is None else np.asarray(row, float)
-            if numbers.shape != (len(names),):
-                raise ValueError(
-                    f"Problem: `{label}` is a State with {numbers.shape} numbers for {', '.join(names) or 'no states'}."
-                )
-            if not np.all(np.isfinite(numbers)):
-                raise ValueError(f"Problem: `{label}` is a State with values that are not finite: {state}.")
-            values |= dict(zip(names, numbers.tolist(), strict=True))
-        if label == "end" and self.n_constraints:
-            values = {k: v for k, v in values.items() if k not in self.system.dependent_coordinates}
-        return values
 
     @property
     def signals(self) -> Any:
@@ -254,16 +229,13 @@ class Problem(PhaseProblem):
             if not callable(value) and np.ndim(value) > 0:
                 raise ValueError(f"Problem: the input {name!r} is an array. Pass jaxkane.Samples(times, values).")
         signals = as_signals(self.inputs, self.system.inputs, jnp.zeros(2), self.title)
-        for name, signal in {} if callable(signals) else signals.items():
-            if is_samples(signal) and not (signal.ts[0] < self.durations[1] and signal.ts[-1] > 0):
+        samples = {} if callable(signals) else {k: x for k, x in signals.items() if is_samples(x)}
+        for name, x in samples.items():
+            if x.zero_order_hold or not (x.ts[0] < self.durations[1] and x.ts[-1] > 0):
                 raise ValueError(
-                    f"Problem: the samples of the input {name!r} are from {signal.ts[0]:.10g} to {signal.ts[-1]:.10g} "
-                    "s, but the motion starts at 0 s. Subtract the time of its start from `ts`."
-                )
-            if is_samples(signal) and signal.zero_order_hold:
-                raise ValueError(
-                    f"Problem: the input {name!r} is a zero-order hold, but collocation needs continuous inputs. Pass "
-                    "jaxkane.Samples(times, values) without zero_order_hold."
+                    f"Problem: the samples of the input {name!r} are from {x.ts[0]:.10g} to {x.ts[-1]:.10g} s, with "
+                    f"zero_order_hold={x.zero_order_hold}. Collocation needs continuous inputs, without a zero-order "
+                    "hold, and the motion starts at 0 s: subtract the time of its start from `ts`."
                 )
         return signals
 
@@ -343,7 +315,3 @@ def _pair(label: str, value: Any) -> Bound:
     if not isinstance(value, (tuple, list)):
         raise ValueError(f"Problem: {label} must be (lower, upper), with None for no bound; got {value!r}.")
     return bounds_of(label, value)
-
-
-def _is_number(value: Any) -> bool:
-    return not isinstance(value, (tuple, list))

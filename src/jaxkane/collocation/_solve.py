@@ -146,13 +146,11 @@ def check_derivatives(
     entry.
     """
     phases = problem if isinstance(problem, Phases) else Phases([problem])
-    found = lobatto(method)
-    mesh = np.linspace(0.0, 1.0, intervals + 1)
-    motions = [guess_of(p, getattr(guess, "trajectory", guess), nodes_of(mesh, found)) for p in phases.phases]
-    theta = np.zeros(0 if phases.phases[0].parameters is None else phases.phases[0].parameters.size)
-    program = (
-        transcription := Transcription(phases.phases, phases.links, [mesh] * len(motions), found, motions, theta)
-    ).program
+    found, mesh = lobatto(method), np.linspace(0.0, 1.0, intervals + 1)
+    motions = [_guessed(p, guess, nodes_of(mesh, found), None) for p in phases.phases]
+    theta, meshes = _theta(phases.phases[0], guess), [mesh] * len(motions)
+    transcription = Transcription(phases.phases, phases.links, meshes, found, motions, theta)
+    program = transcription.program
     rng = np.random.default_rng(seed)
     z = np.clip(transcription.z + 0.1 * rng.normal(size=program.n), program.lower, program.upper)
     weights = rng.normal(size=program.m)
@@ -223,13 +221,18 @@ class _Search:
 
     def plan(self, intervals: int, guesses: Sequence[tuple[Any, Any]]) -> Plan:
         problems = self.phases.phases
-        meshes = [_first_mesh(guess, intervals) for guess, _ in guesses]
+        meshes = [
+            guess.mesh / guess.duration
+            if isinstance(guess, Plan) and not guess.phases and len(guess.mesh) > intervals
+            else np.linspace(0.0, 1.0, intervals + 1)
+            for guess, _ in guesses
+        ]
         nodes = [nodes_of(mesh, self.method) for mesh in meshes]
         motions = [_guessed(p, g, s, detour) for p, (g, detour), s in zip(problems, guesses, nodes, strict=True)]
         theta = _theta(problems[0], guesses[0][0])
         costs: list[float] = []
         iterations, is_warm = 0, isinstance(guesses[0][0], Plan)
-        sizes = [_sizes(p, guess) for p, (guess, _) in zip(problems, guesses, strict=True)]
+        sizes = [g.scales if _is_similar(p, g) else None for p, (g, _) in zip(problems, guesses, strict=True)]
         transcription = self._transcribed(meshes, motions, theta, sizes)
         sizes, solved = transcription.sizes, None  # the solution on the mesh before, which must not be lost
         while True:
@@ -246,7 +249,12 @@ class _Search:
                     errors = self._errors(transcription, x)
                 except KeyboardInterrupt:
                     return self._unrefined(transcription, solution, None, INTERRUPTED, costs, iterations)
-            new = self._refined(meshes, errors)
+            new, tolerance = None, self.tolerance
+            if errors is not None and tolerance is not None and any(np.max(e) > tolerance for e in errors):
+                new = [
+                    refined(mesh, e, tolerance, self.method.order) if np.max(e) > tolerance else mesh
+                    for mesh, e in zip(meshes, errors, strict=True)
+                ]
             if new is None or len(costs) == MAX_MESHES or max(len(m) for m in new) > self.max_intervals + 1:
                 return self._plan(transcription, solution, errors, costs, iterations, new is not None)
             motions = [
@@ -302,15 +310,6 @@ class _Search:
             found.append(errors)
         return found
 
-    def _refined(self, meshes: Sequence[np.ndarray], errors: Sequence[np.ndarray] | None) -> list[np.ndarray] | None:
-        """New meshes, or None if the present ones are fine."""
-        if errors is None or self.tolerance is None or all(np.max(e) <= self.tolerance for e in errors):
-            return None
-        return [
-            refined(mesh, e, self.tolerance, self.method.order) if np.max(e) > self.tolerance else mesh
-            for mesh, e in zip(meshes, errors, strict=True)
-        ]
-
     def _plan(
         self,
         transcription: Transcription,
@@ -329,7 +328,8 @@ class _Search:
             ok, reason = False, f"solved, but the local error is {worst:.1e} instead of {self.tolerance:g}"
         if reason == NOT_FINITE and (names := transcription.not_finite(x)):
             reason = f"{', '.join(names)} is not finite at the last iterate"
-        residual = dual_residual(program, solution)
+        parameters = transcription.parameters
+        values: Any = () if parameters is None else parameters.values(jnp.asarray(transcription.theta(x)))
         common = {
             "ok": ok,
             "reason": reason,
@@ -337,8 +337,8 @@ class _Search:
             "costs": tuple(costs),
             "iterations": iterations,
             "violation": program.violation(solution.z),
-            "dual_residual": residual,
-            "estimates": _estimates(transcription, x),
+            "dual_residual": dual_residual(program, solution),
+            "estimates": dict(zip(() if parameters is None else parameters.names, map(float, values), strict=True)),
         }
         plans = [
             self._plan_of_phase(transcription, solution, x, p, None if errors is None else errors[p], common)
@@ -368,23 +368,10 @@ class _Search:
         )
 
 
-def _first_mesh(guess: Any, intervals: int) -> np.ndarray:
-    if isinstance(guess, Plan) and not guess.phases and len(guess.mesh) > intervals:
-        return guess.mesh / guess.duration
-    return np.linspace(0.0, 1.0, intervals + 1)
-
-
 def _is_similar(problem: Problem, guess: Any) -> bool:
     """Whether a guess is a plan with the same states and controls."""
-
-    def names(p: Problem) -> tuple[str, ...]:
-        return (*p.names, *p.bounds_of_controls)
-
-    return isinstance(guess, Plan) and not guess.phases and names(guess.problem) == names(problem)
-
-
-def _sizes(problem: Problem, guess: Any) -> np.ndarray | None:
-    return guess.scales if _is_similar(problem, guess) else None
+    both = [(*p.names, *p.bounds_of_controls) for p in (problem, getattr(guess, "problem", None)) if p is not None]
+    return isinstance(guess, Plan) and not guess.phases and both[0] == both[1]
 
 
 def _guessed(problem: Problem, guess: Any, s: np.ndarray, detour: Any) -> Motion:
@@ -405,14 +392,6 @@ def _theta(problem: Problem, guess: Any) -> np.ndarray:
     if isinstance(guess, Plan) and set(guess.estimates) == set(parameters.names):
         return np.asarray(parameters.inverse(jnp.asarray([guess.estimates[name] for name in parameters.names])))
     return np.zeros(parameters.size)
-
-
-def _estimates(transcription: Transcription, x: np.ndarray) -> dict[str, float]:
-    parameters = transcription.parameters
-    if parameters is None:
-        return {}
-    values = np.asarray(parameters.values(jnp.asarray(transcription.theta(x))))
-    return dict(zip(parameters.names, values.tolist(), strict=True))
 
 
 def lagrangian_gradient(program: NonlinearProgram, solution: Solution) -> np.ndarray:
@@ -436,10 +415,7 @@ def multipliers_of(transcription: Transcription, solution: Solution, p: int) -> 
     of_bounds[fixed] = -lagrangian_gradient(program, solution)[fixed]  # solvers omit fixed variables
     by_variable = -of_bounds * program.f_scale / program.x_scale
     by_constraint = -solution.multipliers * program.f_scale / program.g_scale
-    values: dict[str, Any] = {}
-    nodes = layout.node(np.arange(layout.K))
-    for i, name in enumerate((*layout.problem.names, *layout.variables.controls)):
-        values[name] = by_variable[nodes[:, i]]
+    values: dict[str, Any] = {name: by_variable[at] for name, at in layout.by_name.items()}
     if layout.duration is not None:
         values["duration"] = float(by_variable[layout.duration])
     costate = {}
@@ -463,35 +439,26 @@ def unmet_of(transcription: Transcription, solution: Solution, p: int, tolerance
         if row.phase == p:
             label = f"equations of motion of {row.name}" if row.kind == "dynamics" else row.name
             found[label] = max(found.get(label, 0.0), float(np.max(of_rows[row.rows])))
-    nodes = layout.node(np.arange(layout.K))
-    for i, name in enumerate((*layout.problem.names, *layout.variables.controls)):
-        found[f"bounds of {name}"] = float(np.max(of_variables[nodes[:, i]]))
+    found |= {f"bounds of {name}": float(np.max(of_variables[at])) for name, at in layout.by_name.items()}
     return {name: x for name, x in found.items() if not x <= tolerance}
 
 
 def active_of(transcription: Transcription, solution: Solution, p: int) -> tuple[str, ...]:
     """The names of bounds and inequality constraints that are active somewhere. Fixed values are not included."""
     program, layout = transcription.program, transcription.layouts[p]
+
+    def is_active(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> dict[str, bool]:
+        distances = {"lower": values - lower, "upper": upper - values}
+        return {side: bool(np.any((lower < upper) & (x < 1e-6))) for side, x in distances.items()}
+
     found = []
-
-    def is_active(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[bool, bool]:
-        free = lower < upper
-        return bool(np.any(free & (values - lower < 1e-6))), bool(np.any(free & (upper - values < 1e-6)))
-
-    nodes = layout.node(np.arange(layout.K))
-    groups = [(name, nodes[:, i]) for i, name in enumerate((*layout.problem.names, *layout.variables.controls))] + (
-        [] if layout.duration is None else [("duration", np.array([layout.duration]))]
-    )
-    for name, at in groups:
-        for side, active in zip(
-            ("lower", "upper"), is_active(solution.z[at], program.lower[at], program.upper[at]), strict=True
-        ):
-            if active:
-                found.append(f"{name} at its {side} bound")
+    for name, at in layout.by_name.items():
+        sides = is_active(solution.z[at], program.lower[at], program.upper[at])
+        found += [f"{name} at its {side} bound" for side, active in sides.items() if active]
     g = program.constraints(solution.z)
     for row in transcription.rows:
         is_own = row.phase == p and row.kind in ("path", "conditions")
-        if is_own and any(is_active(g[row.rows], program.g_lower[row.rows], program.g_upper[row.rows])):
+        if is_own and any(is_active(g[row.rows], program.g_lower[row.rows], program.g_upper[row.rows]).values()):
             found.append(row.name)
     return tuple(found)
 
@@ -505,14 +472,13 @@ def _joined(plans: Sequence[Plan]) -> Plan:
     meshes = [plan.mesh + offset for plan, offset in zip(plans, offsets)]
     mesh = np.concatenate([meshes[0], *(mesh[1:] for mesh in meshes[1:])])
     errors = None if first.errors is None else np.concatenate([plan.errors for plan in plans])  # type: ignore[misc]
-    unmet = {f"phase {i}: {k}": x for i, plan in enumerate(plans) for k, x in plan.unmet.items()}
     active = tuple(f"phase {i}: {name}" for i, plan in enumerate(plans) for name in plan.active)
-    multipliers = Multipliers(
-        *(
-            {f"phase {i}: {k}": x for i, plan in enumerate(plans) for k, x in each(plan).items()}
-            for each in (lambda plan: plan.multipliers, lambda plan: plan.multipliers.costate)
-        )
-    )
+
+    def named(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        return {f"phase {i}: {k}": x for i, part in enumerate(parts) for k, x in part.items()}
+
+    unmet, of_plans = named([plan.unmet for plan in plans]), [plan.multipliers for plan in plans]
+    multipliers = Multipliers(named(of_plans), named([each.costate for each in of_plans]))
     return dataclasses.replace(
         first, duration=float(offsets[-1]), trajectory=trajectory, mesh=mesh, errors=errors, unmet=unmet, active=active,
         multipliers=multipliers, phases=tuple(plans),

@@ -46,11 +46,11 @@ def straight_ahead(bicycle: WhippleBicycle, speed: Component) -> State | SteadyM
             f"independent speeds are {', '.join(bicycle.speeds)}. If a part prescribes the speed, remove it with "
             "bicycle.with_parts(drive=None): the necessary drive torque is computed."
         )
-    if not is_one_number(speed):
-        raise TypeError(f"straight_ahead({type(bicycle).__name__}): the speed must be one number [m/s], got {speed!r}.")
+    if not is_one_number(speed) or (is_concrete(speed) and not np.isfinite(speed)):
+        raise ValueError(
+            f"straight_ahead({type(bicycle).__name__}): the speed must be one finite number [m/s], got {speed!r}."
+        )
     v = jnp.asarray(speed, dtype=jnp.result_type(bicycle.rR))
-    if is_concrete(v) and not np.isfinite(v):
-        raise ValueError(f"straight_ahead({type(bicycle).__name__}): the speed must be finite [m/s], got {float(v)}.")
     wheel = bicycle.speeds.index("rear_wheel_rate")
     u = jnp.zeros(len(bicycle.speeds), v.dtype).at[wheel].set(-v / bicycle.rR)
     q = jnp.zeros(len(bicycle.coordinates), v.dtype)

@@ -53,12 +53,11 @@ def lqr(
                 f"control the mode with the eigenvalue {root / tau:.4g}, which does not decay. Omit the states of this "
                 "mode, linearize(..., states=(...)), or add an input."
             )
-    least_Q, least_R = (float(np.linalg.eigvalsh(0.5 * (W + W.T))[0]) for W in (Q1, R1))
+    least_Q, least_R, *least = (float(np.linalg.eigvalsh(0.5 * (W + W.T))[0]) for W in (Q1, R1, Q, R))
     if not (least_Q >= -1e-12 * np.abs(Q1).max() and least_R > 0.0):
         raise ValueError(
-            "lqr: Q must be positive semidefinite and R positive definite; "
-            f"their smallest eigenvalues are {np.linalg.eigvalsh(0.5 * (Q + Q.T))[0]:.4g} and "
-            f"{np.linalg.eigvalsh(0.5 * (R + R.T))[0]:.4g}."
+            "lqr: Q must be positive semidefinite and R positive definite; their smallest eigenvalues are "
+            "{:.4g} and {:.4g}.".format(*least)
         )
     P, K = _riccati(A1, B1, Q1, R1, model.states, names)
     K, P = K * e[:, None] / d, P * tau / (rho * d * d[:, None])
@@ -133,10 +132,8 @@ def to_control(model: LinearModel) -> Any:
 def _weights(W: Any, n: int, name: str, what: str) -> np.ndarray:
     W = np.asarray(W, dtype=float)
     W = np.diag(np.broadcast_to(W, (n,))) if W.ndim == 0 or W.shape == (n,) else W
-    if W.shape != (n, n):
+    if W.shape != (n, n) or not np.all(np.isfinite(W)):
         raise ValueError(
-            f"lqr: {name} must be ({n}, {n}), or ({n},) for a diagonal: one weight for each of the {what}."
+            f"lqr: {name} must be ({n}, {n}), or ({n},) for a diagonal: one finite weight for each of the {what}."
         )
-    if not np.all(np.isfinite(W)):
-        raise ValueError(f"lqr: {name} is not finite.")
     return W

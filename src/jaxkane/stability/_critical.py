@@ -132,26 +132,23 @@ def critical_speeds(
         names = eigenvalues(system, values, motion, states=states, modes=modes).modes if len(values) else ()
         empty, none = jnp.zeros(0, values.dtype), jnp.full((), jnp.nan, values.dtype)
         return CriticalSpeeds(empty, empty, empty.astype(int), empty.astype(int), none, names, label)
-    crossings, state_names = _crossings(system, values, at, states, groups, most)
-    known = jax.lax.stop_gradient(crossings)
+    crossings, found, state_names = _crossings(system, values, at, states, groups, most)
+    known, found = jax.lax.stop_gradient((crossings[0], found))
     # `motion` may close over traced values: then `crossings` depends on them too
-    origin = (system, values, crossings.values)
-    names, unnamed = names_of_modes(state_names, groups, known.clear, known.number, modes)
+    origin = (system, values, crossings)
+    names, unnamed = names_of_modes(state_names, groups, found["clear"], found["number"], modes)
     # Use NumPy for concrete values: with JAX every operation would be compiled as a program.
-    as_array: Any = np.asarray if is_concrete(crossings, origin) else jnp.asarray
-    columns = (crossings.values, crossings.frequency, known.direction, known.column)
-    critical, frequency, direction, column = map(as_array, columns)
-    if is_concrete(known):
-        if known.is_missing:
+    as_array: Any = np.asarray if is_concrete(found, origin) else jnp.asarray
+    critical, frequency, direction, column = map(as_array, (*crossings, found["direction"], found["column"]))
+    if is_concrete(found):
+        if found["is_missing"]:
             raise ValueError(
-                f"critical_speeds({type(system).__name__}): there is no steady motion at {float(known.missing):.6g}, "
-                "so crossings near it would be missed. Choose `values` at which, and between which, a steady motion "
-                "exists."
+                f"critical_speeds({type(system).__name__}): there is no steady motion at {float(found['missing']):.6g} "
+                "and crossings near it would be missed. Choose `values` with steady motions at and between them."
             )
-        if known.count > most:
-            return critical_speeds(system, values, motion, states=states, modes=modes, most=2 * int(known.count))
-        if known.unexplained:
-            n = int(known.unexplained)
+        if found["count"] > most:
+            return critical_speeds(system, values, motion, states=states, modes=modes, most=2 * int(found["count"]))
+        if n := int(found["unexplained"]):
             warnings.warn(
                 f"critical_speeds({type(system).__name__}): between {float(values[0]):.6g} and {float(values[-1]):.6g} "
                 f"the number of growing eigenvalues {'rises' if n > 0 else 'falls'} by {abs(n)} more than the detected "
@@ -159,41 +156,17 @@ def critical_speeds(
                 "the values), or cross it at too small an angle. Plot jaxkane.stability.eigenvalues to see where.",
                 stacklevel=2,
             )
-        rows = np.flatnonzero(known.counts)
-        order: Any = rows[np.argsort(np.asarray(known.values)[rows])]
+        rows = np.flatnonzero(found["counts"])
+        order: Any = rows[np.argsort(np.asarray(known)[rows])]
     else:
-        counts = known.counts & ~jnp.asarray(unnamed)[column] & ~known.is_missing
+        counts = found["counts"] & ~jnp.asarray(unnamed)[column] & ~found["is_missing"]
         critical, frequency = nan_where(~counts, (critical, frequency), origin)
         order = jnp.argsort(jax.lax.stop_gradient(critical))
     none = np.full((), np.nan, values.dtype)
-    if not is_concrete(crossings, origin):
+    if not is_concrete(found, origin):
         none = nan_where(jnp.array(True), jnp.zeros((), values.dtype), origin)
     critical, frequency, direction, column = (jnp.asarray(x[order]) for x in (critical, frequency, direction, column))
     return CriticalSpeeds(critical, frequency, direction, column, jnp.asarray(none), names, label)
-
-
-class _Crossings(NamedTuple):
-    """At most k crossings.
-
-    - `values`, `frequency`, `direction`, `column` (k,): of each crossing.
-    - `counts` (k,): which entries are crossings.
-    - `count`: the number of crossings found, also above k.
-    - `is_missing`, `missing`: whether some value has no steady motion, and the first such value.
-    - `clear`, `number` (n,): as from `track_modes`.
-    - `unexplained`: as from `_unexplained`.
-    """
-
-    values: Float[Array, " k"]
-    frequency: Float[Array, " k"]
-    direction: Int[Array, " k"]
-    column: Int[Array, " k"]
-    counts: Any
-    count: Any
-    is_missing: Any
-    missing: Any
-    clear: Any
-    number: Any
-    unexplained: Any
 
 
 class _Brackets(NamedTuple):
@@ -213,17 +186,25 @@ class _Brackets(NamedTuple):
     is_missing: Any
     missing: Any
 
-    def extended(self, lower, upper, near, rises, is_one) -> _Brackets:
+    def extended(self, lower, upper, near, rises, is_one, p, exists) -> _Brackets:
         """Append the entries of `near` (n,) for which `is_one`. Those beyond the k-th are counted but not stored."""
         at = jnp.where(is_one, self.count + jnp.cumsum(is_one) - 1, len(self.lower))
-        old = (self.lower, self.upper, self.near, self.rises)
-        rows = [x.at[at].set(y, mode="drop") for x, y in zip(old, (lower, upper, near, rises), strict=True)]
-        lower, upper, near, rises = rows
-        return self._replace(lower=lower, upper=upper, near=near, rises=rises, count=self.count + jnp.sum(is_one))
+        new = (lower, upper, near, rises)
+        lower, upper, near, rises = (x.at[at].set(y, mode="drop") for x, y in zip(self[:4], new, strict=True))
+        missing = jnp.where(self.is_missing | exists, self.missing, p)
+        return _Brackets(lower, upper, near, rises, self.count + jnp.sum(is_one), self.is_missing | ~exists, missing)
 
 
 @jit
 def _crossings(system, values, motion, states, groups, most: int):
+    """At most k crossings.
+
+    **Returns:** their values and frequencies (k,); a dict; and the names of the states. The dict contains:
+
+    - "direction", "column", "counts" (k,): of each crossing, and which entries are crossings.
+    - "count": the number of crossings found, also above k. "is_missing", "missing": as of `_Brackets`.
+    - "clear", "number" (n,): as from `track_modes`. "unexplained": as from `_unexplained`.
+    """
     fixed = constant((system, values))
     state_names: list[tuple[str, ...]] = []
 
@@ -248,16 +229,23 @@ def _crossings(system, values, motion, states, groups, most: int):
     all_of = jax.tree.map(lambda x, y: jnp.concatenate([x, y])[order], spectra, jax.lax.stop_gradient(spectra_at_roots))
     columns, clear, number = track_modes(rows[order], all_of, state_names[0], groups)
     columns = columns[jnp.argsort(order)][len(p) :]
-    column = jnp.argmax(columns == place[:, None].astype(columns.dtype), axis=1)
     # An eigenvalue that is zero at the first or the last value has not crossed.
     ends, step = p[jnp.array([0, -1])], jnp.abs(p[jnp.array([1, -2])] - p[jnp.array([0, -1])])
-    inside = jnp.all(jnp.abs(rows[len(p) :, None] - ends[None, :]) > 1e-9 * step[None, :], axis=1)
-    counts = is_one & inside
+    counts = is_one & jnp.all(jnp.abs(rows[len(p) :, None] - ends[None, :]) > 1e-9 * step[None, :], axis=1)
     direction = jnp.where(brackets.rises, 1, -1)
-    counted = brackets.count, brackets.is_missing, brackets.missing
     passed = jnp.sum(jnp.where(counts, direction * jnp.where(frequency > 0, 2, 1), 0))
-    unexplained = _unexplained(spectra.values[0], spectra.values[-1], passed)
-    return _Crossings(roots, frequency, direction, column, counts, *counted, clear, number, unexplained), state_names[0]
+    found = {
+        "direction": direction,
+        "column": jnp.argmax(columns == place[:, None].astype(columns.dtype), axis=1),
+        "counts": counts,
+        "count": brackets.count,
+        "is_missing": brackets.is_missing,
+        "missing": brackets.missing,
+        "clear": clear,
+        "number": number,
+        "unexplained": _unexplained(spectra.values[0], spectra.values[-1], passed),
+    }
+    return (roots, frequency), found, state_names[0]
 
 
 def _unexplained(first, last, passed):
@@ -283,11 +271,10 @@ def _bracket(at, p, A, x, most: int) -> _Brackets:
     - `A` (m, n, n), `x` (m, n): the matrices at `p`, and their eigenvalues.
     - `most`: the largest number of intervals.
     """
-    depth = _HALVINGS + 2
+    depth, zeros = _HALVINGS + 2, jnp.zeros(most, p.dtype)
     missing = ~jnp.all(jnp.isfinite(A), axis=(1, 2))
-    zeros = jnp.zeros(most, p.dtype)
-    empty = (zeros, zeros, zeros.astype(x.dtype), jnp.zeros(most, bool), jnp.zeros((), int))
-    brackets = _Brackets(*empty, jnp.any(missing), p[jnp.argmax(missing)])
+    none = jnp.zeros(most, bool), jnp.zeros((), int), jnp.any(missing), p[jnp.argmax(missing)]
+    brackets = _Brackets(zeros, zeros, zeros.astype(x.dtype), *none)
 
     def within(brackets, step):
         """Bisect one interval. The undecided halves are on a stack, because a while_loop cannot recurse."""
@@ -308,9 +295,8 @@ def _bracket(at, p, A, x, most: int) -> _Brackets:
             near, rises, is_one = (
                 jnp.where(clear, x, y) for x, y in zip(passing, _crossings_by_order(lower[2], upper[2]), strict=True)
             )
-            brackets = brackets.extended(lower[0], upper[0], near, rises, is_one & (clear | last) & exists)
-            missing = jnp.where(brackets.is_missing | exists, brackets.missing, p)
-            brackets = brackets._replace(is_missing=brackets.is_missing | ~exists, missing=missing)
+            is_one = is_one & (clear | last) & exists
+            brackets = brackets.extended(lower[0], upper[0], near, rises, is_one, p, exists)
             for i, half in enumerate(((middle, upper), (lower, middle))):
                 stack = jax.tree.map(lambda x, y, i=i: x.at[height - 1 + i].set(y), stack, half)
             return brackets, stack, jnp.where(clear | last | ~exists, height - 1, height + 1), trial + 1

@@ -170,10 +170,10 @@ def names_of_modes(
 
 def motion_family(system: System, values: Numbers, motion: MotionAt, states: Sequence[str] | None):
     """Values, (system, value) -> motion, states, and the groups of states whose modes have names (None: no names)."""
-    is_straight = False
     check_is_system(system)
-    if motion is None and isinstance(system, WhippleBicycle):
-        is_straight, motion = True, straight_ahead
+    is_straight = motion is None and isinstance(system, WhippleBicycle)
+    if is_straight:
+        motion = straight_ahead
         has_more = len(system.speeds) > len(WhippleBicycle.speeds) or system.states
         # this bicycle does not name the lateral states of its other parts
         if states is None and not (has_more and type(system).lateral is LATERAL):
@@ -183,21 +183,16 @@ def motion_family(system: System, values: Numbers, motion: MotionAt, states: Seq
             f"{type(system).__name__} has no default family of steady motions. Pass `motion`, a function (system, "
             "value) -> State or SteadyMotion, e.g. steady_turn(system, ..., hold={...: value})."
         )
-    if not callable(motion):
-        if values is not None:
-            raise ValueError(
-                "`values` needs a function of the parameter, got one motion. Omit `values`, or pass a function."
-            )
-        motion, values = _OneMotion(motion), jnp.zeros(1)
-    if values is None:
+    if callable(motion) is (values is None):
         raise ValueError(
-            "`values` is missing. Pass the values of the parameter, e.g. speeds jnp.linspace(0.0, 10.0, 201)."
+            "`values` belong to a function `motion`. Pass the values of the parameter, e.g. speeds "
+            "jnp.linspace(0.0, 10.0, 201), or omit them for one motion."
         )
-    if not is_numeric(values):
-        raise TypeError(f"The values of the parameter must be real numbers, got {values!r}.")
+    if not callable(motion):
+        motion, values = _OneMotion(motion), jnp.zeros(1)
+    if not is_numeric(values) or np.ndim(values) > 1:
+        raise TypeError(f"The `values` of the parameter must be real numbers (m,), got {values!r}.")
     values = jnp.atleast_1d(jnp.asarray(values, dtype=float))
-    if values.ndim > 1:
-        raise ValueError(f"The values of the parameter must have the shape (m,), got {values.shape}.")
     groups = _Groups(getattr(system, "mode_groups", {})) if is_straight else None
     return values, motion, None if states is None else as_names(states, "states"), groups
 
@@ -206,8 +201,8 @@ def parameter_label(system: System, motion: Any) -> str:
     """The label of a family's parameter: the name of the second argument of `motion`, and its unit."""
     if motion is straight_ahead:
         return "forward speed [m/s]"
-    names = [] if isinstance(motion, _OneMotion) else list(inspect.signature(motion).parameters)
-    if len(names) < 2:
+    names = list(inspect.signature(motion).parameters)
+    if isinstance(motion, _OneMotion) or len(names) < 2:
         return "parameter"
     unit = unit_of(names[1], {k: info.unit for k, info in parameter_info(system).items()} | units_of(system))
     return names[1].replace("_", " ") + (f" [{unit}]" if unit else "")
@@ -247,11 +242,5 @@ def _eigenvalues_along(system, values, motion, states, groups):
 
     spectra = eig(jax.vmap(one)(values))
     order, clear, number = track_modes(values, spectra, names[0], groups)
-    rows = jnp.arange(len(values))[:, None]
-    tracked = Eig(
-        spectra.values[rows, order],
-        spectra.vectors[rows, :, order].swapaxes(1, 2),
-        spectra.left[rows, :, order].swapaxes(1, 2),
-        spectra.condition[rows, order],
-    )
-    return tracked, names[0], clear, number
+    tracked = (jnp.take_along_axis(x, order if x.ndim == 2 else order[:, None], axis=-1) for x in spectra)
+    return Eig(*tracked), names[0], clear, number

@@ -151,7 +151,7 @@ def family(
     if isinstance(start, SteadyMotion):
         refuse_other_system(label, system, start)
         steady = SteadyCurve(system, start, tuple(hold), tuple(find), until)
-        return steady.family(*steady.follow(steady.place(towards), *towards.values(), step, max_step, steps))
+        return steady.family(*steady.follow(steady.place(towards), sum(towards.values()), step, max_step, steps))
     if not isinstance(start, Orbit):
         raise TypeError(f"{label}: `start` must be a SteadyMotion, e.g. from steady_turn, or an Orbit; got {start!r}.")
     if hold or find or len(towards) != 1:

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from .._common.lookup import counted, hint
+from .._common.lookup import counted, refuse_unknown
 from ._linearize import LinearModel
 
 
@@ -122,10 +122,7 @@ def _even(trial: Any, input: str, output: str) -> tuple[float, np.ndarray, np.nd
     """The median interval [s], and input and output at equidistant times."""
     t, steps = trial.t, np.diff(trial.t)
     w = trial.inputs[input] if input in trial.inputs else np.zeros_like(t)
-    if output not in trial.measured:
-        raise ValueError(
-            f"{trial.name} has no channel {output}; {hint(output, list(trial.measured), 'the channels are')}"
-        )
+    refuse_unknown([output], trial.measured, f"{trial.name} has no channel", "the channels are")
     y = trial.measured[output]
     if not np.all(np.isfinite(y)):
         raise ValueError(f"{trial.name}: {output} has gaps. Cut them out with `Trial.between`.")
@@ -144,6 +141,5 @@ def _resampled(step: float, dt: float, *signals: np.ndarray) -> tuple[np.ndarray
 
 def place(names: Sequence[str], name: str, what: str) -> int:
     """The index of a name. **Raises:** `ValueError` for an unknown name."""
-    if name not in names:
-        raise ValueError(f"The model has no {what} {name!r}; {hint(name, names, 'it has')}")
+    refuse_unknown([name], names, f"The model has no {what}", "it has")
     return list(names).index(name)

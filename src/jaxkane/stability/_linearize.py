@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._common.lookup import as_names, hint, refuse_unknown
+from .._common.lookup import as_names, refuse_unknown
 from .._integrate.trajectory import refuse_other_system
 from .._kane.api import dependent_speeds
 from .._kane.arguments import (
@@ -168,18 +168,13 @@ def linearize(
         rows, (*known, *functions), f"{name}: `outputs` must be names or a dict of functions; unknown:", "there are"
     )
     wrong = jnp.array(False)
-    if not is_concrete(*origin):
-        wrong = is_not_steady(*origin, steady) | ~_parameters_are_allowed(system)
+    if not is_concrete(*origin):  # for concrete numbers an exception reports it instead
+        allowed = [jnp.all(info.allows(value)) for _, value, info in parameters_in(system) if info.is_limited]
+        wrong = is_not_steady(*origin, steady) | ~jnp.all(jnp.stack([jnp.array(True), *allowed]))
     (A, B, C, D), follows = _derivatives(origin, wrong, _ModelNames(dependent, states, rows), functions)
     if is_concrete(*origin, A) and not (follows and all(np.isfinite(M).all() for M in (A, B, C, D))):
         raise ValueError(_no_linear_model(origin, dependent, bool(follows)))
     return LinearModel(A, B, C, D, states, tuple(system.inputs), rows)
-
-
-def _parameters_are_allowed(system: System) -> Array:
-    """Whether each parameter satisfies its declaration. For concrete numbers an exception reports it instead."""
-    limited = [(value, info) for _, value, info in parameters_in(system) if info.is_limited]
-    return jnp.all(jnp.stack([jnp.array(True), *(jnp.all(info.allows(value)) for value, info in limited)]))
 
 
 def _no_linear_model(origin: Any, dependent: tuple[str, ...], follows: bool) -> str:
@@ -201,17 +196,11 @@ def _state_names(system: System, states: Sequence[str] | None, dependent: tuple[
     if states is None:
         cyclic = cyclic_coordinates(system)
         return (*(c for c in free if c not in cyclic), *system.speeds, *system.states)
-    known = (*free, *system.speeds, *system.states)
-    states = as_names(states, "states")
-    unknown = [k for k in states if k not in known]
-    if unknown:
-        raise ValueError(
-            f"{type(system).__name__}: {', '.join(unknown)} cannot be a state; "
-            f"{hint(unknown, known, 'independent coordinates, speeds and states of the first order are')}"
-        )
-    twice = [k for k in known if states.count(k) > 1]
-    if twice:
-        raise ValueError(f"{type(system).__name__}: {', '.join(twice)} is named twice in `states`.")
+    name, known, states = type(system).__name__, (*free, *system.speeds, *system.states), as_names(states, "states")
+    have = "independent coordinates, speeds and states of the first order are"
+    refuse_unknown(states, known, f"{name}: these cannot be in `states`:", have)
+    if len(set(states)) < len(states):
+        raise ValueError(f"{name}: {', '.join(k for k in known if states.count(k) > 1)} is named twice in `states`.")
     return states
 
 

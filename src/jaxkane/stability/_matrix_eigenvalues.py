@@ -278,8 +278,9 @@ def _condition(values, left, right):
 # several programs run at once, the waiting threads are those of the pool, which is a deadlock.
 
 
+@jax.custom_jvp
 @jax.custom_batching.sequential_vmap
-def _by_lapack(A):
+def _decomposed(A):
     values, Y, X = jax.lax.linalg.eig(A, compute_left_eigenvectors=True, compute_right_eigenvectors=True)
     order = jnp.lexsort(_keys(values))
     return values[order], Y[:, order], X[:, order]
@@ -307,14 +308,7 @@ def _in_order(values):
     return values[jnp.lexsort(_keys(values))]
 
 
-@jax.custom_jvp
-def _decomposed(A):
-    return _by_lapack(A)
-
-
-@jax.custom_jvp
-def _values(A):
-    return _values_alone(A)
+_values = jax.custom_jvp(_values_alone)
 
 
 @_decomposed.defjvp

@@ -53,7 +53,9 @@ def _track_and_name(numbers: Any, states: tuple[str, ...], groups: Groups | None
     rows = np.isfinite(values).all(axis=1)
     if groups is not None and rows.any() and mode_names(states, groups) is not None:
         tracked = np.take_along_axis(values, order, axis=1)[rows]
-        shares = np.take_along_axis(participation_factors(left, right), order[:, None, :], axis=2)[rows]
+        factors = np.abs(np.conj(left) * right)  # participation factors, with a sum of one for each mode
+        factors = factors / np.maximum(factors.sum(axis=-2, keepdims=True), 1e-300)
+        shares = np.take_along_axis(factors, order[:, None, :], axis=2)[rows]
         columns, clear = _named_order(tracked, shares, confused, states, groups)
         order = order[:, columns]
     number = _numbers(np.take_along_axis(values, order, axis=1)[rows])
@@ -123,13 +125,11 @@ def _assigned(change: np.ndarray, last: np.ndarray, values: np.ndarray) -> np.nd
     columns = linear_sum_assignment(change)[1]
     old, new = conjugate_pairs(last), conjugate_pairs(values)
 
-    def is_pair(x: Numbers, i: Numbers, j: Numbers) -> Numbers:
-        return not (x.imag[i] or x.imag[j]) or x[i] == x[j].conj()
+    def keeps(pairs: np.ndarray, x: Numbers) -> bool:
+        """Whether each pair is continued by a pair or by two real eigenvalues, if x is in its order."""
+        return all(not (x.imag[i] or x.imag[j]) or x[i] == x[j].conj() for i, j in np.argwhere(pairs))
 
-    sources = np.argsort(columns)
-    if all(is_pair(values, *columns[[i, j]]) for i, j in np.argwhere(old)) and all(
-        is_pair(last, *sources[[i, j]]) for i, j in np.argwhere(new)
-    ):
+    if keeps(old, values[columns]) and keeps(new, last[np.argsort(columns)]):
         return columns
     (upper, lower), (new_upper, new_lower) = np.nonzero(old), np.nonzero(new)
     of_pairs = change[np.ix_(upper, new_upper)] + change[np.ix_(lower, new_lower)]
@@ -163,12 +163,6 @@ def mode_names(states: Sequence[str], groups: Groups) -> tuple[str, ...] | None:
     if sorted((*LATERAL, *grouped)) != sorted(states):
         return None
     return (*MODES, *(name for name, members in groups.items() for _ in members))
-
-
-def participation_factors(left: Any, right: Any) -> np.ndarray:
-    """Participation factors |conj(left) right|, with a sum of one for each mode: (..., states, modes)."""
-    factors = np.abs(np.conj(left) * right)
-    return factors / np.maximum(factors.sum(axis=-2, keepdims=True), 1e-300)
 
 
 def conjugate_pairs(values: Numbers) -> np.ndarray:
@@ -206,8 +200,11 @@ def _named_order(
     order, sure = assigned[best], own_share[best] >= _CLEAR
     own = order[: len(LATERAL)]
     order[: len(LATERAL)] = own[mode_order(values[:, own])]
-    order = _slower_first(order, values[best], groups)
     names = np.array(mode_names(states, groups))
+    wobble, front = (np.flatnonzero(names == each) for each in ("wobble", "front end"))
+    slowest = [np.abs(values[best][order[place]]).min(initial=np.inf) for place in (wobble, front)]
+    if len(wobble) == len(front) and slowest[1] < slowest[0]:
+        order[np.append(wobble, front)] = order[np.append(front, wobble)]
     differ = names[:, None] != names
     split = conjugate_pairs(values[:, order]) & differ
     if split[best].any():  # keep the order of `track`, in which pairs are adjacent
@@ -215,18 +212,6 @@ def _named_order(
     apart = split.any(axis=0)
     doubtful = ~sure | np.any((confused[np.ix_(order, order)] | apart | apart.T) & differ, axis=1)
     return order, ~np.isin(names, names[doubtful])
-
-
-def _slower_first(order: np.ndarray, values: np.ndarray, groups: Groups) -> np.ndarray:
-    names = mode_names([*LATERAL, *(k for group in groups.values() for k in group)], groups) or ()
-    places = [[i for i, name in enumerate(names) if name == each] for each in ("wobble", "front end")]
-    if len(places[0]) != len(places[1]):
-        return order
-    speed = [np.abs(values[order[place]]).min(initial=np.inf) for place in places]
-    if speed[1] < speed[0]:
-        order = order.copy()
-        order[places[0] + places[1]] = order[places[1] + places[0]]
-    return order
 
 
 def mode_order(values: Numbers) -> np.ndarray:

@@ -281,23 +281,17 @@ class OrbitEquations(eqx.Module):
     def sizes(self, z: Array, args: OrbitArguments) -> Float[Array, " n_z"]:
         """The size of each unknown, in its unit: 1 for an angle, otherwise the amplitude of a harmonic motion with
         these values and rates."""
-        T, system = self.period(z, args), args.system
+        T, system, closed = self.period(z, args), args.system, self.closed
         amplitudes = jnp.sqrt(self.rows(z) ** 2 + (self.rates(z, args) * T / (2 * np.pi)) ** 2)
-        amplitude, largest = jnp.max(amplitudes, axis=0), []
-        n_q, n_u = len(system.coordinates), len(system.speeds)
+        own, n_q, n_u = jnp.max(amplitudes, axis=0), len(system.coordinates), len(system.speeds)
+        kind = np.array([(i >= n_q) + (i >= n_q + n_u) for i in closed], int)
+        # An entry that is zero along the orbit is compared with others of its kind.
+        size = jnp.max(jnp.where(kind[:, None] == kind, own, 0.0), axis=1)
         units = coordinate_units(system)
-        for i in self.closed:
-            like = [
-                j for j, k in enumerate(self.closed) if (k < n_q) == (i < n_q) and (k < n_q + n_u) == (i < n_q + n_u)
-            ]
-            size = jnp.max(amplitude[np.array(like)])
-            least = jnp.where(
-                size > 0, 1e-3 * size, 1.0
-            )  # an entry that is zero along the orbit is compared with others
-            own = amplitude[self.closed.index(i)]
-            largest.append(jnp.ones_like(own) if i < n_q and units[i] == "rad" else jnp.maximum(own, least))
+        is_angle = np.array([i < n_q and units[i] == "rad" for i in closed], bool)
+        largest = jnp.where(is_angle, 1.0, jnp.maximum(own, jnp.where(size > 0, 1e-3 * size, 1.0)))
         # An orbit may have the amplitude zero. Errors of closing below `atol` are those of the simulation.
-        sizes = jnp.tile(jnp.maximum(jnp.stack(largest), self.atol / closing_tolerance(z.dtype)), self.segments)
+        sizes = jnp.tile(jnp.maximum(largest, self.atol / closing_tolerance(z.dtype)), self.segments)
         return jax.lax.stop_gradient(jnp.append(sizes, T) if self.autonomous else sizes)
 
     def return_matrix(self, segments: Array, z: Array, args: OrbitArguments) -> Float[Array, "m m"]:

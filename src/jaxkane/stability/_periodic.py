@@ -14,7 +14,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float
 
-from .._common.lookup import as_names, by_name, hint, refuse_unknown
+from .._common.lookup import as_names, by_name, refuse_unknown
 from .._integrate.events import event_values, own_events_of
 from .._integrate.inputs import as_signals, inputs_at, samples_of
 from .._integrate.simulate import checked_state
@@ -175,8 +175,20 @@ def periodic(
     for key, value in {"segments": segments, "returns": returns}.items():
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise ValueError(f"{name}: `{key}` must be a positive whole number, got {value!r}.")
+    if not isinstance(autonomous, (bool, np.bool_)):
+        raise TypeError(f"{name}: `autonomous` must be True or False, got {autonomous!r}.")
+    if not autonomous and (period is None or section is not None):
+        raise ValueError(
+            f"{name}: with autonomous=False, pass the period of the force as `period` [s]. Omit `section`: the orbit "
+            "starts at the time `t`."
+        )
     y, T, states = _checked_guess(name, system, guess, segments, t)
-    _check_options(name, system, section, period, autonomous, y)
+    if period is not None:
+        T: Any = period(system) if callable(period) else period
+        if not is_one_number(T) or (is_concrete(T) and not 0 < float(T) < np.inf):
+            raise ValueError(
+                f"{name}: `period` must be a positive and finite number [s], or a function of the system; got {T!r}."
+            )
     equations, args = orbit_equations(
         system, y, inputs, hold=hold, advance=advance, section=section, segments=segments, returns=returns, t=t,
         rtol=rtol, atol=atol, solver=solver, max_steps=max_steps, autonomous=bool(autonomous),
@@ -193,8 +205,6 @@ def periodic(
             "force: period=..., autonomous=False."
         )
     y, entries = args.start, (*system.coordinates, *system.speeds, *system.states)
-    if period is not None:
-        T = period(system) if callable(period) else period
     _refuse_equilibrium(name, equations, args, y)
     normal = _normal(equations, args, y)
     args = args._replace(normal=normal)
@@ -209,7 +219,7 @@ def periodic(
     args = args._replace(period=constant(T) if autonomous else T)
     T = jax.lax.stop_gradient(T)
     orbit, found = _solve(equations, args, constant(y), T, states)
-    if is_concrete(orbit.period, found) and not bool(found.ok):
+    if is_concrete(orbit.period, found) and not bool(found["ok"]):
         raise ValueError(_no_orbit(name, equations, entries, found))
     return orbit
 
@@ -259,7 +269,7 @@ def orbit_equations(
         segments=segments,
         hold=tuple(places.values()),
         section=section or "",
-        jumps=_changes_state(system, section, y),
+        jumps=_jumps_at(name, system, section, y),
         returns=returns,
         autonomous=autonomous,
         period_of=None if autonomous else period_of,
@@ -297,40 +307,22 @@ def _checked_guess(name: str, system: System, guess: Any, segments: int, t: Any)
     return packed_motion(state), T, states
 
 
-def _check_options(name: str, system: System, section, period, autonomous, y) -> None:
-    if not isinstance(autonomous, (bool, np.bool_)):
-        raise TypeError(f"{name}: `autonomous` must be True or False, got {autonomous!r}.")
-    T: Any = period(system) if callable(period) else period
-    if T is not None and not is_one_number(T):
-        raise TypeError(f"{name}: `period` must be one number [s], or a function of the system; got {period!r}.")
-    if T is not None and is_concrete(T) and not (np.isfinite(float(T)) and float(T) > 0):
-        raise ValueError(f"{name}: `period` must be positive and finite [s]; got {float(T):g}.")
-    if autonomous:
-        _check_section(name, system, section, y)
-        return
-    if period is None:
-        raise ValueError(f"{name}: with autonomous=False, pass the period of the force as `period` [s].")
-    if section is not None:
-        raise ValueError(f"{name}: with autonomous=False an orbit starts at the time `t`. Omit `section`.")
+def _jumps_at(name: str, system: System, section: str | None, y: Array) -> bool:
+    """Whether the event of a section changes the state.
 
-
-def _check_section(name: str, system: System, section: Any, y: Array) -> None:
+    **Raises:** `ValueError` for an event that does not exist or has no direction.
+    """
     if section is None:
-        return
+        return False
     events = own_events_of(system, jnp.zeros((), y.dtype), unpacked(system, y))
-    if section not in events.names:
-        raise ValueError(f"{name}: there is no event {section!r}; {hint(str(section), events.names, 'the events are')}")
-    if not events.directions[events.names.index(section)]:
+    refuse_unknown([str(section)], events.names, f"{name}: `section`: there is no event", "the events are")
+    place = events.names.index(section)
+    if not events.directions[place]:
         raise ValueError(
             f"{name}: the event {section!r} has no direction, so an orbit would cross it twice. Return "
             "jaxkane.rising(...) or jaxkane.falling(...)."
         )
-
-
-def _changes_state(system: System, section: str | None, y: Array) -> bool:
-    """Whether the event of a section changes the state."""
-    events = own_events_of(system, jnp.zeros((), y.dtype), unpacked(system, y))
-    return section in events.names and events.stages[events.names.index(section)] > 0
+    return events.stages[place] > 0
 
 
 def _refuse_equilibrium(name: str, equations: OrbitEquations, args: OrbitArguments, y: Array) -> None:
@@ -372,7 +364,7 @@ def _first_return(name: str, equations: OrbitEquations, args: OrbitArguments, y:
     if equations.jumps:
         duration = 1e-2
         for _ in range(_DOUBLINGS // 2):
-            time = float(_time_until_return(equations, args, y, jnp.asarray(duration, y.dtype)))
+            time = float(_until_return(equations, args, y, args.t, jnp.asarray(duration, y.dtype))[1])
             if np.isfinite(time):
                 return y, time
             duration *= 2.0
@@ -391,8 +383,7 @@ def _first_return(name: str, equations: OrbitEquations, args: OrbitArguments, y:
                 f"{name}: the simulation of the guess ends at {float(ride.t_end):.6g} s: {ride.reason}. Start nearer "
                 "to the orbit, or pass a guess of the period as `period`."
             )
-        ys, g = np.asarray(ys), np.asarray(g)
-        g, taus = direction * g, np.linspace(0.0, duration, len(g))
+        ys, g, taus = np.asarray(ys), direction * np.asarray(g), np.linspace(0.0, duration, len(g))
         closed = ys[:, equations.places]
         size = np.maximum(np.ptp(closed, axis=0), 1e-300)
         crossed = [i for i in range(1, len(g) - 1) if g[i] < 0 <= g[i + 1]]
@@ -402,11 +393,8 @@ def _first_return(name: str, equations: OrbitEquations, args: OrbitArguments, y:
             first = _crossing(g, taus, ys, i)
         else:
             first = taus[0], ys[0]
-        at = (first[1][equations.places] - closed) / size
-        near = np.linalg.norm(at, axis=1) <= (
-            np.inf if equations.section else 0.25 * np.max(np.linalg.norm(at, axis=1))
-        )
-        found = [i for i in crossed if near[i]]
+        far = np.linalg.norm((first[1][equations.places] - closed) / size, axis=1)
+        found = [i for i in crossed if equations.section or far[i] <= 0.25 * np.max(far)]
         if len(found) >= equations.returns:
             time, _ = _crossing(g, taus, ys, found[equations.returns - 1])
             return jnp.asarray(first[1], y.dtype), time - first[0]
@@ -436,42 +424,25 @@ def _sampled(equations: OrbitEquations, args: OrbitArguments, y: Array, duration
     return ride, ys, g
 
 
-@jit
-def _time_until_return(equations: OrbitEquations, args: OrbitArguments, y: Array, longest: Array) -> Array:
-    return equations.until_return(args, y, args.t, longest)[1]
-
-
-class _Found(eqx.Module):
-    """How the search for an orbit ended.
-
-    - `ok`: whether an orbit was found. `residual`: the largest error of closing relative to the amplitude.
-    - `singular` (n_z,): singular values of the scaled derivative, relative to the largest.
-    - `change` (n_z,): the scaled change of the unknowns that changes the residuals least.
-    - `speed`: the largest change of a closed entry in one period at the initial rate, relative to its size.
-    - `crosses`: whether the orbit crosses the section in the direction of its event.
-    - `repeats`: whether the equations have the period of the orbit.
-    """
-
-    ok: Array
-    residual: Array
-    singular: Array
-    change: Array
-    speed: Array
-    crosses: Array
-    repeats: Array
+_until_return = jit(OrbitEquations.until_return)
 
 
 @jit
 def _solve(equations: OrbitEquations, args: OrbitArguments, y: Array, T: Array, states: Array | None):
+    """The orbit, and how the search ended.
+
+    - "ok": whether an orbit was found. "residual": the largest error of closing relative to the amplitude.
+    - "change" (n_z,): the scaled change of the unknowns that changes the residuals least.
+    - "speed": the largest change of a closed entry in one period at the initial rate, relative to its size.
+    - "crosses": whether the orbit crosses the section in the direction of its event.
+    - "repeats": whether the equations have the period of the orbit.
+    """
     known = constant(args)
     states = _shots(equations, known, y, T) if states is None else jax.lax.stop_gradient(states).at[0].set(y)
     z, at = _root(equations, equations.unknowns(states, T), args)
     z_known = jax.lax.stop_gradient(z)
-    sizes, rows, residual = scales_at(equations, z_known, known, at)
-    J = at.J * sizes[None, :] / rows[:, None]
-    J = jnp.where(jnp.isfinite(J), J, 0.0)
-    J = J / jnp.maximum(jnp.linalg.norm(J, axis=0, keepdims=True), jnp.finfo(J.dtype).tiny)
-    _, s, Vt = jnp.linalg.svd(J, full_matrices=False)
+    sizes, _, residual = scales_at(equations, z_known, known, at)
+    _, _, _, s, Vt = _scaled_svd(equations, at._replace(J=jnp.where(jnp.isfinite(at.J), at.J, 0.0)), sizes)
     period = equations.period(z_known, known)
     speed = jnp.max(jnp.abs(equations.rates(z_known, known)[0] * period / sizes[: len(equations.closed)]))
     speed = speed if equations.autonomous else jnp.ones_like(speed)
@@ -488,7 +459,8 @@ def _solve(equations: OrbitEquations, args: OrbitArguments, y: Array, T: Array, 
     )
     z, segments = nan_where(~ok, (z, at.segments), args)
     orbit = as_orbit(equations, z, args, segments, residual)
-    return orbit, jax.lax.stop_gradient(_Found(ok, residual, singular, Vt[-1], speed, crosses, has_period))
+    found = {"ok": ok, "residual": residual, "change": Vt[-1], "speed": speed, "crosses": crosses}
+    return orbit, jax.lax.stop_gradient(found | {"repeats": has_period})
 
 
 def _crosses(equations: OrbitEquations, z: Array, args: OrbitArguments) -> Array:
@@ -564,7 +536,9 @@ def _root(equations: OrbitEquations, guess: Array, args: OrbitArguments) -> tupl
         last = (jnp.max(jnp.abs(dz)) < eps**0.5) & (damping == 1.0) & (k > 0)
         z = jnp.where(better, trial, z)
         at = jax.tree.map(lambda x, y: jnp.where(better, x, y), new, at)
-        inverse = _scaled_inverse(equations, at, sizes)
+        rows, size, U, s, Vt = _scaled_svd(equations, at, sizes)
+        inverse = jnp.where(s > 1e3 * eps * s[0], 1.0 / jnp.where(s > 0, s, 1.0), 0.0)
+        inverse = (Vt.T @ (inverse[:, None] * U.T)) / size[:, None] / rows[None, :]
         dz = -inverse @ at.F
         damping = jnp.where(better, jnp.minimum(1.0, 4.0 * damping), 0.25 * damping)
         if equations.autonomous:  # a step to a period of zero, or to a multiple, would end at another solution
@@ -578,15 +552,14 @@ def _root(equations: OrbitEquations, guess: Array, args: OrbitArguments) -> tupl
     return z, at._replace(F=jnp.where(missing, jnp.inf, at.F))
 
 
-def _scaled_inverse(equations: OrbitEquations, at: Evaluation, sizes: Array) -> Array:
-    """The pseudoinverse (n_z, m) of J, for unknowns that are divided by their sizes."""
+def _scaled_svd(equations: OrbitEquations, at: Evaluation, sizes: Array) -> tuple[Array, ...]:
+    """The sizes of the residuals (m,), the lengths (n_z,) of the columns of J for unknowns that are divided by their
+    sizes and residuals by theirs, and the singular value decomposition of this J with columns of unit length."""
     rows = _row_sizes(equations, at, sizes)
     J = at.J * sizes[None, :] / rows[:, None]
     length = jnp.linalg.norm(J, axis=0)
     length = jnp.where(length > 0, length, 1.0)
-    U, s, Vt = jnp.linalg.svd(J / length[None, :], full_matrices=False)
-    inverse = jnp.where(s > 1e3 * jnp.finfo(J.dtype).eps * s[0], 1.0 / jnp.where(s > 0, s, 1.0), 0.0)
-    return (Vt.T @ (inverse[:, None] * U.T)) / length[:, None] / rows[None, :]
+    return rows, length, *jnp.linalg.svd(J / length[None, :], full_matrices=False)
 
 
 @_root.def_jvp
@@ -682,36 +655,40 @@ def _ride(equations: OrbitEquations, z: Array, args: OrbitArguments) -> Trajecto
     return dataclasses.replace(ride, t=ride.t + skipped, t_end=ride.t_end + skipped, jumps=jumps)
 
 
-def _no_orbit(name: str, equations: OrbitEquations, entries: tuple[str, ...], found: _Found) -> str:
-    residual, speed = float(found.residual), float(found.speed)
-    if not found.repeats:
-        return (
-            f"{name}: the equations at t and t + period differ, or the type of the state cannot resolve these times. "
-            "Pass a period of the force with all its digits, e.g. as a function of the system. Samples that an input "
-            "function calls must cover two periods, and its delays."
-        )
-    if not np.isfinite(residual):
-        return (
-            f"{name}: the simulation of the guess does not reach the end of its period. A value may grow without "
-            "bound, or an event may end the simulation. Pass a guess that is nearer to the orbit, or its period."
-        )
-    if not residual <= closing_tolerance(found.residual.dtype):
-        return (
-            f"{name}: no periodic orbit was found near this guess (the largest error of closing is {residual:.3g} of "
-            "the amplitude). Pass a nearer guess, more `segments` if the orbit is strongly unstable, or `hold` if the "
-            "system is conservative."
-        )
-    if not speed > 1e-6:
-        return (
-            f"{name}: the search ended at an equilibrium or a steady motion. Pass a guess that is nearer to the orbit."
-        )
-    if not found.crosses:
-        return (
-            f"{name}: the orbit crosses the section {equations.section!r} against the direction of its event. Pass a "
-            "guess near the other crossing, or omit `period`."
-        )
+def _no_orbit(name: str, equations: OrbitEquations, entries: tuple[str, ...], found: dict[str, Array]) -> str:
+    residual = float(found["residual"])
+    for is_so, reason in (
+        (
+            not found["repeats"],
+            "the equations at t and t + period differ, or the type of the state cannot resolve these times. Pass a "
+            "period of the force with all its digits, e.g. as a function of the system. Samples that an input function "
+            "calls must cover two periods, and its delays.",
+        ),
+        (
+            not np.isfinite(residual),
+            "the simulation of the guess does not reach the end of its period. A value may grow without bound, or an "
+            "event may end the simulation. Pass a guess that is nearer to the orbit, or its period.",
+        ),
+        (
+            not residual <= closing_tolerance(found["residual"].dtype),
+            f"no periodic orbit was found near this guess (the largest error of closing is {residual:.3g} of the "
+            "amplitude). Pass a nearer guess, more `segments` if the orbit is strongly unstable, or `hold` if the "
+            "system is conservative.",
+        ),
+        (
+            not float(found["speed"]) > 1e-6,
+            "the search ended at an equilibrium or a steady motion. Pass a guess that is nearer to the orbit.",
+        ),
+        (
+            not found["crosses"],
+            f"the orbit crosses the section {equations.section!r} against the direction of its event. Pass a guess "
+            "near the other crossing, or omit `period`.",
+        ),
+    ):
+        if is_so:
+            return f"{name}: {reason}"
     names = [*(entries[i] for i in equations.closed)] * equations.segments + ["period"]
-    moves = np.abs(np.asarray(found.change))
+    moves = np.abs(np.asarray(found["change"]))
     which = dict.fromkeys(names[i] for i in np.argsort(-moves) if moves[i] > 1e-2 * np.max(moves))
     return (
         f"{name}: the orbits near this guess form a family, along which {', '.join(which)} change. Hold one of these, "

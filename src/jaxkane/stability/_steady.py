@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -10,9 +11,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
-from .._common.lookup import as_names, by_name, hint, refuse_unknown
+from .._common.lookup import as_names, by_name, refuse_unknown
 from .._kane.api import dependent_speeds
 from .._kane.arguments import (
     as_array,
@@ -158,38 +159,30 @@ def steady_turn(
     u = as_array({} if u is None else u, system.speeds, f"{name}: u").astype(q.dtype)
     known = {k: jnp.asarray(x, q.dtype) for k, x in checked_values(system, inputs).items()}
     find = as_names(find, "find")
-    unknown = sorted(set(find) - set(system.inputs))
-    if unknown:
-        raise ValueError(f"{name} has no input {', '.join(unknown)} to find; {hint(unknown, system.inputs, 'it has')}")
+    refuse_unknown(find, system.inputs, f"{name} has no input", "it has")
     equations = SteadyEquations(system, (*find, *system.states), tuple(values))
-    for k, x in values.items():
-        if x is not None and k in system.coordinates:
-            q = q.at[system.coordinates.index(k)].set(jnp.asarray(x, q.dtype))
-        elif x is not None and k in system.speeds:
-            u = u.at[system.speeds.index(k)].set(jnp.asarray(x, q.dtype))
+    given = {k: jnp.asarray(x, q.dtype) for k, x in values.items() if x is not None}
+    for k, x in given.items():
+        if k in system.coordinates:
+            q = q.at[system.coordinates.index(k)].set(x)
+        elif k in system.speeds:
+            u = u.at[system.speeds.index(k)].set(x)
     check_time(name, t)
     t = jnp.asarray(t, q.dtype)
-    _refuse_not_finite(system, q, u, known, values)
+    numbers = dict(zip((*system.coordinates, *system.speeds), (*q, *u), strict=True)) | known | given
+    wrong = [k for k, x in numbers.items() if is_concrete(x) and not np.isfinite(x)]
+    if wrong:
+        raise ValueError(
+            f"{name}: {', '.join(wrong)} is not finite ({float(numbers[wrong[0]])}). Pass finite numbers "
+            f"{'in `hold`' if values.keys() & {*wrong} else 'for the initial guess'}."
+        )
     check_system(system, t, q)
-    targets = [(k, values[k]) for k in equations.hold]
-    targets = [quantity(system, t, q, u, k) if x is None else x for k, x in targets]
-    targets = jnp.stack([jnp.asarray(x, q.dtype) for x in targets]) if targets else jnp.zeros(0, q.dtype)
+    targets = [given[k] if k in given else quantity(system, t, q, u, k) for k in equations.hold]
+    targets = jnp.stack(targets) if targets else jnp.zeros(0, q.dtype)
     motion, rank = _solve(equations, (system, t, q, u, known, targets))
     if is_concrete(motion.q) and not bool(jnp.all(jnp.isfinite(motion.q))):
         raise ValueError(_no_steady_motion(name, equations, tuple(values), float(motion.residual), *rank))
     return motion
-
-
-def _refuse_not_finite(system: System, q, u, known, held: Mapping[str, Any]) -> None:
-    numbers = dict(zip((*system.coordinates, *system.speeds), (*q, *u), strict=True)) | known
-    numbers |= {k: x for k, x in held.items() if x is not None}
-    wrong = [k for k, x in numbers.items() if is_concrete(x) and not np.isfinite(x)]
-    if wrong:
-        held_too = [k for k in wrong if k in held]
-        raise ValueError(
-            f"{type(system).__name__}: {', '.join(wrong)} is not finite ({float(numbers[wrong[0]])}). Pass finite "
-            f"numbers {'in `hold`' if held_too else 'for the initial guess'}."
-        )
 
 
 def quantity(system: System, t, q, u, name: str):
@@ -224,13 +217,9 @@ class SteadyEquations(eqx.Module):
     hold: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, system: System, find: tuple[str, ...], hold: tuple[str, ...]):
+        # Parameters are always constant, and so are inputs that are not in `find`.
         known = (*system.coordinates, *system.speeds, *system.dependent_speeds)
-        unknown = [k for k in hold if k not in known]
-        if unknown:
-            raise ValueError(
-                f"{type(system).__name__} has no {', '.join(unknown)} to hold; {hint(unknown, known, 'it has')} "
-                "Parameters are always constant, and so are inputs that are not in `find`."
-            )
+        refuse_unknown(hold, known, f"{type(system).__name__} has no coordinate or speed", "it has")
         cyclic = cyclic_coordinates(system)
         self.still = tuple(i for i, c in enumerate(system.coordinates) if c not in cyclic)
         self.q_free = tuple(i for i in self.still if system.coordinates[i] not in hold)
@@ -308,9 +297,8 @@ def _solve(equations: SteadyEquations, args):
     J = _by_columns(J / sizes[:, None])[0]
     slopes = singular_values(without_rounding(J, jnp.ones_like(J))) if len(guess) else jnp.ones(1, q.dtype)
     tolerance = rank_tolerance(z.dtype)
-    good = (r <= tolerance) & (slopes[-1] > tolerance)
-    q, u, inputs = equations.parts(z, q, u, known)
-    return as_motion(system, t, q, u, inputs, r, ~good, args), (slopes, J)
+    missing = ~((r <= tolerance) & (slopes[-1] > tolerance))
+    return as_motion(system, t, *equations.parts(z, q, u, known), r, missing, args), (slopes, J)
 
 
 def _by_columns(J: Array) -> tuple[Array, Array]:
@@ -444,11 +432,8 @@ def _search_cyclic(system: System, leaves: list, treedef) -> tuple[str, ...]:
     rng = np.random.default_rng(0)
     dtype = jnp.result_type(*leaves) if leaves else jnp.zeros(()).dtype
 
-    def as_floats(x: Numbers) -> PyTree:
-        return jnp.asarray(x, dtype)
-
     @jax.jit
-    def all_rates(trial, t, q, u, w):
+    def all_rates(trial, q, t, u, w):
         rate = rates(trial, t, q, u, w)
         of_states = [] if rate.x is None else [rate.x]
         return rate.q, jnp.concatenate([rate.u, configuration_residual(trial, t, q), *of_states])
@@ -463,21 +448,18 @@ def _search_cyclic(system: System, leaves: list, treedef) -> tuple[str, ...]:
             trial = system
         q, u = rng.uniform(-0.4, 0.4, n_q), rng.uniform(-1.0, 1.0, len(system.speeds))
         size = _INPUTS[compared % len(_INPUTS)]
-        w = {
-            name: as_floats(size * rng.choice([-1, 1]) * rng.uniform(0.5, 1.5))
-            for name in (*system.inputs, *system.states)
-        }
-        t, u = as_floats(rng.uniform(0.0, 2.0)), as_floats(u)
+        names_of_inputs = (*system.inputs, *system.states)
+        w = {name: size * rng.choice([-1, 1]) * rng.uniform(0.5, 1.5) for name in names_of_inputs}
+        others = jax.tree.map(lambda x: jnp.asarray(x, dtype), (rng.uniform(0.0, 2.0), u, w))
 
-        def rates_at(q, trial=trial, t=t, u=u, w=w):
-            return tuple(map(np.asarray, all_rates(trial, t, as_floats(q), u, w)))
+        def rates_at(q, trial=trial, others=others):
+            return [*map(np.asarray, all_rates(trial, jnp.asarray(q, dtype), *others))]
 
         before = rates_at(q)
         if not all(np.all(np.isfinite(x)) for x in before):
             continue
-        for i in range(n_q):
-            for shift in _SHIFTS:
-                depends[:, i] |= _changed_rates(before, rates_at(q + shift * np.eye(n_q)[i]), 1 + abs(shift))
+        for i, shift in itertools.product(range(n_q), _SHIFTS):
+            depends[:, i] |= _changed_rates(before, rates_at(q + shift * np.eye(n_q)[i]), 1 + abs(shift))
         compared += 1
         if compared == _TRIALS:
             break
@@ -492,16 +474,15 @@ def _search_cyclic(system: System, leaves: list, treedef) -> tuple[str, ...]:
     return tuple(name for name, k in zip(names, non_cyclic, strict=True) if not k)
 
 
-def _changed_rates(before: tuple[np.ndarray, ...], after: tuple[np.ndarray, ...], rounding: float) -> np.ndarray:
+def _changed_rates(before: list[np.ndarray], after: list[np.ndarray], rounding: float) -> np.ndarray:
     """Which rates of the coordinates (n_q,) differ beyond rounding; the last entry is for all other rates."""
-    eps = float(np.finfo(before[0].dtype).eps)
-    rows = []
-    for a, b in (*zip(before[0], after[0], strict=True), (before[1], after[1])):
-        a, b = np.atleast_1d(a), np.atleast_1d(b)
-        size = rounding * (1.0 + np.abs(a).max(initial=0.0))
+    tolerance = float(np.finfo(before[0].dtype).eps) ** 0.6 * rounding
+
+    def changed(a, b):
         # If a rate is not finite after the shift of a cyclic coordinate, it was not finite before.
-        rows.append(not np.all(np.abs(b - a) <= eps**0.6 * size))
-    return np.array(rows)
+        return not np.all(np.abs(b - a) <= tolerance * (1.0 + np.abs(a).max(initial=0.0)))
+
+    return np.array([*map(changed, before[0], after[0]), changed(before[1], after[1])])
 
 
 def inputs_by_name(system: System, w) -> dict[str, Any]:
@@ -517,13 +498,12 @@ def _non_cyclic(system: System) -> np.ndarray:
 def check_dependent(system: System, dependent: Sequence[str], n_h: int) -> None:
     """**Raises:** `ValueError` if the number of named coordinates is not the number `n_h` of configuration
     constraints."""
-    name = type(system).__name__
-    refuse_unknown(dependent, system.coordinates, f"{name}: `dependent` contains unknown names:", "the coordinates are")
-    if len(set(dependent)) != n_h:
+    name, n, known = type(system).__name__, len(set(dependent)), system.coordinates
+    refuse_unknown(dependent, known, f"{name}: `dependent` contains unknown names:", "the coordinates are")
+    if n != n_h:
         raise ValueError(
-            f"{name}: {n_h} configuration constraints determine {n_h} coordinates, but {len(set(dependent))} are named "
-            f"({', '.join(dependent) or 'none'}). Pass {n_h} coordinates as linearize(..., dependent=(...)): "
-            f"{', '.join(system.coordinates)}."
+            f"{name}: {n_h} configuration constraints determine {n_h} coordinates, but {n} are named "
+            f"({', '.join(dependent) or 'none'}). Pass {n_h} of {', '.join(known)} as linearize(..., dependent=(...))."
         )
 
 

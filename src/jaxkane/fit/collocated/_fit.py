@@ -15,7 +15,7 @@ import numpy as np
 
 from ..._collocate.functions import bounds_of
 from ..._collocate.lobatto import lobatto
-from ..._collocate.program import Bounds, NonlinearProgram
+from ..._collocate.program import NonlinearProgram
 from ..._collocate.second_order import refused_unless_minimum
 from ..._collocate.solvers import INTERRUPTED, Solution, Solver, default_solver, run
 from ..._collocate.transcription import Transcription
@@ -162,9 +162,8 @@ def solved(problem: Problem, how: Collocation, progress: bool) -> CollocationFit
 def with_fixed(program: NonlinearProgram, variables: np.ndarray, z: np.ndarray) -> NonlinearProgram:
     """The same program, but with some variables fixed at their values in z (n,), in scaled numbers."""
     changed = copy.copy(program)
-    lower, upper = program.x_bounds.lower.copy(), program.x_bounds.upper.copy()
-    lower[variables] = upper[variables] = z[variables] * program.x_scale[variables]
-    changed.x_bounds = Bounds(lower, upper)
+    changed.lower, changed.upper = program.lower.copy(), program.upper.copy()
+    changed.lower[variables] = changed.upper[variables] = z[variables]
     return changed
 
 
@@ -299,7 +298,7 @@ class CollocationFit:
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Confidence intervals by name, truncated at the bounds of the parameters."""
         half_widths = t_quantile(level, np.inf) * np.array([*self.standard_errors.values()])
-        return dict(zip(self.names, intervals(self.parameters, self._theta, half_widths), strict=True))
+        return dict(zip(self.names, intervals(self.parameters, jnp.asarray(self._theta), half_widths), strict=True))
 
     @functools.cached_property
     def _at_samples(self) -> list[tuple[Trial, dict[str, np.ndarray], dict[str, np.ndarray]]]:

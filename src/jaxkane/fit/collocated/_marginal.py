@@ -144,9 +144,10 @@ class Marginal:
         value += float(np.linalg.slogdet(S)[1])
         # the derivatives of the motion by the shared parameters that are not fixed
         slopes, free = np.zeros((program.n, len(self.shared))), np.isin(self.shared, kkt.border)
-        of_local = -np.linalg.solve(S, kkt.schur[np.ix_(is_local, ~is_local)])
+        is_shared = np.logical_not(is_local)
+        of_local = -np.linalg.solve(S, kkt.schur[np.ix_(is_local, is_shared)])
         slopes[np.ix_(kkt.border[is_local], free)] = of_local
-        slopes[np.ix_(kkt.inner, free)] = -(kkt.solved[:, ~is_local] + kkt.solved[:, is_local] @ of_local)[:n]
+        slopes[np.ix_(kkt.inner, free)] = -(kkt.solved[:, is_shared] + kkt.solved[:, is_local] @ of_local)[:n]
         return Point(z, multipliers, value, slopes)
 
     def _kkt(self, z: np.ndarray, multipliers: np.ndarray) -> Kkt:
