@@ -80,13 +80,9 @@ def falling(quantity: Component, *, then: Any = None, when: Component | None = N
 
 
 def _stages(then: Any) -> tuple[Any, ...]:
-    if then is None:
-        return ()
-    if isinstance(then, (tuple, list)):
-        if not then:
-            raise ValueError("`then` is an empty tuple. Pass at least one stage, or omit `then` to end the simulation.")
-        return tuple(then)
-    return (then,)
+    if isinstance(then, (tuple, list)) and not then:
+        raise ValueError("`then` is an empty tuple. Pass at least one stage, or omit `then` to end the simulation.")
+    return tuple(then) if isinstance(then, (tuple, list)) else () if then is None else (then,)
 
 
 def first_crossing(
@@ -288,16 +284,14 @@ def _as_crossing(name: str, event: Any, dtype: DTypeLike) -> Crossing:
 
 def _as_float(name: str, event: Any, dtype: DTypeLike, is_condition: bool = False) -> Any:
     value, part = jnp.asarray(event), ": `when`" if is_condition else ""
-    if is_condition and value.dtype == bool:
-        raise TypeError(
-            f"The event {name!r}: `when` is a boolean. Pass a number that is positive where the event may occur, e.g. "
-            "when=q['x'] instead of when=q['x'] > 0."
-        )
     if value.dtype == bool:
-        raise TypeError(
-            f"The event {name!r} is a boolean. Return a smooth, signed quantity that is zero at the event, e.g. "
-            "q['h'] instead of q['h'] < 0. jaxkane.falling and jaxkane.rising select the direction of the crossing."
+        advice = (
+            "a number that is positive where the event may occur, e.g. when=q['x'] instead of when=q['x'] > 0"
+            if is_condition
+            else "a smooth, signed quantity that is zero at the event, e.g. q['h'] instead of q['h'] < 0. "
+            "jaxkane.falling and jaxkane.rising select the direction of the crossing"
         )
+        raise TypeError(f"The event {name!r}{part} is a boolean. Return {advice}.")
     if value.shape:
         raise TypeError(
             f"The event {name!r}{part} has the shape {value.shape}. Return one number per name, e.g. one event for "

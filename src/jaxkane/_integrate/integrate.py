@@ -53,10 +53,10 @@ from .inputs import (
     samples_of,
 )
 from .jumps import JumpTable, impulses_at, stages_of, state_after, without_derivative_at
-from .loop import Jump, JumpRecord, Jumps, Steps, diffrax_loop, fast_loop, is_supported
+from .loop import Jump, Steps, diffrax_loop, fast_loop, is_supported
 from .probe import Probing, as_integers, direction_of, generic
 from .settings import Settings, with_scan_kind, with_tolerances
-from .solvers import StepwiseInputs, UnrolledERK, is_explicit, last_stage_is_spare
+from .solvers import UnrolledERK, is_explicit, last_stage_is_spare, with_stepwise_inputs
 from .status import Status
 from .step_control import FEWEST_STEPS, SHARE, StepSizeController, evenly_spread, first_step
 from .tangents import with_own_tangents
@@ -155,7 +155,8 @@ def _solved(
     follows_from = parts_of((system, state, origin, taus, signals, discontinuities, closures))
     others_are_valid = inputs_are_valid(signals)
     if not settings.rising:
-        rises = _is_rising(origin, taus)
+        # The last times of a window of a fit may be equal, because windows are padded with the last time.
+        rises = jnp.all(taus[1:] >= taus[:-1]) & (taus[-1] > 0) & jnp.isfinite(origin) & jnp.isfinite(taus[-1])
         taus = jnp.where(rises, taus, jnp.arange(taus.shape[0], dtype=taus.dtype))
         others_are_valid &= rises
     if settings.check_bodies:
@@ -261,12 +262,6 @@ class Problem(NamedTuple):
         state = unpacked(self.system, self.start)
         return has_configuration_constraints(self.system, self.args.origin, state.q)
 
-    @property
-    def are_native(self) -> bool:
-        """Whether the right-hand side is one native kernel."""
-        t, state = self.args.origin, unpacked(self.system, self.start)
-        return rates_are_native(self.args.system, t, self.start, inputs_at(self.system, self.args.signals, t, state))
-
     def rates(self, forward: bool | None = None) -> Callable[..., Any]:
         settings = self.settings
         forward = settings.is_forward if forward is None else forward
@@ -277,16 +272,13 @@ class Problem(NamedTuple):
         settings, rates = self.settings, self.rates()
         controller = self.controller(rates)
 
-        def trial_rates(t: Any, y: Any, args: Any) -> Any:
-            # If a step is rejected because its rates are not finite, the reverse-mode derivative must not become NaN.
-            return derivative_free_where_not_finite(rates, t, y, args)
-
-        solver = _solver_for(settings, self.are_native)
+        # If a step is rejected because its rates are not finite, the reverse-mode derivative must not become NaN.
+        trial_rates = functools.partial(derivative_free_where_not_finite, rates)
+        solver = _solver_for(settings, self.args.system, self.args.origin, self.start, self.args.signals)
         how = rates if settings.is_forward else trial_rates, solver, controller, self.start, self.args, self.taus
         limits = settings.adjoint, settings.max_steps, self.valid
         if is_supported(solver, controller, settings.adjoint, settings.progress):
-            n_impulses = len(self.events.layout.names) * (1 + self.events.layout.d)
-            jumps = Jumps(self.jump, settings.max_jumps, n_impulses) if self.events.continue_ else None
+            jumps = (self.jump, settings.max_jumps) if self.events.continue_ else None
             return fast_loop(*how, *limits, jumps, errors=self.errors_of_tangent(solver, controller, jumps))
         if self.events.continue_:
             raise ValueError(
@@ -296,7 +288,7 @@ class Problem(NamedTuple):
             )
         return diffrax_loop(*how, *limits, settings.progress)
 
-    def errors_of_tangent(self, solver: Any, controller: StepSizeController, jumps: Jumps | None) -> Array | None:
+    def errors_of_tangent(self, solver: Any, controller: StepSizeController, jumps: Any) -> Array | None:
         """The errors of a tangent in all steps, None if they are not controlled."""
         if self.args_dot is None:
             return None
@@ -317,9 +309,7 @@ class Problem(NamedTuple):
         def quantities(t: Array, y: Array, args: RateArguments) -> EventValues:
             return self.event_values(t, y, args, rates(t, y, args) if events.read_rates else None)
 
-        def as_number(x: Any) -> Array:
-            return jnp.asarray(x, self.taus.dtype)
-
+        as_number = functools.partial(jnp.asarray, dtype=self.taus.dtype)
         fixed, may_end, found = settings.step is not None, events.names or system.dependent_speeds, self.discontinuities
         if found is not None and ((fixed and not found.jumps) or self.args.past_end):
             found = found._replace(restart=False)  # no stage of a step is used on the other side of a jump
@@ -405,7 +395,7 @@ class Problem(NamedTuple):
             # An event function that jumps across zero with an input vanishes nowhere: its time is that of the input.
             apart = jnp.abs(constant(point.t) - constant(self.discontinuities.times))
             smooth |= jnp.any(apart <= 2 * reach)
-        jump = Jump(point.t, point.y, after, smooth.astype(y.dtype), y[:0], jnp.zeros_like(event))
+        jump = Jump(point.t, event, point.y, after, smooth.astype(y.dtype), y[:0], jnp.zeros_like(event))
         if self.events.layout.names:
             jump = self.contact_jump(jump._replace(after=jnp.where(is_possible, after, point.y)), event, reach)
         status = jnp.where(is_possible, jump.status, float(Status.IMPOSSIBLE_JUMP))
@@ -479,28 +469,9 @@ def _is_small(x: Any) -> bool:
     return eqx.is_inexact_array(x) and 0 < x.size <= LARGEST_SUM
 
 
-def _is_rising(origin: Array, taus: Array) -> Array:
-    # The last times of a window of a fit may be equal, because windows are padded with the last time.
-    return jnp.all(taus[1:] >= taus[:-1]) & (taus[-1] > 0) & jnp.isfinite(origin) & jnp.isfinite(taus[-1])
-
-
 def is_valid(system: System, y: Array, t: Array, signals: Any) -> Array:
     """Whether a simulation can start at `t`, with a packed state."""
-    others = _large_are_valid(system, y) & inputs_are_valid(signals)
-    return _small_are_valid(*constant((system, y, t)), others)
-
-
-def _large_are_valid(system: System, y: Array) -> Array:
-    allowed = [jnp.all(info.allows(x)) for x, info in _limited(system) if not _is_small(x)]
-    return functools.reduce(jnp.logical_and, allowed, all_finite(eqx.filter((system, y), _is_small, inverse=True)))
-
-
-@ScalarFunction.compile_cheaply
-def _small_are_valid(system: System, y: Array, t: Array, others_are_valid: Array) -> Array:
-    conditions = [others_are_valid, configuration_is_met(system, t, unpacked(system, y).q)]
-    conditions += [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, y)) if _is_small(x)]
-    conditions += [jnp.all(info.allows(x)) for x, info in _limited(system) if _is_small(x)]
-    return functools.reduce(jnp.logical_and, conditions)
+    return initial_check(*constant((system, y, t)), inputs_are_valid(signals))[0]
 
 
 def _limited(system: System) -> list[tuple[Array, ParameterInfo]]:
@@ -514,7 +485,9 @@ def initial_check(system: System, y: Array, t: Array, others_are_valid: Array) -
     Invalid parameters are replaced by 1. Masking the result is not enough: NaN would still reach the reverse-mode
     gradients of parameters that a batch shares. Small arrays are checked in one program, large ones one by one.
     """
-    others = _large_are_valid(system, y) & others_are_valid
+    others = all_finite(eqx.filter((system, y), _is_small, inverse=True)) & others_are_valid
+    for x, info in _limited(system):
+        others = others if _is_small(x) else others & jnp.all(info.allows(x))
     valid, start, small = _initial_check(system, y, t, others)
     large = _harmless(system, y, valid, lambda x: eqx.is_inexact_array(x) and not _is_small(x))
     rest = eqx.filter((y, system), eqx.is_inexact_array, inverse=True)
@@ -523,7 +496,10 @@ def initial_check(system: System, y: Array, t: Array, others_are_valid: Array) -
 
 @ScalarFunction.compile_cheaply
 def _initial_check(system: System, y: Array, t: Array, others: Array) -> tuple[Array, Any, Any]:
-    valid = _small_are_valid.__wrapped__(system, y, t, others)
+    conditions = [others, configuration_is_met(system, t, unpacked(system, y).q)]
+    conditions += [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, y)) if _is_small(x)]
+    conditions += [jnp.all(info.allows(x)) for x, info in _limited(system) if _is_small(x)]
+    valid = functools.reduce(jnp.logical_and, conditions)
     start, harmless = _harmless(system, y, valid, _is_small)
     # The initial state formally depends on the parameters. The first evaluation of the rates then uses the same
     # derivative program as the loop, so it is compiled once.
@@ -552,19 +528,20 @@ def one_step(
     args = RateArguments(system, signals, jnp.zeros_like(t0), disturbance)
     constrained = has_configuration_constraints(system, t0, unpacked(system, y).q)
     rates = _rates(settings.stabilize if constrained else 0.0)
-    inputs = inputs_at(system, signals, t0, unpacked(system, y))
-    solver = with_scan_kind(_solver_for(settings, rates_are_native(system, t0, y, inputs)), "lax")
+    solver = with_scan_kind(_solver_for(settings, system, t0, y, signals), "lax")
     term = diffrax.ODETerm(rates)
     state = solver.init(term, t0, t1, y, args)
     y1, _, _, _, result = solver.step(term, t0, t1, y, args, state, False)
     return jnp.where(result == diffrax.RESULTS.successful, y1, jnp.nan)
 
 
-def _solver_for(settings: Settings, rates_are_native: bool) -> Any:
+def _solver_for(settings: Settings, system: Any, t: Array, y: Array, signals: Any) -> Any:
     solver: Any = settings.solver
-    if is_explicit(solver) and rates_are_native:
-        return UnrolledERK(solver)
-    return StepwiseInputs(with_tolerances(solver, settings.rtol, settings.atol))
+    if is_explicit(solver):
+        tree = tree_of(system)
+        if rates_are_native(system, t, y, inputs_at(tree, signals, t, unpacked(tree, y))):
+            return UnrolledERK(solver)
+    return with_stepwise_inputs(with_tolerances(solver, settings.rtol, settings.atol))
 
 
 def ends_between(system: System, t0: Array, y0: Array, t1: Array, y1: Array, signals: Any) -> Array:
@@ -637,7 +614,7 @@ def _trajectory(problem: Problem, steps: Steps, end: End, follows_from: list[Arr
     motion = jnp.where(late[:, None], end.y[None], steps.motion)
     if steps.jumps is not None:
         record = steps.jumps
-        happened = jnp.arange(record.t.shape[0]) < record.count
+        happened = jnp.arange(record.t.shape[0]) < steps.n_jumps
 
         def away_from_jumps(times: Array, states: Array) -> Array:
             apart = jnp.abs(times[:, None] - constant(record.t)[None])
@@ -648,7 +625,7 @@ def _trajectory(problem: Problem, steps: Steps, end: End, follows_from: list[Arr
         end = end._replace(y=jnp.where(end.by_event, end.y, away_from_jumps(end.t[None], end.y[None])[0]))
         rough = jnp.min(jnp.where(happened & (record.smooth == 0), constant(record.t), jnp.inf), initial=jnp.inf)
         motion = nan_derivative_where(taus >= rough, motion, follows_from)
-        motion = nan_beyond_second_derivative(record.count > 0, motion, follows_from)
+        motion = nan_beyond_second_derivative(steps.n_jumps > 0, motion, follows_from)
         end = end._replace(smooth=end.smooth & (rough == jnp.inf))
     layout = problem.events.layout
     # States that were not reached are replaced by the first: masking the outputs would leave NaN in derivatives.
@@ -679,7 +656,7 @@ def _trajectory(problem: Problem, steps: Steps, end: End, follows_from: list[Arr
     motion, u_dep, inputs, outputs = nan_where(~reached, (motion, u_dep, inputs, outputs), follows_from)
     t_end, y_end = nan_derivative_where(~end.smooth, (end.t, end.y), follows_from)
     if problem.events.names:
-        located = end.by_event if steps.jumps is None else end.by_event | (steps.jumps.count > 0)
+        located = end.by_event if steps.jumps is None else end.by_event | (steps.n_jumps > 0)
         t_end, y_end = nan_beyond_second_derivative(located, (t_end, y_end), follows_from)
     states, last = unpacked(system, motion), unpacked(system, nan_where(~problem.valid, y_end, follows_from))
     return Trajectory(
@@ -701,13 +678,13 @@ def _trajectory(problem: Problem, steps: Steps, end: End, follows_from: list[Arr
         units=tuple(units_of(system).items()),
         end=last,
         discontinuities=discontinuities,
-        jumps=None if steps.jumps is None else _jump_table(problem, steps.jumps, follows_from),
+        jumps=None if steps.jumps is None else _jump_table(problem, steps.jumps, steps.n_jumps, follows_from),
     )
 
 
-def _jump_table(problem: Problem, record: JumpRecord, follows_from: list[Array]) -> JumpTable:
+def _jump_table(problem: Problem, record: Jump, count: Array, follows_from: list[Array]) -> JumpTable:
     system, args = problem.system, problem.args
-    unused = jnp.arange(record.t.shape[0]) >= record.count
+    unused = jnp.arange(record.t.shape[0]) >= count
     before, after = (jnp.where(unused[:, None], problem.start, y) for y in (record.before, record.after))
     times, which = args.clock(record.t), stages_of(problem.events)
 
@@ -718,7 +695,7 @@ def _jump_table(problem: Problem, record: JumpRecord, follows_from: list[Array])
     lost = energy(before) - energy(after)
     impulses = record.impulses
     if not problem.events.layout.names:
-        impulses = jax.vmap(lambda t, y, event: impulses_at(system, t, y, event, which))(times, before, record.events)
+        impulses = jax.vmap(lambda t, y, event: impulses_at(system, t, y, event, which))(times, before, record.event)
     sides = [
         jax.vmap(lambda tau, y: args.inputs(system, tau, unpacked(system, y), all_of_them=True))(record.t, y)
         for y in (before, after)
@@ -726,11 +703,11 @@ def _jump_table(problem: Problem, record: JumpRecord, follows_from: list[Array])
     values = times, before, after, lost, impulses, tuple(sides)
     rough = jnp.cumsum(jnp.where(unused, 0.0, 1.0 - constant(record.smooth))) > 0
     values = nan_derivative_where(rough, values, follows_from)
-    values = nan_beyond_second_derivative(record.count > 0, values, follows_from)
+    values = nan_beyond_second_derivative(count > 0, values, follows_from)
     t, before, after, lost, impulses, inputs = nan_where(unused, values, follows_from)
-    events = jnp.where(unused, -1, record.events.astype(jnp.int32))
+    events = jnp.where(unused, -1, record.event.astype(jnp.int32))
     states = unpacked(system, before), unpacked(system, after)
-    return JumpTable(t, events, *states, lost, impulses, inputs, record.count, problem.events.names)
+    return JumpTable(t, events, *states, lost, impulses, inputs, count, problem.events.names)
 
 
 @ScalarFunction

@@ -31,57 +31,21 @@ _KINDS: dict[type, str] = {
 }
 
 
-class JumpRecord(NamedTuple):
-    """The jumps of a simulation, at most m; entries from `count` on are unused.
+class Jump(NamedTuple):
+    """A jump of the state; or all jumps of a simulation, with a leading axis of at most `max_jumps`.
 
-    Fields: their times `t` (m,) since the start [s], their `events` (m,) as floats, the packed states `before` and
-    `after` them (m, n), whether all of this is a `smooth` (m,) function of the arguments, the `impulses` (m, r) of
-    contacts, and their number `count`.
+    Fields: the time `t` since the start [s], the `event` as a float, the packed states `before` and `after`, whether
+    all of this is a `smooth` function of the arguments, the `impulses` (r,) of contacts, and the `status`: 0 if the
+    jump is possible. The table of all jumps has no status.
     """
 
     t: Array
-    events: Array
+    event: Array
     before: Array
     after: Array
     smooth: Array
     impulses: Array
-    count: Array
-
-    @classmethod
-    def empty(cls, m: int, y: Array, r: int) -> JumpRecord:
-        times, states = jnp.zeros(m, y.dtype), jnp.zeros((m, *y.shape), y.dtype)
-        return cls(times, times, states, states, times, jnp.zeros((m, r), y.dtype), jnp.zeros((), int))
-
-    @property
-    def buffers(self) -> list[Array]:
-        return [self.t, self.events, self.before, self.after, self.smooth, self.impulses]
-
-    def with_(self, *values: Array) -> JumpRecord:
-        """The record with one more jump: the values of its fields."""
-        # JAX drops a row that does not fit.
-        rows = [x.at[self.count].set(value) for x, value in zip(self.buffers, values, strict=True)]
-        return JumpRecord._make([*rows, jnp.minimum(self.count + 1, self.t.shape[0])])
-
-
-class Jump(NamedTuple):
-    """A jump of the state: its time `t` [s], the packed states `before` and `after` it, whether it is `smooth`, the
-    `impulses` (r,) of contacts, and its `status`: 0 if it is possible."""
-
-    t: Array
-    before: Array
-    after: Array
-    smooth: Array
-    impulses: Array
-    status: Array
-
-
-class Jumps(NamedTuple):
-    """How the loop treats jumps: `jump` (t, y, event, reach) -> `Jump`, from a time near the event; the largest number
-    of jumps `most`; and the number of impulses of contacts."""
-
-    jump: Callable[[Array, Array, Array, Array], Jump]
-    most: int
-    n_impulses: int = 0
+    status: Array | None
 
 
 class Steps(NamedTuple):
@@ -94,7 +58,7 @@ class Steps(NamedTuple):
       the solver does not evaluate them.
     - `state`: the state of the controller.
     - `taken`, `accepted`: numbers of steps.
-    - `jumps`: the jumps, or None if no event changes the state.
+    - `jumps`, `n_jumps`: the jumps and their number, or None if no event changes the state. Later rows are unused.
     - `errors`: the errors of the tangent in all steps if it moves with the motion, or None.
     """
 
@@ -106,7 +70,8 @@ class Steps(NamedTuple):
     state: ControllerState
     taken: Array
     accepted: Array
-    jumps: JumpRecord | None = None
+    jumps: Jump | None = None
+    n_jumps: Any = None
     errors: Array | None = None
 
 
@@ -122,7 +87,7 @@ class Carry(NamedTuple):
     - `running`: whether the steps continue.
     - `steps` (2,): numbers of steps, taken and accepted.
     - `motion` (n_t, n), `count`: the saved states, and their number.
-    - `jumps`: the jumps so far, or None.
+    - `jumps`, `n_jumps`: the jumps so far and their number, or None.
     - `probe`: the tangent whose error is controlled, or None.
     """
 
@@ -134,25 +99,12 @@ class Carry(NamedTuple):
     controller_state: Any
     made_jump: Any
     running: Array
-    steps: Array
-    motion: Array
-    count: Array
-    jumps: JumpRecord | None
+    steps: Any
+    motion: Any
+    count: Any
+    jumps: Any
+    n_jumps: Any
     probe: Probe | None
-
-
-class AtJump(NamedTuple):
-    """What a jump changes. Fields as in `Carry`; `t`: the time of the jump, infinity if none is due."""
-
-    is_due: Array
-    t: Array
-    t1: Array
-    y: Array
-    rates: Array | None
-    solver_state: Any
-    controller_state: Any
-    running: Array
-    jumps: JumpRecord
 
 
 def is_supported(solver: Any, controller: StepSizeController, adjoint: Any, progress: bool) -> bool:
@@ -172,16 +124,17 @@ def fast_loop(
     adjoint: Any,
     max_steps: int | None,
     may_begin: Array,
-    jumps: Jumps | None,
+    jumps: tuple[Callable[[Array, Array, Array, Array], Jump], int] | None,
     probing: Probing | None = None,
     errors: Array | None = None,
 ) -> Steps:
     """The steps of `diffeqsolve`, to the last digit. No steps are taken unless the simulation `may_begin`.
 
+    `jumps`: a function (t, y, event, reach) -> `Jump`, from a time near the event, and the largest number of jumps.
     `probing`: move a tangent with the motion, and let steps be so short that its error meets the tolerance too.
     `errors`: take the errors of this tangent from an earlier loop.
     """
-    kind = _KINDS[type(adjoint)]
+    kind: Any = _KINDS[type(adjoint)]
     checkpoints = getattr(adjoint, "checkpoints", None)
     kind = "lax" if max_steps is None and checkpoints is None else kind
     solver = solver if kind == "checkpointed" else with_scan_kind(solver, kind)
@@ -191,11 +144,16 @@ def fast_loop(
     begin, probe = (y0, None) if probing is None else probing.start(y0, max_steps)
     needs_rates = bool(controller.events.names) and rates_at_ends(solver)
     restart = controller.discontinuities is not None and controller.discontinuities.restart
+    table = None
+    if jumps is not None:
+        layout, times = controller.events.layout, jnp.zeros(jumps[1], y0.dtype)
+        states, n_impulses = jnp.zeros((jumps[1], *y0.shape), y0.dtype), len(layout.names) * (1 + layout.d)
+        table = Jump(times, times, states, states, times, jnp.zeros((jumps[1], n_impulses), y0.dtype), None)
     carry = Carry(
         start, end, begin, jnp.zeros_like(y0) if needs_rates else None, solver.init(term, start, end, begin, args),
         state, jnp.array(False) if restart else None, may_begin, jnp.zeros(2, int),
         jnp.zeros((len(ts), *y0.shape), y0.dtype), jnp.zeros((), int),
-        None if jumps is None else JumpRecord.empty(jumps.most, y0, jumps.n_impulses), probe,
+        table, None if jumps is None else jnp.zeros((), int), probe,
     )  # fmt: skip
     n_events = len(controller.events.names)
 
@@ -224,65 +182,71 @@ def fast_loop(
         interpolation = solver.interpolation_cls(t0=c.t0, t1=c.t1, **dense)
         running, y_next = ended == diffrax.RESULTS.successful, chosen(y1, c.y)
         rates_next = chosen(k[-1], k[0]) / (c.t1 - c.t0) if needs_rates else None
-        solver_state, record, cut = chosen(solver_state, c.solver_state), c.jumps, None
+        solver_state, cut = chosen(solver_state, c.solver_state), None
         if probing is not None and probe is not None and c.probe is not None:
             probe = probe._replace(size=chosen(probe.size, c.probe.size))
-        if jumps is not None and c.jumps is not None:
+        following = Carry(
+            t0, t1, y_next, rates_next, solver_state, state, None, running, None, None, None, c.jumps, c.n_jumps, None
+        )  # fmt: skip
+        if jumps is not None:
             # The loop runs once if a jump is due. In a batch it runs if a jump is due in any member: a condition would
             # be evaluated in every step.
-            base = AtJump(
-                ControllerState.unpacked(state[0], n_events).jump >= 0, jnp.full_like(t1, jnp.inf), t1, y_next,
-                rates_next, solver_state, state, running, c.jumps,
-            )  # fmt: skip
+            jump_at, most = jumps
+            is_due = ControllerState.unpacked(state[0], n_events).jump >= 0
 
-            def jumped_at(a: AtJump, jumps: Jumps = jumps) -> AtJump:
+            def jumped_at(due_and_carry: tuple[Array, Carry]) -> tuple[Array, Carry]:
+                due, a = due_and_carry
                 now, start = ControllerState.unpacked(a.controller_state[0], n_events), jnp.where(keep, c.t1, c.t0)
-                jump, fits = jumps.jump(start, motion_of(a.y), now.jump, now.reach), a.jumps.count < jumps.most
+                jump, fits = jump_at(start, motion_of(a.y), now.jump, now.reach), a.n_jumps < most
                 # A state that is not finite must not reach the solver.
-                is_possible = jump.status == float(Status.COMPLETED)
-                jump = jump._replace(after=jnp.where(fits & is_possible, jump.after, jump.before))
-                end, changed = controller.after_jump(a.controller_state, jump.t, jump.after, args)
+                status_of_jump: Any = jump.status
+                is_possible = status_of_jump == float(Status.COMPLETED)
+                jump = jump._replace(after=jnp.where(fits & is_possible, jump.after, jump.before), status=None)
+                end, (changed, inner) = controller.after_jump(a.controller_state, jump.t, jump.after, args)
                 y = jump.after if probing is None or probe is None else probing.again(jump.after, probe)
-                restarted = solver.init(term, jump.t, end, y, args)
-                after = ControllerState.unpacked(changed[0], n_events)
-                status = jnp.where(is_possible, after.status, jump.status)
+                status = jnp.where(is_possible, ControllerState.unpacked(changed, n_events).status, status_of_jump)
                 status = jnp.where(fits, status, float(Status.MAX_JUMPS))
-                changed = (changed[0].at[0].set(status), changed[1])
-                goes_on = status == float(Status.COMPLETED)
-                record = a.jumps.with_(jump.t, now.jump, jump.before, jump.after, jump.smooth, jump.impulses)
-                rates_after = None if a.rates is None else jnp.zeros_like(a.rates)
-                return AtJump(
-                    jnp.zeros_like(a.is_due), jump.t, end, y, rates_after, restarted, changed, goes_on, record
-                )
+                # JAX drops a row that does not fit. In reverse mode, the arrays are objects of equinox.
+                rows = [x.at[a.n_jumps].set(row) for x, row in zip(a.jumps[:-1], jump[:-1], strict=True)]
+                return jnp.zeros_like(due), a._replace(
+                    t0=jump.t, t1=end, y=y, rates=None if a.rates is None else jnp.zeros_like(a.rates),
+                    solver_state=solver.init(term, jump.t, end, y, args),
+                    controller_state=(changed.at[0].set(status), inner), running=status == float(Status.COMPLETED),
+                    jumps=Jump(*rows, None), n_jumps=jnp.minimum(a.n_jumps + 1, most),
+                )  # fmt: skip
 
-            after = loop(lambda a: a.is_due, jumped_at, base, 1, 1, lambda a: a.jumps.buffers)
-            t0, cut = jnp.where(base.is_due, after.t, t0), constant(after.t)
-            cut = cut - 16 * rounding(jnp.where(base.is_due, cut, 0.0), controller.duration)
-            t1, y_next, rates_next, solver_state, state = (
-                after.t1, after.y, after.rates, after.solver_state, after.controller_state
-            )  # fmt: skip
-            running, record = after.running, after.jumps
+            at_infinity = following._replace(t0=jnp.full_like(t1, jnp.inf))
+            # Not the status, which is None.
+            _, following = loop(lambda a: a[0], jumped_at, (is_due, at_infinity), 1, 1, lambda a: a[1].jumps[:-1])
+            cut = constant(following.t0)
+            cut = cut - 16 * rounding(jnp.where(is_due, cut, 0.0), controller.duration)
+            following = following._replace(t0=jnp.where(is_due, following.t0, t0))
 
-        def is_due(kept: tuple[Array, Array]) -> Array:
-            due = keep & (kept[1] < len(ts)) & (ts[kept[1]] <= c.t1)
+        def is_passed(kept: tuple[Array, Array]) -> Array:
+            passed = keep & (kept[1] < len(ts)) & (ts[kept[1]] <= c.t1)
             # A sample at the time of a jump gets the state after it.
-            return due if cut is None else due & (ts[kept[1]] < cut)
+            return passed if cut is None else passed & (ts[kept[1]] < cut)
 
         def sampled(kept: tuple[Array, Array]) -> tuple[Array, Array]:
             return kept[0].at[kept[1]].set(motion_of(interpolation.evaluate(ts[kept[1]]))), kept[1] + 1
 
-        motion, count = loop(is_due, sampled, (c.motion, c.count), len(ts), len(ts), lambda kept: kept[0])
+        motion, count = loop(is_passed, sampled, (c.motion, c.count), len(ts), len(ts), lambda kept: kept[0])
         steps = c.steps + jnp.stack([jnp.ones_like(count), keep.astype(count.dtype)])
-        return Carry(
-            t0, t1, y_next, rates_next, solver_state, state, chosen(jumped, c.made_jump) if restart else None,
-            running if max_steps is None else running & (steps[0] < max_steps), steps, motion, count, record, probe,
+        return following._replace(
+            made_jump=chosen(jumped, c.made_jump) if restart else None,
+            running=following.running if max_steps is None else following.running & (steps[0] < max_steps),
+            steps=steps, motion=motion, count=count, probe=probe,
         )  # fmt: skip
 
-    loop = functools.partial(_while_loop, kind)
+    def loop(condition: Any, body: Any, carry: Any, most: int | None, checkpoints: int | None, buffers: Any) -> Any:
+        # The loop of diffrax counts its steps if the derivative requires it.
+        more: dict[str, Any] = {} if kind == "lax" else {"max_steps": most}
+        more |= {"checkpoints": checkpoints} if kind == "checkpointed" else {}
+        return eqxi.while_loop(condition, body, carry, buffers=buffers, kind=kind, **more)
 
     def buffers(c: Carry) -> Any:
         # Not `c.jumps is None`: equinox calls this with wrapped leaves.
-        more = [*(() if jumps is None else c.jumps.buffers), *(() if probing is None else [c.probe.errors])]  # pyright: ignore[reportOptionalMemberAccess]
+        more = [*(() if jumps is None else c.jumps[:-1]), *(() if probing is None else [c.probe.errors])]  # pyright: ignore
         return [c.motion, *more]
 
     last = loop(lambda c: c.running, step, carry, max_steps, checkpoints, buffers)
@@ -291,7 +255,7 @@ def fast_loop(
     errors = None if last.probe is None else last.probe.errors
     return Steps(
         last.motion, reached, last.t0, motion_of(last.y), last.rates, state, last.steps[0], last.steps[1], last.jumps,
-        errors,
+        last.n_jumps, errors,
     )  # fmt: skip
 
 
@@ -340,12 +304,3 @@ def diffrax_loop(
     status = jnp.where(reached[-1], state[0], early)
     state = ControllerState.unpacked(state, len(controller.events.names))._replace(status=status)
     return Steps(solution.ys, reached, ts[i], solution.ys[i], None, state, *stats)
-
-
-def _while_loop(
-    kind: Any, condition: Any, body: Any, carry: Any, max_steps: int | None, checkpoints: int | None, buffers: Any
-) -> Any:
-    """The loop of diffrax. It counts its steps if the derivative requires it."""
-    more: dict[str, Any] = {} if kind == "lax" else {"max_steps": max_steps}
-    more |= {"checkpoints": checkpoints} if kind == "checkpointed" else {}
-    return eqxi.while_loop(condition, body, carry, buffers=buffers, kind=kind, **more)

@@ -23,7 +23,7 @@ def is_explicit(solver: Any) -> bool:
 
 def rates_at_ends(solver: Any) -> bool:
     """Whether the first and the last stage k_i = h f_i of a step are evaluated at its start and its end."""
-    method = solver.method if isinstance(solver, UnrolledERK) else getattr(solver, "solver", solver)
+    method = solver.method if isinstance(solver, UnrolledERK) else solver
     tableau: Any = method.tableau if is_explicit(method) else None
     return tableau is not None and tableau.fsal
 
@@ -34,52 +34,28 @@ def last_stage_is_spare(solver: Any) -> bool:
     return tableau is not None and tableau.fsal and not np.any((tableau.c == 1) & (tableau.b_sol[1:] != 0))
 
 
-class StepwiseInputs(diffrax.AbstractWrappedSolver[Any]):
-    """A solver whose stages use the piece of each input that lies inside the step (see `RateArguments.in_step`).
+@functools.cache
+def _stepwise(kind: Any) -> Any:
+    class StepwiseInputs(kind):
+        def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+            return super().init(terms, t0, t1, y0, args.in_step(t0, t1))
+
+        def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+            return super().step(terms, t0, t1, y0, args.in_step(t0, t1), solver_state, made_jump)
+
+    return StepwiseInputs
+
+
+def with_stepwise_inputs(solver: diffrax.AbstractSolver) -> Any:
+    """The solver, whose stages use the piece of each input that lies inside the step (see `RateArguments.in_step`).
 
     A solver of diffrax passes only the time to the right-hand side. At the end of a step, the time does not determine
     the side of a discontinuity.
     """
-
-    solver: diffrax.AbstractSolver
-
-    @property
-    def term_structure(self) -> Any:  # type: ignore[override]
-        return self.solver.term_structure
-
-    @property
-    def term_compatible_contr_kwargs(self) -> Any:  # type: ignore[override]
-        return self.solver.term_compatible_contr_kwargs
-
-    @property
-    def interpolation_cls(self) -> Any:  # type: ignore[override]
-        return self.solver.interpolation_cls
-
-    @property
-    def root_finder(self) -> Any:
-        return self.solver.root_finder  # type: ignore[attr-defined]
-
-    @property
-    def scan_kind(self) -> Any:
-        return self.solver.scan_kind  # type: ignore[attr-defined]
-
-    def order(self, terms: Any) -> int | None:
-        return self.solver.order(terms)
-
-    def strong_order(self, terms: Any) -> Any:
-        return self.solver.strong_order(terms)
-
-    def error_order(self, terms: Any) -> Any:
-        return self.solver.error_order(terms)
-
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return self.solver.func(terms, t0, y0, args)
-
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
-        return self.solver.init(terms, t0, t1, y0, args.in_step(t0, t1))
-
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
-        return self.solver.step(terms, t0, t1, y0, args.in_step(t0, t1), solver_state, made_jump)
+    stepwise = object.__new__(_stepwise(type(solver)))
+    for field in dataclasses.fields(solver):
+        object.__setattr__(stepwise, field.name, getattr(solver, field.name))
+    return stepwise
 
 
 class UnrolledERK(diffrax.AbstractAdaptiveSolver[Any]):
