@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -14,8 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._integrate.trajectory import Trajectory, as_trajectory, reached_times
-from .._scalarjit.cache_key import version_of
-from .._scalarjit.captured_values import CapturedValues
+from .._scalarjit.cache_key import jit
 from .._scalarjit.components import stack
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point, Vector
@@ -203,34 +200,25 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
     reached = reached_times("animate", system, trajectory)
     # A plan with phases has the state before and after a link at the same time, between which no frame can be drawn.
     reached = reached & np.append(True, np.diff(np.asarray(trajectory.t)) > 0)
-    numbers, rest = eqx.partition(system, eqx.is_array)
-    drawing = None if figure is None else _Drawing(weakref.ref(figure), CapturedValues(figure).version)
     t, q, u, u_dep = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u, trajectory.u_dep))
     u = np.concatenate([u, u_dep], axis=1)
-    motion = jax.tree.map(np.asarray, _record_along(numbers, rest, drawing, version_of(system), t, q, u))
+    motion = jax.tree.map(np.asarray, _record_along(system, figure, t, q, u))
     if not motion.bodies:
         raise ValueError(f"animate({name}): no body has a position. Define positions of points, see jaxkane.Point.at.")
     return eqx.tree_at(lambda r: (r.mass, r.inertia), motion, (motion.mass[0], motion.inertia[0]))
 
 
-class _Drawing(eqx.Module):
-    """A figure by a weak reference, so that a cached program does not keep it alive; and a digest of all that its code
-    reads."""
-
-    figure: Any = eqx.field(static=True)
-    version: bytes = eqx.field(static=True)
-
-
-@functools.partial(jax.jit, static_argnums=(1, 2, 3))
-def _record_along(numbers, rest, drawing, version, t, q, u):
+@jit
+def _record_along(system, figure, t, q, u):
     # This program runs once or twice, so it should compile quickly: use one function for one instant.
-    system = eqx.combine(numbers, rest)
-    return jax.lax.map(lambda now: _record_at(system, drawing, *now), (t, q, u))
+    @ScalarFunction
+    def at(system, t, q, u):
+        return _record_at(system, figure, t, q, u)
+
+    return jax.lax.map(lambda now: at(system, *now), (t, q, u))
 
 
-@ScalarFunction
-def _record_at(system: System, drawing: _Drawing | None, t, q, u) -> Any:
-    figure = None if drawing is None else drawing.figure()
+def _record_at(system: System, figure: Figure | None, t, q, u) -> Any:
     motion = system.motion(t, q, u)
     N, dtype = motion.N, q.dtype
     placed = [i for i, body in enumerate(motion.bodies) if body.center.has_position]
@@ -348,12 +336,8 @@ def _upper_body(s: Sketch, motion: Motion, U: Frame, hips: Vector, shoulders: Ve
     s.line("grey", shoulders, shoulders + U.vector(0.04, 0.0, -0.1), width=5.0)
 
 
-FIGURES: dict[type, Figure] = {WhippleBicycle: bicycle}
-
-
 def figure_of(system: object) -> Figure | None:
-    """The figure of a system's class, or of a base class."""
-    return next((FIGURES[c] for c in type(system).__mro__ if c in FIGURES), None)
+    return bicycle if isinstance(system, WhippleBicycle) else None
 
 
 def bodies_and_points(motion: Record, build: Builder) -> None:
