@@ -151,10 +151,6 @@ class Animation:
 
     def html(self) -> str:
         """The page: one canvas and its script. It does not load anything."""
-        return self._page
-
-    @functools.cached_property
-    def _page(self) -> str:
         page = resources.files("jaxkane._animate").joinpath("viewer.html").read_text(encoding="utf-8")
         scene = json.dumps(_compact(self.scene, self.speed), separators=(",", ":")).replace("<", "\\u003c")
         for mark, text in (("theme", self.theme), ("title", html.escape(self.scene.title)), ("scene", scene)):

@@ -33,14 +33,6 @@ class Discontinuities(NamedTuple):
     jumps: bool
     restart: bool
 
-    @classmethod
-    def within(cls, found: Discontinuities | None, duration: Array) -> Discontinuities | None:
-        """The times at which steps must end, without the end of the simulation: no step begins there."""
-        if found is None:
-            return None
-        times = jnp.where(found.times < duration - rounding(duration, duration), found.times, jnp.inf)
-        return found._replace(times=times)
-
     def after(self, t: Array, duration: Array) -> Array:
         """The next of the times after `t`, infinity if there is none. Times within rounding of `t` are not after it."""
         i = count_until(*jax.lax.stop_gradient((self.times, t + rounding(t, duration))))

@@ -366,7 +366,6 @@ def _as_signal(label: str, value: Any, ts: Array) -> Any:
 
 
 def samples_of(signals: Any) -> list[Samples]:
-    """The signals that are samples."""
     return [x for x in jax.tree.leaves(signals, is_leaf=is_samples) if is_samples(x)]
 
 

@@ -185,6 +185,10 @@ def _solved(
     spare = fixed and last_stage_is_spare(settings.solver)
     only_samples = isinstance(signals, dict) and len(samples_of(signals)) == len(signals)
     has_pieces = found is not None and not (only_samples and discontinuities is None and not readers)
+    if found is not None:
+        # No step begins at the end of the simulation.
+        ends = jnp.where(found.times < taus[-1] - rounding(taus[-1], taus[-1]), found.times, jnp.inf)
+        found = found._replace(times=ends)
     problem = Problem(
         system=system,
         start=start,
@@ -199,7 +203,7 @@ def _solved(
             share=SHARE if fixed else 0.0,
             past_end=spare,
         ),
-        discontinuities=Discontinuities.within(found, taus[-1]),
+        discontinuities=found,
         events=events_of(system, origin, state),
         settings=settings,
     )
@@ -212,7 +216,8 @@ def _solved(
     if touches is not None:
         problem, determined = problem.with_found_contacts(touches)
     steps = problem.steps()
-    end = problem.end(steps)
+    nothing = steps.accepted < 1
+    end: End = _end(problem.valid, taus[-1], problem.start, steps.t, steps.y, steps.state.status, nothing)
     if determined is not None:
         end = end._replace(status=jnp.where(determined, end.status, float(Status.UNDETERMINED_CONTACT)))
     end = problem.located(end, steps.rates, steps.state.reach) if problem.events.names else end
@@ -325,11 +330,6 @@ class Problem(NamedTuple):
             events=events,
             inner=settings.controller,
         )
-
-    def end(self, steps: Steps) -> End:
-        """The end of the last step. With an event, this is near the event."""
-        nothing = steps.accepted < 1
-        return End(*_end(self.valid, self.taus[-1], self.start, steps.t, steps.y, steps.state.status, nothing))
 
     def located(self, end: End, y_dot: Any, reach: Array) -> End:
         """The same, at the time of the event if an event ended the simulation."""
@@ -454,15 +454,16 @@ class Problem(NamedTuple):
 @ScalarFunction.compile_cheaply
 def _end(
     valid: Array, duration: Array, start: Array, t: Array, y: Array, status: Array, nothing_accepted: Array
-) -> tuple[Array, ...]:
-    # One `ScalarFunction`: XLA would compute it again in every kernel that uses one of its results.
+) -> End:
+    # The end of the last step; with an event, this is near the event. One `ScalarFunction`: XLA would compute it again
+    # in every kernel that uses one of its results.
     unfinished = (status == Status.COMPLETED) & (t < duration)
     status = jnp.where(unfinished, float(Status.MAX_STEPS), status)
     status = jnp.where((status == Status.STEP_TOO_SMALL) & nothing_accepted, float(Status.NO_SOLUTION), status)
     status = jnp.where(valid, status, float(Status.INVALID))
     completed, by_event = status == Status.COMPLETED, status >= Status.EVENT
     t = jnp.where(completed, duration, jnp.where(valid, t, 0.0))
-    return status, t, jnp.where(valid, y, start), completed, by_event
+    return End(status, t, jnp.where(valid, y, start), completed, by_event)
 
 
 def _is_small(x: Any) -> bool:

@@ -108,7 +108,6 @@ class Carry(NamedTuple):
 
 
 def is_supported(solver: Any, controller: StepSizeController, adjoint: Any, progress: bool) -> bool:
-    """Whether the fast loop takes these steps."""
     return type(adjoint) in _KINDS and solver.term_structure is diffrax.AbstractTerm and not (
         progress or controller.inner
     )  # fmt: skip

@@ -51,7 +51,6 @@ class Settings(eqx.Module):
 
     @property
     def is_forward(self) -> bool:
-        """Whether only forward mode is supported."""
         return isinstance(self.adjoint, diffrax.ForwardMode)
 
 
@@ -186,7 +185,6 @@ def _changed(solver: Any, changes: Callable[[Any], dict[str, Any]]) -> Any:
 
 
 def _check_kind(label: str, value: Any, kind: Any, expected: str, may_be_omitted: bool = True) -> None:
-    """**Raises:** `TypeError` if a value is not of this kind."""
     if isinstance(value, type) and issubclass(value, kind):
         raise TypeError(f"`{label}` must be an instance, not a class: {label}=diffrax.{value.__name__}().")
     if not isinstance(value, kind) and not (value is None and may_be_omitted):

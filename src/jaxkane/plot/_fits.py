@@ -44,7 +44,7 @@ def fits(
     """
     names = list(fit.trial_names)
     if trials is None:
-        chosen = _spread(len(names))
+        chosen = np.unique(np.linspace(0, len(names) - 1, min(len(names), _TRIALS)).astype(int)).tolist()
     else:
         chosen = [_number(names, trial) for trial in ([trials] if isinstance(trials, (str, int)) else trials)]
     all_channels = list(fit.problem.channels)
@@ -94,10 +94,6 @@ def _number(names: list[str], trial: str | int) -> int:
     if not isinstance(trial, str) and -len(names) <= trial < len(names):
         return range(len(names))[trial]
     raise ValueError(f"fits: the fit has no trial {trial!r}; {hint(str(trial), names)}")
-
-
-def _spread(n: int) -> list[int]:
-    return np.unique(np.linspace(0, n - 1, min(n, _TRIALS)).astype(int)).tolist()
 
 
 def residuals(

@@ -83,17 +83,13 @@ def _one_point(model: Any, vectors: Any, states: Any, at: float | None, modes: A
         states = model.states if states is None else states
         modes = getattr(model, "modes", None) if modes is None else modes
         model, vectors = model.eigenvalues[i], model.vectors[i]
-    lam, X = np.asarray(model, dtype=complex), np.asarray(vectors, dtype=complex)
-    if X.ndim != 2 or lam.shape != X.shape[1:]:
+    lam, X = np.asarray(model, dtype=complex), np.atleast_1d(np.asarray(vectors, complex))
+    states = [f"state {i + 1}" for i in range(len(X))] if states is None else list(as_names(states, "states"))
+    names = [""] * lam.size if modes is None else list(as_names(modes, "modes"))
+    if X.ndim != 2 or lam.shape != X.shape[1:] or (len(states), len(names)) != X.shape:
         raise ValueError(
-            f"mode_shapes: vectors must be (n_states, n) for eigenvalues (n,), got {X.shape} and {lam.shape}."
-        )
-    states = [f"state {i + 1}" for i in range(X.shape[0])] if states is None else list(as_names(states, "states"))
-    names = [""] * len(lam) if modes is None else list(as_names(modes, "modes"))
-    if len(states) != X.shape[0] or len(names) != len(lam):
-        raise ValueError(
-            f"mode_shapes: got {len(states)} states and {len(names)} names of modes for vectors of shape {X.shape}. "
-            "Pass one state for each row and one name for each column."
+            f"mode_shapes: `vectors` must be (n_states, n) for `eigenvalues` (n,), n_states `states` and n `modes`; "
+            f"got {X.shape}, {lam.shape}, {len(states)} states and {len(names)} modes."
         )
     return lam, X, states, names, where
 
@@ -255,17 +251,16 @@ def _table(values: Any, eigenvalues: Any, modes: Sequence[str] | None) -> tuple[
         modes = getattr(values, "modes", None) if modes is None else modes
         values, eigenvalues = values.values, values.eigenvalues
     x, lam = np.asarray(values, dtype=float), np.asarray(eigenvalues, dtype=complex)
-    if lam.ndim != 2 or x.shape != lam.shape[:1] or len(x) < 2:
+    names = [""] * (lam.shape or (0,))[-1] if modes is None else list(as_names(modes, "modes"))
+    if lam.ndim != 2 or x.shape != lam.shape[:1] or len(x) < 2 or len(names) != lam.shape[1]:
         raise ValueError(
-            f"Eigenvalues must have the shape (m, n) for m >= 2 values of the parameter; got {lam.shape} for {x.shape}."
+            "Eigenvalues must have the shape (m, n) for m >= 2 values of the parameter and n `modes`; got "
+            f"{lam.shape} for {x.shape} and {len(names)} modes."
         )
     if not np.any(np.isfinite(lam)):
         raise ValueError(
             "All eigenvalues are NaN, because no steady motion exists at these values. Choose other values."
         )
-    names = [""] * lam.shape[1] if modes is None else list(as_names(modes, "modes"))
-    if len(names) != lam.shape[1]:
-        raise ValueError(f"There are {lam.shape[1]} modes but {len(names)} names: {', '.join(names)}.")
     return x, lam, names
 
 

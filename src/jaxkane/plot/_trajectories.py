@@ -102,7 +102,10 @@ def trajectories(
         ax.set_ylabel(_axis_label(labelled))
         finish(ax)
     if np.ndim(trajectory.status) == 0 and int(trajectory.status) != Status.COMPLETED:
-        _mark_t_end(panel_axes, trajectory)
+        for ax in panel_axes:
+            ax.axvline(float(trajectory.t_end), color=SOFT, linestyle=":", linewidth=1.0)
+        ended = f"{label_of(trajectory.reason)} at {float(trajectory.t_end):.3g} s"
+        panel_axes[0].set_title(ended, loc="right", fontsize="small")
     panel_axes[-1].set_xlabel("time [s]")
     return panel_axes
 
@@ -157,14 +160,6 @@ def _mark_ends(ax: Axes, trajectory: Trajectory, t: np.ndarray, y: np.ndarray, c
         reached = np.flatnonzero(np.isfinite(y[k]))
         if reached.size:
             ax.plot(t[k, reached[-1]], y[k, reached[-1]], "x", color=color, markersize=6, markeredgewidth=1.5)
-
-
-def _mark_t_end(axes: np.ndarray, trajectory: Trajectory) -> None:
-    for ax in axes:
-        ax.axvline(float(trajectory.t_end), color=SOFT, linestyle=":", linewidth=1.0)
-    axes[0].set_title(
-        f"{label_of(trajectory.reason)} at {float(trajectory.t_end):.3g} s", loc="right", fontsize="small"
-    )
 
 
 def audit(audit: Audit, *, axes: Any = None) -> np.ndarray:
