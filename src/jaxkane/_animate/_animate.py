@@ -249,7 +249,11 @@ def _write_gif(
         target, span = (center_of_mass[i], view.span_following) if view.follow else (view.center, view.span)
         image = Image.new("RGB", (size[0] * _FINE, size[1] * _FINE), painter.color("paper"))
         to_page = functools.partial(project, target=target, view=view, span=span)
-        painter.paint(ImageDraw.Draw(image, "RGBA"), i, x, to_page, _grid(target, span))
+        # Centre, step [m] and number of lines to each side of the grid, which does not move with the view
+        step = 10.0 ** np.floor(np.log10(0.3 * span))
+        step *= max(k for k in (1, 2, 5) if k * step <= 0.3 * span)
+        grid = np.round(target[:2] / step) * step, step, 8
+        painter.paint(ImageDraw.Draw(image, "RGBA"), i, x, to_page, grid)
         images.append(image.resize(size, Image.Resampling.LANCZOS))
     # One palette for all frames, because changing palettes flicker: every colour, blended in steps with the background.
     palette = Image.new("P", (1, 1))
@@ -337,11 +341,3 @@ def zigzag(ends: list[tuple[float, float]]) -> list[Any]:
     start, axis = np.array(ends[0]), np.subtract(ends[1], ends[0])
     across = _FINE * np.array([-axis[1], axis[0]]) / (np.linalg.norm(axis) or 1.0)
     return [tuple(start + s * axis + a * across) for s, a in _SPRING]
-
-
-def _grid(target: np.ndarray, span: float) -> tuple[np.ndarray, float, int]:
-    """Centre (2,), step [m] and number of lines to each side of the grid on the ground. The grid does not move with the
-    view."""
-    step = 10.0 ** np.floor(np.log10(0.3 * span))
-    step *= max(k for k in (1, 2, 5) if k * step <= 0.3 * span)
-    return np.round(target[:2] / step) * step, step, 8

@@ -359,7 +359,10 @@ def bodies_and_points(motion: Record, build: Builder) -> None:
             is_solid = _solid(build, k, color[k], motion.inertia[k] / motion.mass[k])
             marks[k] = "center", 5.0 if is_solid else 9.0
         else:
-            _axes(build, k)
+            # The axes of the body's frame, a tenth of the scene long
+            for axis_color, axis in zip(("red", "green", "blue"), 0.1 * build.scale * np.eye(3), strict=True):
+                build.local(np.array([np.zeros(3), axis]), k)
+                build.shape("line", axis_color, 2, width=2.0)
             marks[k] = "dot", 3.0
     for k, name in enumerate(motion.bodies):
         build.moving(motion.place[:, k : k + 1])
@@ -380,13 +383,6 @@ def _trace(build: Builder, x: np.ndarray, color: str) -> None:
     if np.ptp(x, axis=0).max() > build.tolerance:
         build.moving(x)
         build.shape("trace", color, 1, width=1.2)
-
-
-def _axes(build: Builder, body: int) -> None:
-    """The axes of a body's frame, a tenth of the scene long."""
-    for color, axis in zip(("red", "green", "blue"), 0.1 * build.scale * np.eye(3), strict=True):
-        build.local(np.array([np.zeros(3), axis]), body)
-        build.shape("line", color, 2, width=2.0)
 
 
 def _solid(build: Builder, body: int, color: str, inertia: np.ndarray) -> bool:

@@ -203,7 +203,10 @@ class Builder:
                 self._add_vertices(local.mean(axis=0), "part", k)
                 return
         if x.shape[1] == 1:
-            self._add_vertices(np.zeros((1, 3)), "path", self._path(x[:, 0]))
+            same = [k for k, path in enumerate(self.paths) if np.abs(path - x[:, 0]).max() <= self.tolerance]
+            if not same:
+                self.paths.append(x[:, 0])
+            self._add_vertices(np.zeros((1, 3)), "path", same[0] if same else len(self.paths) - 1)
         elif not self._turn_about_the_first(x):
             for i in range(x.shape[1]):
                 self.moving(x[:, i : i + 1])
@@ -224,13 +227,6 @@ class Builder:
     @staticmethod
     def _components(R: np.ndarray, origin: np.ndarray, x: np.ndarray) -> np.ndarray:
         return np.einsum("tji,tnj->tni", R, x - origin[:, None])
-
-    def _path(self, x: np.ndarray) -> int:
-        for k, path in enumerate(self.paths):
-            if np.abs(path - x).max() <= self.tolerance:
-                return k
-        self.paths.append(x)
-        return len(self.paths) - 1
 
     def _add_vertices(self, vertices: np.ndarray, kind: str, number: int) -> None:
         self.vertices.extend(np.asarray(vertices, dtype=float))

@@ -62,8 +62,7 @@ class ContactEvent(NamedTuple):
 
     @classmethod
     def of_start(cls, touches: Array) -> ContactEvent:
-        no = jnp.zeros_like(touches)
-        return cls(touches, no, no, no, jnp.array(False), jnp.array(True))
+        return cls(touches, *[jnp.zeros_like(touches)] * 3, jnp.array(False), jnp.array(True))
 
 
 def gaps_at_start(system: System, t: Array, state: State) -> tuple[Array, Array]:
@@ -149,7 +148,10 @@ def changed_contacts(
     strikes = takes_part & closes & ~(closed & event.is_own)
     # With all contacts open, a body would not approach the resting body on which it bounces.
     approach = -(before.a[:, 0] + jnp.where(closed, 0.0, jnp.einsum("iks,ks->i", before.delassus[:, 0], forces)))
-    bounces = _rest_of_bounces(before, approach, strikes)
+    # The time that all bounces after this impact take, 2 v / (a (1 - e)); infinity if they do not end.
+    ends = strikes & (approach > 0) & (before.laws.restitution < 1)
+    slowing = jnp.where(ends, approach * (1.0 - before.laws.restitution), 1.0)
+    bounces = jnp.where(ends, -2.0 * before.laws.restitution * v_N / slowing, jnp.inf)
     # A bounce that is lower than the rounding error of the gap cannot be simulated.
     is_low = 0.5 * (before.laws.restitution * v_N) ** 2 <= approach * (errors / 16)
     rests, is_impact = strikes & (bounces < jnp.inf) & ((bounces < rest) | is_low), jnp.any(strikes)
@@ -195,16 +197,6 @@ def _negligible(terms: ContactTerms) -> Array:
     """Velocities (c, r) that are rounding errors. All velocities of a contact have the size of the largest."""
     size = jnp.max(terms.size, axis=1, keepdims=True)
     return 1e3 * float(jnp.finfo(terms.v.dtype).eps) * jnp.broadcast_to(size, terms.size.shape)
-
-
-def _rest_of_bounces(terms: ContactTerms, fall: Array, strikes: Array) -> Array:
-    """The time (c,) that all bounces after this impact take, 2 v / (a (1 - e)); infinity if they do not end [s].
-
-    `fall` (c,): the accelerations a toward the surfaces.
-    """
-    e = terms.laws.restitution
-    ends = strikes & (fall > 0) & (e < 1)
-    return jnp.where(ends, -2.0 * e * terms.v[:, 0] / jnp.where(ends, fall * (1.0 - e), 1.0), jnp.inf)
 
 
 def _states_by_accelerations(
@@ -267,7 +259,9 @@ def _states_by_accelerations(
         strength2 = jnp.sum(push**2, axis=1)
         strength = jnp.sqrt(jnp.where(strength2 > 0, strength2, 1.0))[:, None]
         onset = jnp.where(slides, found.velocities[:, 1:], 0.0)
-        onset = jnp.where((strength2 > 0)[:, None], push / strength, _unit_rows(onset))
+        squares = jnp.sum(onset**2, axis=1)
+        onset = onset / jnp.sqrt(jnp.where(squares > 0, squares, 1.0))[:, None]
+        onset = jnp.where((strength2 > 0)[:, None], push / strength, onset)
         start = jnp.where(slides, jnp.where(is_still[:, None], onset, slip), 0.0)
         if d == 1:
             directions = jnp.sign(jax.lax.stop_gradient(start))
@@ -295,11 +289,6 @@ def _stops_within(delays: Array, terms: ContactTerms, v: Array, speed: Array) ->
     normal = -a[:, 0] / jnp.where(push[:, 0] > 0, push[:, 0], 1.0)
     slows = jnp.sum(way * (a[:, 1:] + push[:, 1:] * normal[:, None]), axis=1)
     return (delays > 0) & (push[:, 0] > 0) & (speed + slows * delays <= 0)
-
-
-def _unit_rows(x: Array) -> Array:
-    squares = jnp.sum(x**2, axis=1)
-    return x / jnp.sqrt(jnp.where(squares > 0, squares, 1.0))[:, None]
 
 
 @ScalarFunction

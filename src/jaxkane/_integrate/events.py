@@ -266,20 +266,18 @@ def crossings(system: System, t: Component, q: Any, u_all: Any, x: Any, dtype: D
     events = call_with_states(system.events, t, q, u_all, x)
     if not isinstance(events, Mapping):
         raise TypeError(f"{type(system).__name__}.events must return a dict of quantities by name; got {events!r}.")
-    unnamed = [name for name in events if not isinstance(name, str)]
-    if unnamed:
-        raise TypeError(f"{type(system).__name__}.events: the name of an event must be a string; got {unnamed[0]!r}.")
-    reserved = [name for name in events if name.replace("_", " ") in REASONS]
+    reserved = [name for name in events if not isinstance(name, str) or name.replace("_", " ") in REASONS]
     if reserved:
-        raise ValueError(f"{type(system).__name__}: the event name {reserved[0]!r} is reserved. Use another name.")
-    return {name: _as_crossing(name, events[name], dtype) for name in sorted(events)}
-
-
-def _as_crossing(name: str, event: Any, dtype: DTypeLike) -> Crossing:
-    if not isinstance(event, Crossing):
-        return Crossing(_as_float(name, event, dtype), 0)
-    when = None if event.when is None else _as_float(name, event.when, dtype, is_condition=True)
-    return dataclasses.replace(event, value=_as_float(name, event.value, dtype), when=when)
+        raise ValueError(
+            f"{type(system).__name__}: the event name {reserved[0]!r} is reserved, or not a string. Use another name."
+        )
+    found = {}
+    for name in sorted(events):
+        is_crossing = isinstance(events[name], Crossing)
+        event = events[name] if is_crossing else Crossing(_as_float(name, events[name], dtype), 0)
+        when = None if event.when is None else _as_float(name, event.when, dtype, is_condition=True)
+        found[name] = dataclasses.replace(event, value=_as_float(name, event.value, dtype), when=when)
+    return found
 
 
 def _as_float(name: str, event: Any, dtype: DTypeLike, is_condition: bool = False) -> Any:

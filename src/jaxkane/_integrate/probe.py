@@ -132,7 +132,15 @@ def direction_of(args: RateArguments, moved: Any, signals_move: bool) -> Any:
             system_dot, tree_of(args.system), is_leaf=_is_none,
         )  # fmt: skip
         system_dot = Packed.of(everywhere, args.system.numbers.dtype)
-    signals_dot = jax.tree.map(lambda x: _along_signal(x, signals_move), args.signals, is_leaf=is_samples)
+
+    def of_signal(x: Any) -> Any:
+        if not is_samples(x):
+            return _along(signals_move, x, 1.0)
+        size = _along(signals_move, x.values, 1.0)
+        size = None if size is None else jnp.full_like(x.values, jnp.max(size))
+        return eqx.tree_at(lambda s: s.values, jax.tree.map(lambda _: None, x), size, is_leaf=_is_none)
+
+    signals_dot = jax.tree.map(of_signal, args.signals, is_leaf=is_samples)
     return dataclasses.replace(nowhere, system=system_dot, signals=signals_dot)
 
 
@@ -141,15 +149,6 @@ def _along(moves: bool, x: Any, factor: Any) -> Array | None:
         return None
     size = constant(jnp.where(jnp.isfinite(x), jnp.abs(x), 0.0))
     return jnp.asarray(factor, x.dtype) * jnp.where(jnp.any(size > 0), size, 1.0)
-
-
-def _along_signal(x: Any, moves: bool) -> Any:
-    if not is_samples(x):
-        return _along(moves, x, 1.0)
-    nowhere = jax.tree.map(lambda _: None, x)
-    size = _along(moves, x.values, 1.0)
-    size = None if size is None else jnp.full_like(x.values, jnp.max(size))
-    return eqx.tree_at(lambda s: s.values, nowhere, size, is_leaf=_is_none)
 
 
 def _is_none(x: Any) -> bool:

@@ -391,10 +391,7 @@ def nees(belief: Belief, truth: Float[Array, " n"], age: int = 0) -> Array:
             f"nees: `truth` must be an array ({n},) in the order of `filter.names`, got {got}. The order is "
             "coordinates, speeds, states, parameters. For a State, pass jnp.concatenate([state.q, state.u])."
         )
-    return _of_rank(belief.covariance(age), truth - belief.mean[age])
-
-
-def _of_rank(P: Array, error: Array) -> Array:
+    P, error = belief.covariance(age), truth - belief.mean[age]
     # Use the rank of the correlations. With metres and nanometres, eigenvalues of P cannot be compared.
     deviation = jnp.sqrt(jnp.where(jnp.diagonal(P) > 0, jnp.diagonal(P), 1.0))
     values, vectors = jnp.linalg.eigh(P / jnp.outer(deviation, deviation))

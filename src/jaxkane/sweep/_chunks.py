@@ -180,7 +180,8 @@ def on_cluster(
         raise ImportError("sweep(..., client=...) needs Dask: pip install 'jaxkane[cluster]'") from error
 
     # Send NumPy arrays: a worker would convert JAX arrays before it has set their precision.
-    arrays = jax.tree.map(_as_numpy, dataclasses.replace(task, mesh=None))
+    arrays = dataclasses.replace(task, mesh=None)
+    arrays = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, arrays)
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members_at(0))
     common = cloudpickle.dumps((arrays, like))
     program = _program(jax.tree.map(_as_jax, arrays), like)
@@ -251,10 +252,6 @@ def _received(common: bytes) -> tuple[Task, Any]:
 
     task, like = cloudpickle.loads(common)
     return jax.tree.map(_as_jax, task), like
-
-
-def _as_numpy(x: Numbers) -> PyTree:
-    return np.asarray(x) if isinstance(x, jax.Array) else x
 
 
 def _as_jax(x: Numbers) -> PyTree:
