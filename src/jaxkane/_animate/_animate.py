@@ -71,10 +71,9 @@ def animate(
 
     **Raises:** `ValueError` for a batch, for a trajectory of another system, and if no body has a position.
     """
-    if up is not None and up not in UPRIGHT:
-        raise ValueError(f"animate: `up` must be one of {', '.join(UPRIGHT)}, got {up!r}.")
-    if theme not in _THEMES:
-        raise ValueError(f"animate: `theme` must be one of {', '.join(_THEMES)}, got {theme!r}.")
+    for label, value, allowed in (("up", "z" if up is None else up, UPRIGHT), ("theme", theme, _THEMES)):
+        if value not in tuple(allowed):
+            raise ValueError(f"animate: `{label}` must be one of {', '.join(allowed)}, got {value!r}.")
     positive_number(speed, "animate: `speed`")
     positive_number(height, "animate: `height`")
     figure = figure or figure_of(system)

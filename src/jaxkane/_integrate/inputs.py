@@ -70,8 +70,8 @@ class Samples(eqx.Module):
             raise ValueError(f"Samples: `ts` and `values` must have the same length of at least two; got {n} and {m}.")
         if not isinstance(self.ts, Tracer) and not np.all(np.diff(np.asarray(self.ts)) > 0):
             raise ValueError("Samples: `ts` must increase and be finite.")
-        _check_finite("Samples: `ts`", self.ts)
-        _check_finite("Samples: `values`", self.values)
+        check_finite("Samples: `ts`", self.ts)
+        check_finite("Samples: `values`", self.values)
 
     def __repr__(self) -> str:
         ts, values = concrete_numbers(self.ts), concrete_numbers(self.values)
@@ -101,7 +101,7 @@ class Samples(eqx.Module):
         return x0 + (x1 - x0) * w
 
 
-def _check_finite(label: str, values: Array) -> None:
+def check_finite(label: str, values: Array) -> None:
     if not isinstance(values, Tracer) and not np.all(np.isfinite(np.asarray(values))):
         raise ValueError(f"{label} contains values that are not finite: fill the gaps, or cut the record there.")
 
@@ -361,7 +361,7 @@ def _as_signal(label: str, value: Any, ts: Array) -> Any:
             "value for each of the times `ts`, with linear interpolation between them. For other times pass "
             "jaxkane.Samples(times, values)."
         )
-    _check_finite(label, array)
+    check_finite(label, array)
     return Samples(ts, array) if array.ndim else array
 
 

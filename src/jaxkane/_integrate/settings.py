@@ -77,8 +77,7 @@ def settings_for(
     **Raises:** `ValueError` or `TypeError` for invalid or contradictory options.
     """
     for label, flag in (("project", project), ("progress", progress)):
-        if not isinstance(flag, (bool, np.bool_)):
-            raise TypeError(f"`{label}` must be True or False, got {flag!r}.")
+        _check_kind(label, flag, (bool, np.bool_), "True or False", may_be_omitted=False)
     _check_kind("solver", solver, diffrax.AbstractSolver, "a solver of diffrax, e.g. diffrax.Tsit5()")
     controllers = "a controller of diffrax, e.g. diffrax.PIDController(rtol=1e-6, atol=1e-6)"
     _check_kind("controller", controller, diffrax.AbstractStepSizeController, controllers)

@@ -27,7 +27,17 @@ from .._scalarjit.components import Inputs
 from .._scalarjit.configure import warn_of_float32
 from .._system.system import State, System
 from .events import events_of
-from .inputs import as_signals, inputs_at, is_coarse, is_samples, share_times, since, time_array, times_since
+from .inputs import (
+    as_signals,
+    check_finite,
+    inputs_at,
+    is_coarse,
+    is_samples,
+    share_times,
+    since,
+    time_array,
+    times_since,
+)
 from .integrate import refuse_captured, solve
 from .settings import settings_for, with_array_tolerances
 from .status import Status
@@ -182,8 +192,7 @@ def checked_discontinuities(times: Any, start: Any, dtype: DTypeLike) -> Array |
     times = time_array(times, "`discontinuities`", dtype)
     if times.ndim != 1:
         raise ValueError(f"`discontinuities` must be an array (n,) of times; got the shape {times.shape}.")
-    if not isinstance(times, Tracer) and not np.all(np.isfinite(np.asarray(times))):
-        raise ValueError("`discontinuities` contains times that are not finite. Remove or correct them.")
+    check_finite("`discontinuities`", times)
     return times_since(start, times, dtype)
 
 
@@ -234,17 +243,13 @@ def checked_state(system: System, state: Any) -> State:
         )
     state = as_state(system, state)
     parts = [("q", state.q, system.coordinates), ("u", state.u, system.speeds), ("x", state.x, system.states)]
+    parts.append(("contacts", state.contacts, ("the contacts",) * layout_of(system).memory_size))
     for label, value, names in parts:
         if value is not None and value.shape != (len(names),):
             raise ValueError(
-                f"{name}: state.{label} must have the shape ({len(names)},) for {', '.join(names)}; got {value.shape}."
-                + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
+                f"{name}: state.{label} must have the shape ({len(names)},) for {', '.join(dict.fromkeys(names))}; got "
+                f"{value.shape}." + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
             )
-    if state.contacts is not None and state.contacts.shape != (size := (layout_of(system).memory_size,)):
-        raise ValueError(
-            f"{name}: state.contacts must have the shape {size}, got {state.contacts.shape}. Omit it, or pass a state "
-            "of a trajectory of this system."
-        )
     return state
 
 

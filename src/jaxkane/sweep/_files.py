@@ -157,14 +157,11 @@ class Folder:
             return None
         try:
             with zipfile.ZipFile(path) as archive, np.load(path, allow_pickle=False) as arrays:
-                if (part := archive.testzip()) is not None:
-                    raise ValueError(f"{part} is damaged")
-                if str(arrays[_MARK]) != f"{self.sweep} from {start}":
-                    raise ValueError("the file was renamed, or belongs to another sweep")
                 leaves = {name: arrays[name] for name in _by_path(like)}
-            for name, leaf in _by_path(like).items():
-                if leaves[name].shape != (size, *leaf.shape) or leaves[name].dtype != leaf.dtype:
-                    raise ValueError(f"{name} has another shape or type")
+                is_own = archive.testzip() is None and str(arrays[_MARK]) == f"{self.sweep} from {start}"
+            types = {name: ((size, *leaf.shape), leaf.dtype) for name, leaf in _by_path(like).items()}
+            if not is_own or types != {name: (x.shape, x.dtype) for name, x in leaves.items()}:
+                raise ValueError("the file was renamed, belongs to another sweep, or is damaged")
         except (MemoryError, PermissionError):
             raise
         except Exception as error:  # decoders raise various exceptions for damaged files

@@ -203,16 +203,15 @@ def members_of(
     if table is not None and not columns:
         lengths["table"] = len(table)
     if not jax.tree.leaves(members):
-        if table is not None:
-            raise ValueError(
-                f"sweep: all columns of `table` ({', '.join(table.columns)}) are text. Text only labels a member, so "
-                "all members would be equal. Add a column of numbers; numbers that were read as text are converted by "
-                "numpy.asarray(column, float)."
+        if table is None:
+            advice = (
+                "no argument is a batch. Pass a `table`, or add a leading axis of members to a parameter, state.q, "
             )
-        raise ValueError(
-            "sweep: no argument is a batch. Pass a `table`, or add a leading axis to a parameter, state.q, state.u or "
-            "an input. For one trajectory, call jaxkane.simulate."
-        )
+            advice += "state.u or an input. For one trajectory, call jaxkane.simulate"
+        else:
+            advice = f"all columns of `table` ({', '.join(table.columns)}) are text. Text only labels a member, so all "
+            advice += "members would be equal. Add a column of numbers; numpy.asarray(column, float) converts text"
+        raise ValueError(f"sweep: {advice}.")
     n = _common_length(lengths, "sweep: the batches")
     origin, _ = clock_of(ts, dtype)
     _check(members, shared, origin, table)
