@@ -109,7 +109,6 @@ def simulate(
     refuse_captured(system)
     warn_of_float32()
     state = checked_state(system, state)
-    refuse_not_finite(system, state)
     dtype = state.q.dtype
     ts = checked_times(ts, dtype)
     signals = as_signals(inputs, system.inputs, ts, type(system).__name__)
@@ -234,7 +233,7 @@ def on_clock(ts: Any, trajectory: Trajectory) -> dict[str, Any]:
 
 
 def checked_state(system: System, state: Any) -> State:
-    """A state of the right shape for a system."""
+    """A state of the right shape for a system. In a batch, the member's status reports values that are not finite."""
     check_is_system(system)
     name = type(system).__name__
     if not isinstance(state, State):
@@ -249,6 +248,11 @@ def checked_state(system: System, state: Any) -> State:
             raise ValueError(
                 f"{name}: state.{label} must have the shape ({len(names)},) for {', '.join(dict.fromkeys(names))}; got "
                 f"{value.shape}." + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
+            )
+        if label != "contacts" and value is not None and is_concrete(value) and not np.all(np.isfinite(value)):
+            i = int(np.argmin(np.isfinite(value)))
+            raise ValueError(
+                f"{name}: state.{label}: {names[i]} = {float(value[i])} is not finite. Pass finite initial values."
             )
     return state
 
@@ -280,16 +284,3 @@ def as_state(system: System, state: State) -> State:
         arrays = [x.astype(functools.reduce(np.promote_types, types)) for x in arrays]
     contacts = None if state.contacts is None else arrays.pop()
     return State(arrays[0], arrays[1], arrays[2] if system.states else None, contacts)
-
-
-def refuse_not_finite(system: System, state: State) -> None:
-    """**Raises:** `ValueError` for a state that is not finite, by name. In a batch, the member's status reports this
-    instead."""
-    groups = (("q", state.q, system.coordinates), ("u", state.u, system.speeds), ("x", state.x, system.states))
-    for label, values, names in groups:
-        if values is not None and is_concrete(values) and not np.all(np.isfinite(np.asarray(values))):
-            i = int(np.argmin(np.isfinite(np.asarray(values))))
-            raise ValueError(
-                f"{type(system).__name__}: state.{label}: {names[i]} = {float(values[i])} is not finite. Pass finite "
-                "initial values."
-            )

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import refuse_unknown
 from .._integrate.jumps import refuse_jumps
-from .._integrate.simulate import checked_state, refuse_not_finite
+from .._integrate.simulate import checked_state
 from .._kane.api import dependent_speeds
 from .._kane.arguments import (
     check_is_system,
@@ -237,7 +237,6 @@ def begin(filter: Filter, state: State, deviation: Mapping[str, float], t: float
     """
     names, state = filter.names, checked_state(filter.system, state)
     check_time("begin", t)
-    refuse_not_finite(filter.system, state)
     check_state(filter.system, t, state.q)
     if is_concrete(t) and (step := float(np.spacing(np.abs(np.asarray(t, state.q.dtype))))) > 1e-3:
         raise ValueError(

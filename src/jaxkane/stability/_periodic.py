@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from .._common.lookup import as_names, by_name, hint, refuse_unknown
 from .._integrate.events import event_values, own_events_of
 from .._integrate.inputs import as_signals, inputs_at, samples_of
-from .._integrate.simulate import checked_state, refuse_not_finite
+from .._integrate.simulate import checked_state
 from .._integrate.trajectory import Trajectory, as_trajectory, reached_times
 from .._kane.arguments import check_time, is_concrete, is_one_number
 from .._kane.checks import check_system
@@ -292,7 +292,6 @@ def _checked_guess(name: str, system: System, guess: Any, segments: int, t: Any)
     else:
         state = guess
     state = checked_state(system, state)
-    refuse_not_finite(system, state)
     check_state(system, jnp.asarray(t, state.q.dtype), state.q)
     check_system(system, jnp.asarray(t, state.q.dtype), state.q)
     return packed_motion(state), T, states
