@@ -36,7 +36,6 @@ if _typing.TYPE_CHECKING:  # the same names as below, for type checkers and the 
     from ._integrate.events import falling as falling
     from ._integrate.events import rising as rising
     from ._integrate.inputs import Samples as Samples
-    from ._integrate.ode_term import ode_term as ode_term
     from ._integrate.queries import constraint_forces as constraint_forces
     from ._integrate.queries import constraint_multipliers as constraint_multipliers
     from ._integrate.queries import orientations as orientations
@@ -45,6 +44,7 @@ if _typing.TYPE_CHECKING:  # the same names as below, for type checkers and the 
     from ._integrate.queries import speed_rates as speed_rates
     from ._integrate.queries import state_rates as state_rates
     from ._integrate.queries import velocities as velocities
+    from ._integrate.simulate import ode_term as ode_term
     from ._integrate.simulate import simulate as simulate
     from ._integrate.status import Status as Status
     from ._integrate.trajectory import Trajectory as Trajectory
@@ -95,10 +95,9 @@ _NAMES = {
     "_integrate.audit": "Audit audit",
     "_integrate.events": "falling rising",
     "_integrate.inputs": "Samples",
-    "_integrate.ode_term": "ode_term",
     "_integrate.queries": "constraint_forces constraint_multipliers orientations outputs positions "
     "speed_rates state_rates velocities",
-    "_integrate.simulate": "simulate",
+    "_integrate.simulate": "ode_term simulate",
     "_integrate.status": "Status",
     "_integrate.trajectory": "Trajectory",
     "_kane.api": "accelerations constraint_jacobian constraint_jacobian_rate coordinate_rates "

@@ -54,12 +54,11 @@ from .inputs import (
 )
 from .jumps import JumpTable, impulses_at, stages_of, state_after, without_derivative_at
 from .loop import Jump, Steps, diffrax_loop, fast_loop, is_supported
-from .probe import Probing, as_integers, direction_of, generic
 from .settings import Settings, with_scan_kind, with_tolerances
 from .solvers import UnrolledERK, is_explicit, last_stage_is_spare, with_stepwise_inputs
 from .status import Status
 from .step_control import FEWEST_STEPS, SHARE, StepSizeController, evenly_spread, first_step
-from .tangents import with_own_tangents
+from .tangents import Probing, as_integers, direction_of, generic, with_own_tangents
 from .trajectory import InputDiscontinuities, Trajectory
 
 

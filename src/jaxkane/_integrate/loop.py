@@ -17,11 +17,11 @@ from jaxtyping import Array
 
 from .._scalarjit.nan import constant
 from .discontinuities import rounding
-from .probe import Probe, Probing, read_errors
 from .settings import with_scan_kind
 from .solvers import rates_at_ends
 from .status import Status
 from .step_control import ControllerState, StepSizeController
+from .tangents import Probe, Probing, read_errors
 
 # How the loop of equinox is differentiated, by adjoint.
 _KINDS: dict[type, str] = {

@@ -1,4 +1,4 @@
-"""`simulate`: it checks its arguments and passes them to `solve`."""
+"""`simulate`: it checks its arguments and passes them to `solve`. `ode_term`: the equations for diffrax."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from .._kane.constraint_residuals import check_state
 from .._kane.contact import layout_of
 from .._kane.contact_checks import check_contacts
 from .._kane.diagnosis import diagnosis
-from .._kane.right_hand_side import reads_time, values_of
+from .._kane.right_hand_side import reads_time, values_of, vector_field
 from .._scalarjit.cache_key import captured_tracers
 from .._scalarjit.compat import Tracer, on_device
 from .._scalarjit.components import Inputs
 from .._scalarjit.configure import warn_of_float32
-from .._system.system import State, System
+from .._system.system import State, System, packed, unpacked
 from .events import events_of
 from .inputs import (
     as_signals,
@@ -284,3 +284,38 @@ def as_state(system: System, state: State) -> State:
         arrays = [x.astype(functools.reduce(np.promote_types, types)) for x in arrays]
     contacts = None if state.contacts is None else arrays.pop()
     return State(arrays[0], arrays[1], arrays[2] if system.states else None, contacts)
+
+
+def ode_term(system: System, inputs: Inputs = None) -> tuple[diffrax.ODETerm, Any]:
+    """The equations of motion as a term of diffrax, and the arguments to pass with it.
+
+        term, args = jk.ode_term(system, {"push": 1.0})
+        solution = diffrax.diffeqsolve(term, diffrax.Tsit5(), 0.0, 1.0, 0.01, state, args)
+        solution.ys.q  # (1, n_q)
+
+    The solution is a `State`. The system and the state are not checked. Steps do not end at discontinuities or events.
+    Pass `stepsize_controller=diffrax.ClipStepSizeController(...)` and `event=diffrax.Event(...)`, or use `simulate`.
+
+    **Arguments:**
+
+    - `system`: a `System`.
+    - `inputs`: a dict with a number, `Samples` or a function (t, state) -> number for each input; or one function
+        (t, state) -> dict.
+
+    **Returns:**
+
+    - a `diffrax.ODETerm` of (t, y, args), in which y is a `State` with arrays, as from `assemble`.
+    - args: the system and its inputs. Solutions can be differentiated with respect to them.
+
+    **Raises:** `ValueError` for an unknown input, or for an array of samples without times.
+    """
+    check_is_system(system)
+    no_times: Any = np.zeros(0)
+    signals = as_signals(inputs, system.inputs, no_times, type(system).__name__)
+
+    def rates(t: Any, y: State, args: Any) -> State:
+        system, signals = args
+        t = jnp.asarray(t, y.q.dtype)
+        return unpacked(system, vector_field(system, t, packed(y), inputs_at(system, signals, t, y)))
+
+    return diffrax.ODETerm(rates), (system, signals)  # pyright: ignore[reportArgumentType]

@@ -3,5 +3,5 @@ files."""
 
 from ._members import Table as Table
 from ._members import grid as grid
-from ._result import Sweep as Sweep
+from ._sweep import Sweep as Sweep
 from ._sweep import sweep as sweep
