@@ -211,7 +211,7 @@ def test_every_public_function_refuses_the_motion_of_another_system(ride, name):
 
 
 def test_every_public_function_of_a_trajectory_is_tested():
-    rooms = [jk, *(importlib.import_module(f"jaxkane.{room}") for room in jk._ROOMS if room != "catalog")]
+    rooms = [jk, *(importlib.import_module(f"jaxkane.{room}") for room in jk._PACKAGES if room != "catalog")]
     functions = {
         f"{room.__name__}.{name}": f
         for room in rooms

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
+import jax
 import numpy as np
 
 from .._common.lookup import as_names, label_of
@@ -121,20 +122,20 @@ def _with_jumps(
     jumps = trajectory.jumps
     if jumps is None:
         return t, y
-    count = int(np.ravel(np.asarray(jumps.count))[k])
-    times = np.reshape(np.asarray(jumps.t), (-1, np.shape(jumps.t)[-1]))[k, :count]
-    sides = np.full((2, count), np.nan)
-    if name in jumps.inputs[0]:
-        values = [np.reshape(np.asarray(x[name]), (-1, np.shape(jumps.t)[-1]))[k, :count] for x in jumps.inputs]
-        sides = scale * np.stack(values)
-    for i, names in enumerate((trajectory.names[0], trajectory.names[1], trajectory.names[3])):
+    lead = np.ndim(jumps.count)
+    member = jax.tree.map(lambda x: np.reshape(np.asarray(x), (-1, *np.shape(x)[lead:]))[k], jumps)
+    count = int(member.count)
+    times, sides = member.t[:count], [np.full(count, np.nan)] * 2
+    if name in member.inputs[0]:
+        sides = [side[name][:count] for side in member.inputs]
+    for names, part in zip(
+        (trajectory.names[0], trajectory.names[1], trajectory.names[3]), ("q", "u", "x"), strict=True
+    ):
         if name in names:
-            states = [(side.q, side.u, side.x)[i] for side in (jumps.before, jumps.after)]
-            values = [np.reshape(np.asarray(x), (-1, *np.shape(x)[-2:]))[k, :count] for x in states]
-            sides = scale * np.stack(values)[:, :, names.index(name)]
+            sides = [getattr(side, part)[:count, names.index(name)] for side in (member.before, member.after)]
     # Before a jump, a gap, and after it; samples at the time of a jump have the value after it.
     at = np.repeat(times, 3)
-    points = np.stack([sides[0], np.full(count, np.nan), sides[1]], axis=1).reshape(-1)
+    points = np.stack([scale * sides[0], np.full(count, np.nan), scale * sides[1]], axis=1).reshape(-1)
     places = np.repeat(np.searchsorted(t, times, side="left"), 3)
     return np.insert(t, places, at), np.insert(y, places, points)
 
