@@ -487,8 +487,8 @@ def test_contradictory_options_raise(options, message):
             {"adjoint": None},
             "`adjoint` must be one of auto, reverse, forward, both, or an adjoint of diffrax; got None",
         ),
-        ({"project": "no"}, "`project` must be True or False, got 'no'"),
-        ({"progress": 1}, "`progress` must be True or False, got 1"),
+        ({"project": "no"}, "`project` must be True or False; got 'no'"),
+        ({"progress": 1}, "`progress` must be True or False; got 1"),
     ],
 )
 def test_options_of_the_wrong_type_raise(options, message):

@@ -477,12 +477,13 @@ class Audit(eqx.Module):
             ("linear momentum", *_conservation(self.linear_momentum)),
             ("angular momentum", *_conservation(self.angular_momentum)),
         ]
-        if self.configuration_residuals.size:
-            largest = _largest(relative(self.configuration_residuals, self.configuration_sizes))
-            lines.append(("configuration", f"{largest:.1e}", _verdict(largest, 1e-6, 1e-3)))
-        if self.velocity_residuals.size:
-            largest = _largest(relative(self.velocity_residuals, self.velocity_sizes))
-            lines.append(("velocity constraints", f"{largest:.1e}", _verdict(largest, 1e-6, 1e-3)))
+        for what, residuals, sizes in (
+            ("configuration", self.configuration_residuals, self.configuration_sizes),
+            ("velocity constraints", self.velocity_residuals, self.velocity_sizes),
+        ):
+            if residuals.size:
+                largest = _largest(relative(residuals, sizes))
+                lines.append((what, f"{largest:.1e}", _verdict(largest, 1e-6, 1e-3)))
         lines.append(("condition of M", *_condition(self.condition_M)))
         if self.velocity_residuals.size:
             lines.append(("condition of C_dep", *_condition(self.condition_C_dep)))

@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from .._common.lookup import not_there, refuse_unknown
+from .._common.lookup import by_name, refuse_unknown
 from .._kane.arguments import checked_inputs, is_numeric
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import Tracer, on_device
@@ -182,14 +182,11 @@ class InputState(eqx.Module):
     system: System
 
     def __getitem__(self, name: str) -> Component:
-        system = self.system
-        for names, values in ((system.coordinates, self.q), (system.speeds, self.u), (system.states, self.x)):
-            if values is not None and name in names:
-                return values[names.index(name)]
+        system, u_dep = self.system, None
         if name in system.dependent_speeds:
-            u_dep = KaneEquations(system, self.t, self.q, self.u).u_dep
-            return jnp.asarray(u_dep[system.dependent_speeds.index(name)])
-        raise not_there(name, [each for names in names_of(system) for each in names], "the state")
+            u_dep = jnp.stack([jnp.asarray(x) for x in KaneEquations(system, self.t, self.q, self.u).u_dep])
+        groups = zip(names_of(system), (self.q, self.u, u_dep, self.x), strict=True)
+        return by_name(name, groups, {}, "the state")
 
 
 def inputs_at(
@@ -216,8 +213,6 @@ def inputs_at(
     context = InputState(state.q, state.u, state.x, now, system)
     if callable(signals):
         values: Any = called(CONTROLLER, signals, now, context)
-        if not isinstance(values, Mapping):
-            raise TypeError(f"{CONTROLLER} must return a dict by name, got {values!r}.")
     else:
         values = {
             name: f.piece(t, at)

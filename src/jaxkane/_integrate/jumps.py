@@ -183,12 +183,6 @@ def _after_stage(system: System, t: Component, y: Array, name: str, stage: int) 
         )
     names = (*system.coordinates, *system.speeds, *system.states)
     label = f"{type(system).__name__}.events: `then` of {name!r}"
-    dependent = [key for key in then if key in system.dependent_speeds]
-    if dependent:
-        raise ValueError(
-            f"{label} sets the dependent speed {dependent[0]!r}, which the constraints determine. Set independent "
-            f"speeds: {', '.join(system.speeds)}."
-        )
     refuse_unknown(then, names, f"{label}: not a coordinate, an independent speed or a first-order state:")
     new = []
     for i, key in enumerate(names):

@@ -201,10 +201,11 @@ def _check_number(label: str, value: Any, is_allowed: Callable[[float], bool], a
 
 def with_array_tolerances(settings: Settings, dtype: DTypeLike) -> Settings:
     """The same with arrays as tolerances and step, so that other values do not cause a recompilation."""
-
-    def array(x: Any) -> Any:
-        # Convert a number by NumPy, which compiles nothing.
-        return x.astype(dtype) if isinstance(x, jax.Array) else jax.device_put(np.asarray(x, dtype))
-
     values = {name: getattr(settings, name) for name in ("rtol", "atol", "step", "max_step")}
-    return dataclasses.replace(settings, **{name: x if x is None else array(x) for name, x in values.items()})
+    # Convert a number by NumPy, which compiles nothing.
+    arrays = {
+        name: x.astype(dtype) if isinstance(x, jax.Array) else jax.device_put(np.asarray(x, dtype))
+        for name, x in values.items()
+        if x is not None
+    }
+    return dataclasses.replace(settings, **arrays)
