@@ -62,7 +62,8 @@ class ContactEvent(NamedTuple):
 
     @classmethod
     def of_start(cls, touches: Array) -> ContactEvent:
-        return cls(touches, *[jnp.zeros_like(touches)] * 3, jnp.array(False), jnp.array(True))
+        no = jnp.zeros_like(touches)
+        return cls(touches, no, no, no, jnp.array(False), jnp.array(True))
 
 
 def gaps_at_start(system: System, t: Array, state: State) -> tuple[Array, Array]:

@@ -471,7 +471,8 @@ def _is_small(x: Any) -> bool:
 
 def is_valid(system: System, y: Array, t: Array, signals: Any) -> Array:
     """Whether a simulation can start at `t`, with a packed state."""
-    return initial_check(*constant((system, y, t)), inputs_are_valid(signals))[0]
+    system, y, t = constant((system, y, t))
+    return initial_check(system, y, t, inputs_are_valid(signals))[0]
 
 
 def _limited(system: System) -> list[tuple[Array, ParameterInfo]]:

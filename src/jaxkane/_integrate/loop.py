@@ -45,7 +45,7 @@ class Jump(NamedTuple):
     after: Array
     smooth: Array
     impulses: Array
-    status: Array | None
+    status: Any
 
 
 class Steps(NamedTuple):
@@ -198,7 +198,7 @@ def fast_loop(
                 now, start = ControllerState.unpacked(a.controller_state[0], n_events), jnp.where(keep, c.t1, c.t0)
                 jump, fits = jump_at(start, motion_of(a.y), now.jump, now.reach), a.n_jumps < most
                 # A state that is not finite must not reach the solver.
-                status_of_jump: Any = jump.status
+                status_of_jump = jump.status
                 is_possible = status_of_jump == float(Status.COMPLETED)
                 jump = jump._replace(after=jnp.where(fits & is_possible, jump.after, jump.before), status=None)
                 end, (changed, inner) = controller.after_jump(a.controller_state, jump.t, jump.after, args)
@@ -211,7 +211,7 @@ def fast_loop(
                     t0=jump.t, t1=end, y=y, rates=None if a.rates is None else jnp.zeros_like(a.rates),
                     solver_state=solver.init(term, jump.t, end, y, args),
                     controller_state=(changed.at[0].set(status), inner), running=status == float(Status.COMPLETED),
-                    jumps=Jump(*rows, None), n_jumps=jnp.minimum(a.n_jumps + 1, most),
+                    jumps=Jump._make([*rows, None]), n_jumps=jnp.minimum(a.n_jumps + 1, most),
                 )  # fmt: skip
 
             at_infinity = following._replace(t0=jnp.full_like(t1, jnp.inf))
