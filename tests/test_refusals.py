@@ -500,7 +500,6 @@ ALIASES = {
 """Other words (a pattern) by which a message names an argument."""
 
 NOT_YET: dict[str, str] = {
-    "animate-up": "message of Python: wrong shape",
     "animate-follow": "accepted: wrong type",
     "animate-ground": "accepted: wrong type",
     "animate-title": "accepted: all",

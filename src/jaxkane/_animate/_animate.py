@@ -19,7 +19,7 @@ from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
 from .._system.system import System
 from ._figures import COLORS, Figure, Record, bodies_and_points, figure_of, record
-from ._scene import FIXED, UPRIGHT, Builder, Scene, project, turned_by, upward_axis, view_of
+from ._scene import FIXED, UPRIGHT, Builder, Scene, angles_of, project, turned_by, upward_axis, view_of
 
 _FRAMES_PER_SECOND = 50.0
 _MOST_FRAMES = 3000
@@ -76,9 +76,9 @@ def animate(
             raise ValueError(f"animate: `{label}` must be one of {', '.join(allowed)}, got {value!r}.")
     positive_number(speed, "animate: `speed`")
     positive_number(height, "animate: `height`")
-    figure = figure or figure_of(system)
+    angles, figure = angles_of(azimuth, elevation), figure or figure_of(system)
     scene = _scene(record(system, trajectory, figure), figure, speed, up, follow, ground, title, type(system).__name__)
-    scene = dataclasses.replace(scene, view=scene.view.seen_from(azimuth, elevation))
+    scene = dataclasses.replace(scene, view=dataclasses.replace(scene.view, **angles))
     return Animation(scene, speed, theme, height)
 
 
@@ -234,7 +234,7 @@ def _write_gif(
     """Write into the open file; see `Animation.save`."""
     from PIL import Image, ImageDraw
 
-    view = scene.view.seen_from(azimuth, elevation)
+    view = dataclasses.replace(scene.view, **angles_of(azimuth, elevation))
     seconds = None if seconds is None else positive_number(seconds, "Animation.save: `seconds`")
     # A GIF has delays in hundredths of a second; browsers need at least two.
     hundredths = max(2, round(100.0 / positive_number(fps, "Animation.save: `fps`")))

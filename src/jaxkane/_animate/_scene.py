@@ -27,17 +27,18 @@ class View:
     follow: bool
     span_following: float
 
-    def seen_from(self, azimuth: float | None, elevation: float | None) -> View:
-        """The view from other angles [degrees]; None keeps an angle.
 
-        **Raises:** `ValueError` for an angle that is not finite.
-        """
-        angles = {"azimuth": azimuth, "elevation": elevation}
-        angles = {key: real_number(x, f"`{key}`") for key, x in angles.items() if x is not None}
-        wrong = [key for key, x in angles.items() if not np.isfinite(x)]
-        if wrong:
-            raise ValueError(f"`{wrong[0]}` must be finite, got {angles[wrong[0]]}.")
-        return dataclasses.replace(self, **{key: float(np.deg2rad(x)) for key, x in angles.items()})
+def angles_of(azimuth: float | None, elevation: float | None) -> dict[str, float]:
+    """The angles of a `View` from angles [degrees]; None keeps an angle.
+
+    **Raises:** `ValueError` for an angle that is not finite.
+    """
+    angles = {"azimuth": azimuth, "elevation": elevation}
+    angles = {key: float(np.deg2rad(real_number(x, f"`{key}`"))) for key, x in angles.items() if x is not None}
+    wrong = [key for key, x in angles.items() if not np.isfinite(x)]
+    if wrong:
+        raise ValueError(f"`{wrong[0]}` must be finite, got {angles[wrong[0]]}.")
+    return angles
 
 
 UPRIGHT = {
