@@ -1,7 +1,11 @@
-"""Diagnostics of a fit as sentences: about its records, residuals, parameters and bodies. Runs no fit."""
+"""Diagnostics of a fit as sentences: about its records, residuals, parameters and bodies; plausible values. Runs no
+fit.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -11,13 +15,14 @@ from jaxtyping import Array
 
 from ..problem.bodies import PossibleBody
 from ..problem.model import Unknowns
-from ..problem.parameters import Parameters
+from ..problem.parameters import Interval, Parameters
 from ..problem.problem import Problem
 from ..problem.specification import delayed_inputs
-from ..problem.trial import DEGREE, check_records
+from ..problem.trial import DEGREE, check_records, trial_names
 from ..problem.windows import first_after, state_names
-from .statistics import FEWEST_TRIALS, LARGEST_LEVERAGE, ByTrial, ResidualTest, trial_names
+from .statistics import FEWEST_TRIALS, LARGEST_LEVERAGE, ByTrial, ResidualTest
 
+# By status, why a fit ended.
 STATUS = {
     "converged": "converged",
     "bound": "converged: a parameter rests at its bound",
@@ -27,10 +32,9 @@ STATUS = {
     "interrupted": "interrupted: this is the best result so far",
     "validated": "not fitted: these are the parameters of another fit",
 }
-"""By status, why a fit ended."""
 
+# Statuses of fits that have errors and intervals.
 AT_A_MINIMUM = ("converged", "bound", "unchecked")
-"""Statuses of fits that have errors and intervals."""
 
 
 def not_converged(status: str) -> Iterator[str]:
@@ -59,13 +63,15 @@ def notes(fit: Any) -> Iterator[str]:
     if problem.model.errors is None:  # otherwise the scales are estimated
         yield from wrong_sigma(problem, fit.variance, fit.identifiability.degrees_of_freedom)
     yield from numerical_limits(fit)
+    reasons: list[Any] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             problem.check_system(fit.point)
         except ValueError as error:
-            yield f"A body is not physically possible: {error}"
-    yield from (f"A body is not physically possible: {warning.message}" for warning in caught)
+            reasons.append(error)
+    for reason in (*reasons, *(warning.message for warning in caught)):
+        yield f"A body is not physically possible: {reason}"
     yield from _starts_at_zero(problem)
     trials = zip(fit.trial_names, problem.trials, strict=True)
     skipped = {name: trial.t[first_after(trial, late)] - trial.t[0] for name, trial in trials}
@@ -85,7 +91,7 @@ def notes(fit: Any) -> Iterator[str]:
 def unrecorded_inputs(problem: Problem, point: Unknowns) -> Iterator[str]:
     """Inputs whose first sample is used for earlier times, because they are delayed by more than two intervals."""
     before, nuisance = delayed_inputs(problem.specification)[1], problem.model.nuisance
-    names, calibration = trial_names(problem), problem.parameters.apply(problem.system, point.parameters)[1]
+    names, calibration = trial_names(problem.trials), problem.parameters.apply(problem.system, point.parameters)[1]
     # Reversed, so that the dict keeps the first window of each trial.
     starts = {k: first for k, first, _ in reversed(problem.slices)}
     for name in (name for name in problem.system.inputs if name not in before):
@@ -181,30 +187,28 @@ def _residuals(fit: Any) -> Iterator[str]:
         )
 
 
-def _fixed_starts(problem: Problem) -> list[str]:
-    """Independent initial values that are not estimated."""
+def _fixed_starts(problem: Problem) -> tuple[list[str], dict[str, list[str]]]:
+    """Independent initial values that are not estimated, and by name the trials in which a speed or a state starts at
+    zero because no initial value is given.
+    """
     names, estimated = state_names(problem.system), {*problem.model.nuisance.start}
     for four in problem.model.quaternions:
         euler = {names[i] for i in four}
         if len(euler & estimated) >= 3:  # the fourth Euler parameter follows from the norm
             estimated |= euler
-    return [name for name in names if name not in (*estimated, *problem.system.dependent_coordinates)]
-
-
-def _unstated_starts(problem: Problem) -> dict[str, list[str]]:
-    """Speeds and states that start at zero because no initial value is given, with their trials."""
-    found: dict[str, list[str]] = {}
-    for name in (name for name in _fixed_starts(problem) if name not in problem.system.coordinates):
-        for label, trial in zip(trial_names(problem), problem.trials, strict=True):
+    fixed = [name for name in names if name not in (*estimated, *problem.system.dependent_coordinates)]
+    unstated: dict[str, list[str]] = {}
+    for name in (name for name in fixed if name not in problem.system.coordinates):
+        for label, trial in zip(trial_names(problem.trials), problem.trials, strict=True):
             if name not in trial.initial and not np.isfinite(trial.measured.get(name, np.nan)).any():
-                found.setdefault(name, []).append(label)
-    return found
+                unstated.setdefault(name, []).append(label)
+    return fixed, unstated
 
 
 def _starts_at_zero(problem: Problem) -> Iterator[str]:
     """Initial values that the user may have forgotten."""
     by_trials: dict[str, list[str]] = {}
-    for name, trials in _unstated_starts(problem).items():
+    for name, trials in _fixed_starts(problem)[1].items():
         where = "all trials" if len(trials) == len(problem.trials) else ", ".join(trials)
         by_trials.setdefault(where, []).append(name)
     for where, names in by_trials.items():
@@ -220,7 +224,7 @@ def wrong_sigma(problem: Problem, variance: float, degrees_of_freedom: float) ->
     """Residuals whose size differs from `sigma` by more than four standard deviations of chi^2."""
     if np.isnan(variance) or not (variance - 1) ** 2 > 16 * 2 / degrees_of_freedom:
         return
-    fixed, unstated = _fixed_starts(problem), tuple(_unstated_starts(problem))
+    fixed, unstated = _fixed_starts(problem)
     noisy = tuple(n for n in fixed if any(n in t.measured and n not in t.initial for t in problem.trials))
     chi = f"chi^2 is {variance * degrees_of_freedom:.4g} with {degrees_of_freedom:.4g} degrees of freedom"
     size = f"{chi}: residuals are {variance**0.5:.2g} times as large as `sigma`"
@@ -313,9 +317,9 @@ def _parameters(fit: Any) -> Iterator[str]:
             )
 
 
+# With fewer groups, the estimated standard deviation of a distribution is uncertain. With five groups whose true
+# standard deviation was 0.6 of the error of one group, 95 % intervals of the groups had a coverage of 0.80 to 0.90.
 FEWEST_GROUPS = 10
-"""With fewer groups, the estimated standard deviation of a distribution is uncertain. With five groups whose true
-standard deviation was 0.6 of the error of one group, 95 % intervals of the groups had a coverage of 0.80 to 0.90."""
 
 
 def _constraints_and_priors(fit: Any) -> Iterator[str]:
@@ -347,3 +351,61 @@ def _constraints_and_priors(fit: Any) -> Iterator[str]:
     for name, error, deviation, is_learned in zip(*columns, strict=True):
         if not is_learned and np.isfinite(deviation) and error > 0.95 * deviation:
             yield f"{name} is determined by its prior alone: the data add no information."
+
+
+Range = tuple[float, float]
+
+# Largest plausible deviation from the mean of the prior, in standard deviations of the prior.
+DEVIATIONS = 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Plausible:
+    """By name of a parameter, the range of its plausible values."""
+
+    ranges: Mapping[str, Range]
+
+    def bound_violations(self, values: Mapping[str, float]) -> dict[str, str]:
+        """By name, a sentence for each value that is outside its plausible range."""
+        violations = {}
+        for name, value in values.items():
+            low, high = self.ranges.get(name, (-math.inf, math.inf))
+            if not low <= value <= high:
+                side = f"below {low:.4g}" if value < low else f"above {high:.4g}"
+                violations[name] = f"{name} = {value:.4g} is {side}" if math.isfinite(value) else f"{name} is {value}"
+        return violations
+
+
+def plausible_of(parameters: Parameters, plausible: Mapping[str, Any]) -> Plausible:
+    """The plausible range of every parameter.
+
+    A given range is (lower, upper) or a relative deviation from the start. By default it is three standard deviations
+    of the prior. Without a prior it is the bounds, except for their ends. The initial guess alone implies no range.
+    """
+    ranges = {}
+    for i, (name, owner, (low, high)) in enumerate(
+        zip(parameters.names, parameters.owners, parameters.bounds.tolist(), strict=True)
+    ):
+        bijection, start = parameters.bijections[owner], float(parameters.start[i])
+        mean, deviation = float(parameters.prior_mean[i]), float(parameters.prior_deviation[i])
+        if name in plausible:
+            ranges[name] = _range(name, plausible[name], start)
+        elif math.isfinite(deviation):
+            ranges[name] = mean - DEVIATIONS * deviation, mean + DEVIATIONS * deviation
+        elif isinstance(bijection, Interval) and bijection.uniform and math.isfinite(high - low):
+            ranges[name] = low + 1e-3 * (high - low), high - 1e-3 * (high - low)
+    return Plausible(ranges)
+
+
+def _range(name: str, value: Any, start: float) -> Range:
+    low = high = math.nan
+    if isinstance(value, (int, float)):
+        low, high = start - value * abs(start), start + value * abs(start)
+    elif isinstance(value, (tuple, list)) and len(value) == 2:
+        low, high = (end if x is None else float(x) for x, end in zip(value, (-math.inf, math.inf), strict=True))
+    if not low < high:
+        raise ValueError(
+            f"`plausible` of {name} must be (lower, upper) with lower < upper, or a positive relative deviation from "
+            f"an initial guess other than zero; got {value!r} and the initial guess {start:g}."
+        )
+    return low, high

@@ -20,13 +20,14 @@ from ..problem.model import Unknowns
 from ..problem.parameters import Parameters, places_of
 from ..problem.problem import Problem
 from ..problem.specification import refuse_other
+from ..problem.trial import trial_names
 from ..solve.linearization import Linearization
 from ..solve.mixed_effects import degrees_of_freedom
 from ..solve.step_refinement import STEP_TOLERANCE, residual_deviation, step_errors
 from . import diagnostics as diagnostics
 from . import statistics as statistics
 from .identifiability import Identifiability, identifiability_at
-from .linearized import Posterior, folds_of, linearized_problem
+from .linearized import Posterior, linearized_problem, trial_folds
 from .statistics import ByTrial, ResidualTest, infinite_along
 from .tables import Export, costs_in_words, read_fit
 
@@ -389,8 +390,7 @@ class Fit(Export, Posterior):
 
         **Raises:** `ValueError` if `level` is not between 0 and 1.
         """
-        ends = statistics.intervals(self.parameters, self.point.parameters, self.half_widths(level))
-        return dict(zip(self.names, ends, strict=True))
+        return statistics.intervals(self.parameters, self.point.parameters, self.half_widths(level))
 
     @property
     def correlation(self) -> np.ndarray:
@@ -449,7 +449,7 @@ class Fit(Export, Posterior):
     @property
     def trial_names(self) -> tuple[str, ...]:
         """Names of the trials. Repeated names are numbered."""
-        return statistics.trial_names(self.problem)
+        return trial_names(self.problem.trials)
 
     @property
     def nuisance(self) -> dict[str, dict[str, Any]]:
@@ -484,12 +484,12 @@ class Fit(Export, Posterior):
         are fixed. NaN with one trial, with process noise or `errors`, if the fit has not converged, and if one fold
         alone determines a parameter.
         """
-        T = len(self.problem.trials)
-        if T < 2 or self.problem.model.has_likelihood or self.status not in diagnostics.AT_A_MINIMUM:
+        trials = self.problem.trials
+        if len(trials) < 2 or self.problem.model.has_likelihood or self.status not in diagnostics.AT_A_MINIMUM:
             return math.nan
         linearized = linearized_problem(self.linearization)
         free = [i for i, name in enumerate(self.names) if name not in self.identifiability.at_bound]
-        cost = float(np.sum(linearized.costs_left_out(free, folds_of(None, T))))
+        cost = float(np.sum(linearized.costs_left_out(free, trial_folds(None, trials)[0])))
         return cost if math.isfinite(cost) else math.nan
 
     @property

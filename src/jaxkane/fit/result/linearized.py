@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array
 from scipy import stats
 
-from ..._common.lookup import not_there
+from ..._common.lookup import by_name, whole_number
 from ..._kane.api import _dependent_speeds
 from ..._scalarjit.cache_key import jit
 from ..._scalarjit.compat import on_device
@@ -21,6 +21,7 @@ from ..._system.system import unpacked
 from ...estimate._filter import brought_back
 from ..problem.model import Model, Unknowns
 from ..problem.problem import Problem
+from ..problem.trial import Trial
 from ..problem.windows import state_names
 from ..solve.blocks import Blocks, Eliminated, eliminate
 from ..solve.kalman import filtered, smoothed_moments
@@ -40,8 +41,8 @@ from .statistics import (
 
 LOG_2PI = math.log(2 * math.pi)
 
+# Prior standard deviation of an initial state or trial unknown that has none, in multiples of its standard error.
 DIFFUSE = 1e4
-"""Prior standard deviation of an initial state or trial unknown that has none, in multiples of its standard error."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,8 +76,7 @@ class Laplace:
 
         **Returns:** by name, values (n,) in the parameter's unit. They are always inside its bounds.
         """
-        if not isinstance(n, (int, np.integer)) or n < 0:
-            raise ValueError(f"`n` must be an integer that is not negative, got {n!r}.")
+        whole_number(n, 0, "`n`")
         rng = np.random.default_rng(seed)
         x = jnp.asarray(rng.multivariate_normal(self.mean, self.covariance, size=n), self.fit.point.parameters.dtype)
         values = np.asarray(jax.vmap(self.fit.parameters.values)(x))
@@ -105,7 +105,7 @@ class Smoothed:
     covariance: np.ndarray
 
     def __getitem__(self, name: str) -> np.ndarray:
-        return self.mean[:, self._place(name)]
+        return by_name(name, [(self.names, self.mean)], {}, "this motion")
 
     def deviation(self, name: str) -> np.ndarray:
         """Standard deviation (n_t,).
@@ -114,8 +114,8 @@ class Smoothed:
 
         - `name`: one of `names`.
         """
-        i = self._place(name)
-        return np.sqrt(self.covariance[:, i, i])
+        deviations = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        return by_name(name, [(self.names, deviations)], {}, "this motion")
 
     def band(self, name: str, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
         """Pointwise probability band.
@@ -132,11 +132,6 @@ class Smoothed:
         check_level(level)
         half = float(stats.norm.ppf(0.5 * (1 + level))) * self.deviation(name)
         return self[name] - half, self[name] + half
-
-    def _place(self, name: str) -> int:
-        if name not in self.names:
-            raise not_there(name, self.names, "this motion")
-        return self.names.index(name)
 
     def __repr__(self) -> str:
         return f"Smoothed({len(self.t)} times from {self.t[0]:g} to {self.t[-1]:g} s: {', '.join(self.names)})"
@@ -307,18 +302,44 @@ def _smoothed(model: Model, windows: Any, point: Unknowns, starts: Array, begin:
     return map_windows(of_trial, (windows, point.trial_unknowns[windows.trial], starts, begin))
 
 
-def folds_of(folds: int | Sequence[Sequence[int]] | None, T: int) -> list[list[int]]:
-    """Groups of trials that are left out together. None: each trial alone; with eleven or more trials, five folds."""
-    if folds is None:
-        folds = T if T <= 10 else 5
-    if isinstance(folds, int):
-        if not 2 <= folds <= T:
-            raise ValueError(f"`folds` must be between 2 and the number of trials, {T}; got {folds}.")
-        return [list(range(k, T, folds)) for k in range(folds)]
-    groups = [[int(k) for k in group] for group in folds]
+def trial_folds(
+    folds: int | str | Sequence[Sequence[int]] | None, trials: Sequence[Trial]
+) -> tuple[list[list[int]], str]:
+    """Groups of trials that are left out together, and their description as text.
+
+    None: each trial alone; with eleven or more trials, five folds.
+
+    **Raises:** `ValueError` for folds that do not leave out each trial exactly once, and for a label that a trial does
+    not have.
+    """
+    T = len(trials)
+    if isinstance(folds, str):
+        missing = [trial.name for trial in trials if folds not in trial.labels]
+        if missing:
+            known = ", ".join(sorted({label for trial in trials for label in trial.labels})) or "none"
+            raise ValueError(
+                f"`folds`: {missing[0]} has no label {folds!r}; the labels of these trials are: {known}. Pass "
+                f"Trial(..., labels={{{folds!r}: ...}})."
+            )
+        by_label: dict[str | float, list[int]] = {}
+        for k, trial in enumerate(trials):
+            by_label.setdefault(trial.labels[folds], []).append(k)
+        if len(by_label) < 2:
+            raise ValueError(
+                f"`folds`: all trials have the same {folds}, {trials[0].labels[folds]!r}, so none can be left out. Use "
+                "another label."
+            )
+        return list(by_label.values()), f"each {folds}: {', '.join(str(label) for label in by_label)}"
+    number = (T if T <= 10 else 5) if folds is None else folds
+    groups = [range(k, T, number) for k in range(number)] if isinstance(number, int) else number
+    groups = [[int(k) for k in group] for group in groups]
     if sorted(k for group in groups for k in group) != list(range(T)) or not all(groups) or len(groups) < 2:
-        raise ValueError(f"`folds` must contain each of the trials 0 to {T - 1} exactly once, in at least two groups.")
-    return groups
+        raise ValueError(
+            f"`folds` must be between 2 and the number of trials, {T}, or contain each of the trials 0 to {T - 1} "
+            f"exactly once, in at least two groups; got {folds}."
+        )
+    alone = all(len(group) == 1 for group in groups)
+    return groups, "each trial alone" if alone else f"{len(groups)} folds of the trials"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -355,9 +376,9 @@ class LinearizedProblem:
         """
         places, costs = list(places), []
         rank = _rank(self.of(places)[0])
-        for fold in folds:
-            rest = dataclasses.replace(self, data=np.delete(self.data, list(fold), axis=0))
-            (x, _), out = rest.minimum(places), self.data[list(fold)]
+        for fold in map(list, folds):
+            rest, out = dataclasses.replace(self, data=np.delete(self.data, fold, axis=0)), self.data[fold]
+            x, _ = rest.minimum(places)
             predicts = _rank(rest.of(places)[0]) == rank
             costs.append(np.sum((out[:, :, places] @ x + out[:, :, -1]) ** 2) if predicts else np.inf)
         return np.array(costs)
@@ -443,33 +464,31 @@ def score_test(
     # A projected column below 1e-7 of the original one is a rounding error.
     distinguishable = sensitive & (np.linalg.norm(rest, axis=0) > 1e-7 * rows.norms[new])
     before = r + A0 @ solved(A0, r)
-    step = solved(rest, before) if q and np.all(distinguishable) else np.zeros(q)
-    after = before + rest @ step
-    minimal_cost = float(after @ after)
-    drop = float(before @ before) - minimal_cost
-    covariance, freedom, p = np.full((q, q), np.nan), None, 1.0
-    if np.all(distinguishable):
-        p = f_test(drop, q, minimal_cost, degrees_of_freedom - q, correlation)
-    if q and np.all(distinguishable):
-        T, m, n = *rows.data.shape[:2], A.shape[1]
-        of_priors, by_trial = A[T * m :].T @ A[T * m :], rows.data[np.any(rows.data, axis=(1, 2))]
-        clustered = None
-        # With three trials and slow errors, the F test accepted 11 % of null candidates at a level of 5 %. This test
-        # accepted 3 %.
-        if len(by_trial) >= FEWEST_TRIALS_OF_A_TEST:
-            A_t = by_trial[:, :, [*base, *new]]
-            left = by_trial[:, :, -1] + A_t @ solved(A, r)
-            places = np.tile(np.arange(n), (len(A_t), 1))
-            scores = np.einsum("tmi,tm->ti", A_t, left)
-            clustered = jackknife(Clusters(A_t.mT @ A_t, scores, places, of_priors), np.eye(n)[-q:])
-        if clustered is not None and np.all(clustered.leverage <= LARGEST_LEVERAGE):
-            covariance, freedom, _ = clustered
-            p = wald_test(step, covariance.diagonal(), freedom)
-        elif degrees_of_freedom > q:
-            variance = minimal_cost / (degrees_of_freedom - q) / effective_sample_fraction(correlation)
-            size = np.linalg.norm(A, axis=0)
-            inverse = np.linalg.pinv((A / size).T @ (A / size), rcond=1e-14) / np.outer(size, size)
-            covariance = formal_covariance(inverse, of_priors, variance)[-q:, -q:]
-            if clustered is not None and correlation > 0:
-                p = 1.0  # one trial alone does not show the scatter between trials
-    return Score(step, covariance, freedom, drop, minimal_cost, p, sensitive, distinguishable)
+    cost = float(before @ before)
+    if not q or not np.all(distinguishable):
+        return Score(np.zeros(q), np.full((q, q), np.nan), None, 0.0, cost, 1.0, sensitive, distinguishable)
+    step = solved(rest, before)
+    minimal_cost = float(np.sum((before + rest @ step) ** 2))
+    p = f_test(cost - minimal_cost, q, minimal_cost, degrees_of_freedom - q, correlation)
+    covariance, freedom, clustered = np.full((q, q), np.nan), None, None
+    T, m, n = *rows.data.shape[:2], A.shape[1]
+    of_priors, by_trial = A[T * m :].T @ A[T * m :], rows.data[np.any(rows.data, axis=(1, 2))]
+    # With three trials and slow errors, the F test accepted 11 % of null candidates at a level of 5 %. This test
+    # accepted 3 %.
+    if len(by_trial) >= FEWEST_TRIALS_OF_A_TEST:
+        A_t = by_trial[:, :, [*base, *new]]
+        left = by_trial[:, :, -1] + A_t @ solved(A, r)
+        places = np.tile(np.arange(n), (len(A_t), 1))
+        scores = np.einsum("tmi,tm->ti", A_t, left)
+        clustered = jackknife(Clusters(A_t.mT @ A_t, scores, places, of_priors), np.eye(n)[-q:])
+    if clustered is not None and np.all(clustered.leverage <= LARGEST_LEVERAGE):
+        covariance, freedom, _ = clustered
+        p = wald_test(step, covariance.diagonal(), freedom)
+    elif degrees_of_freedom > q:
+        variance = minimal_cost / (degrees_of_freedom - q) / effective_sample_fraction(correlation)
+        size = np.linalg.norm(A, axis=0)
+        inverse = np.linalg.pinv((A / size).T @ (A / size), rcond=1e-14) / np.outer(size, size)
+        covariance = formal_covariance(inverse, of_priors, variance)[-q:, -q:]
+        if clustered is not None and correlation > 0:
+            p = 1.0  # one trial alone does not show the scatter between trials
+    return Score(step, covariance, freedom, cost - minimal_cost, minimal_cost, p, sensitive, distinguishable)

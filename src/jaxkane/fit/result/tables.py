@@ -279,8 +279,8 @@ def _versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in ("jaxkane", "jax", "diffrax")}
 
 
+# Largest relative difference of the cost that `load` accepts if the code has changed since the fit was saved.
 SAME_COST = 1e-6
-"""Largest relative difference of the cost that `load` accepts if the code has changed since the fit was saved."""
 
 
 def read_fit(path: Path, problem: Problem) -> dict[str, Any]:
