@@ -308,7 +308,7 @@ def prior_information(
     return information, determined, number, float(squares + np.sum(of_nuisance[:, :, -1] ** 2))
 
 
-def intervals(parameters: Parameters, x: Array, half: np.ndarray) -> dict[str, tuple[float, float]]:
+def intervals(parameters: Parameters, x: Array | np.ndarray, half: np.ndarray) -> dict[str, tuple[float, float]]:
     """By name, intervals with the half-widths `half` (p,) around every parameter, truncated at its bounds."""
     values = np.asarray(parameters.values(x))
     ends = np.clip([values - half, values + half], *np.expand_dims(parameters.bounds.T, 1))

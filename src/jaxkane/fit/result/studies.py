@@ -207,7 +207,7 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
     data do not determine, and if no fit with the parameter fixed converges.
     """
     refuse_other(fit, Fit, "profile", "profile(fit(...), name)")
-    refuse_unknown([name], fit.names, "profile: there is no free parameter", "the free parameters are")
+    refuse_unknown([str(name)], fit.names, "profile: `name`: there is no free parameter", "the free parameters are")
     whole_number(n, 3, "profile: `n`")
     span = None if span is None else positive_number(span, "profile: `span`")
     refuse_unless_at_a_minimum(fit.status, "profile")
