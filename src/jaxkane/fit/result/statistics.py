@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-from jaxtyping import Array
 from scipy import stats
 
 from ..._common.lookup import real_number
@@ -308,8 +307,8 @@ def prior_information(
     return information, determined, number, float(squares + np.sum(of_nuisance[:, :, -1] ** 2))
 
 
-def intervals(parameters: Parameters, x: Array | np.ndarray, half: np.ndarray) -> dict[str, tuple[float, float]]:
-    """By name, intervals with the half-widths `half` (p,) around every parameter, truncated at its bounds."""
+def intervals(parameters: Parameters, x: Any, half: np.ndarray) -> dict[str, tuple[float, float]]:
+    """By name, intervals with the half-widths `half` (p,) around the parameters at x (p,), truncated at the bounds."""
     values = np.asarray(parameters.values(x))
     ends = np.clip([values - half, values + half], *np.expand_dims(parameters.bounds.T, 1))
     return {name: (float(low), float(high)) for name, low, high in zip(parameters.names, *ends, strict=True)}
