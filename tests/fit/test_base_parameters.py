@@ -186,7 +186,7 @@ def test_invalid_samples_are_rejected():
         base_parameters(truth, KinematicSamples(at.t, at.q[:, :1], at.u, at.u_dot))
     with pytest.raises(ValueError, match="no input or state named torque3"):
         base_parameters(truth, KinematicSamples(at.t, at.q, at.u, at.u_dot, {"torque3": 0.0}))
-    with pytest.raises(ValueError, match="of rate2 is missing or not positive"):
+    with pytest.raises(ValueError, match="`sigma` of rate2 must be"):
         base_parameters(truth, at, sigma={"rate1": 0.1})
     nothing = np.zeros((60, 2))
     with pytest.raises(ValueError, match="nothing moves, and no load acts"):

@@ -34,9 +34,9 @@ from jaxkane.fit import (
 )
 from jaxkane.fit.extend.candidates import augmented_problem, checked_terms, compatible_groups
 from jaxkane.fit.problem import problem as problem_module
-from jaxkane.fit.result.comparison import energy_sources
 from jaxkane.fit.result.linearized import LinearizedProblem, score_test, solved
 from jaxkane.fit.result.statistics import serial_correlation
+from jaxkane.fit.result.studies import energy_sources
 
 TS = np.linspace(0.0, 2.0, 41)
 NOISE = {"angle": 0.004, "rate": 0.02}
@@ -293,8 +293,8 @@ def test_selection_with_one_trial(rubbing):
             "`plausible` contains unknown names: dyr",
             marks=pytest.mark.weekly,
         ),
-        (("dry",), {"plausible": {"damping": (1.0, 0.0)}}, "must be less than the upper end"),
-        (("dry",), {"plausible": {"dry": 0.2}}, "a relative deviation must be positive, and needs an initial guess"),
+        (("dry",), {"plausible": {"damping": (1.0, 0.0)}}, "lower < upper"),
+        (("dry",), {"plausible": {"dry": 0.2}}, "an initial guess other than zero; got 0.2"),
         (("dry",), {"level": 0.0}, "`level` must be a probability"),
         (("dry",), {"depth": 0}, "`depth` must be an integer of at least 1"),
         (("dry",), {"beam": 0}, "`beam` must be an integer of at least 1"),

@@ -82,7 +82,7 @@ def test_invalid_optimizer_options_are_rejected():
         with pytest.raises(ValueError, match=rf"`steps` must be an integer.*{steps}"):
             minimize(problem, LeastSquares(), steps=steps)
     for n in (0, -1):
-        with pytest.raises(ValueError, match=rf"`n`, the number of initial guesses, must be at least one, got {n}"):
+        with pytest.raises(ValueError, match=f"number of initial guesses, must be an integer of at least 1, got {n}"):
             multi_start(problem, n)
     with pytest.raises(ValueError, match="`spread`, the distance of the guesses"):
         multi_start(problem, 2, spread=-1.0)

@@ -16,7 +16,6 @@ from jaxkane.fit import (
     fit,
     load,
 )
-from jaxkane.fit.result.posterior import laplace
 
 TIGHT = 1e-6
 T = np.linspace(0.0, 2.0, 21)
@@ -83,7 +82,7 @@ def test_a_measured_sum_and_a_joint_prior_equal_least_squares_rows(trial):
     np.testing.assert_allclose(joint.covariance, B @ (v * N + P) @ B, rtol=TIGHT)
     assert joint.cost == pytest.approx(np.sum((A @ best - trial.measured["x"] / 0.05) ** 2)
                                        + np.sum((rows @ best - L @ [0.2, 1.0]) ** 2), rel=1e-9)  # fmt: skip
-    assert "No evidence" in laplace(joint).message
+    assert "No evidence" in joint.laplace().message
     # The priors of parameters are not part of the likelihood.
     square, each = np.sum((A @ best - trial.measured["x"] / 0.05) ** 2), np.log(0.05 * np.sqrt(2 * np.pi))
     assert joint.marginal_likelihood() == pytest.approx(-square / 2 - T.size * each, rel=1e-9)

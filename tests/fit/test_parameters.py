@@ -30,7 +30,7 @@ from jaxkane.fit import (
 )
 from jaxkane.fit.problem.from_declarations import parameters_of
 from jaxkane.fit.problem.parameters import Interval, log_gaussian_mass
-from jaxkane.fit.result.comparison import plausible_of
+from jaxkane.fit.result.diagnostics import plausible_of
 
 
 class Springs(eqx.Module):

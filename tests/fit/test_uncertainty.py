@@ -145,7 +145,7 @@ def test_the_profile_interval_of_a_nearly_linear_problem(result):
     width = high - low
     assert likelihood.interval == pytest.approx((low, high), abs=0.1 * width)
     assert likelihood.costs.min() == pytest.approx(result.cost, rel=1e-4)
-    with pytest.raises(ValueError, match="gravity is not a free parameter"):
+    with pytest.raises(ValueError, match="no free parameter gravity; the free parameters are"):
         profile(result, "gravity")
 
 

@@ -142,3 +142,13 @@ def positive_number(value: Any, what: str) -> float:
     number = real_number(value, what)
     refuse_if(not 0.0 < number < float("inf"), f"{what} must be positive, got {value!r}.")
     return number
+
+
+def whole_number(value: Any, least: int, what: str) -> int:
+    """One integer that is not smaller than `least`.
+
+    **Raises:** `ValueError` for all other values, such as booleans and floats.
+    """
+    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
+        raise ValueError(f"{what} must be an integer of at least {least}, got {value!r}.")
+    return int(value)

@@ -27,8 +27,6 @@ from .problem.model import Simulation as Simulation
 from .problem.problem import Problem as Problem
 from .problem.trial import Trial as Trial
 from .problem.trial import check_records as check_records
-from .result.comparison import compare as compare
-from .result.comparison import compare_estimates as compare_estimates
 from .result.design import design as design
 from .result.fit_result import Fit as Fit
 from .result.fit_result import load as load
@@ -39,6 +37,8 @@ from .result.studies import bootstrap as bootstrap
 from .result.studies import check_signs as check_signs
 from .result.studies import multi_start as multi_start
 from .result.studies import profile as profile
+from .result.validation import compare as compare
+from .result.validation import compare_estimates as compare_estimates
 from .result.validation import cross_validate as cross_validate
 from .result.validation import predict as predict
 from .result.validation import validate as validate

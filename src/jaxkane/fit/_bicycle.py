@@ -23,8 +23,6 @@ from .solve.fit import solve
 from .solve.optimizers import GradientDescent, Optimizer
 
 WHEEL = "rear_wheel_rate"
-SIGMA = {"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0.2}
-"""Default standard deviations of the channels of a ride [rad, rad/s]."""
 
 
 @with_options
@@ -110,7 +108,8 @@ def bicycle_problem(
     channels = tuple(dict.fromkeys(name for ride in rides for name in ride.measured))
     names = parameters_of(bicycle, free, options.get("noise"), channels, rides).names
     if isinstance(priors, (str, os.PathLike)):
-        priors = bicycle_priors(priors)
+        values, deviations = read_bicycle_file(priors)
+        priors = {name: (values[name], deviation) for name, deviation in deviations.items() if deviation > 0}
     if "rR" in names and any("speed" in ride.initial for ride in rides):
         raise ValueError(
             "`free` contains rR, so the speed of a ride does not determine the rate of the rear wheel. Pass "
@@ -140,23 +139,17 @@ def bicycle_rides(rides: Sequence[Trial] | Trial, bicycle: WhippleBicycle) -> tu
 
     **Raises:** `ValueError` for a ride without a speed.
     """
-    rides = as_trials(rides)
-    return tuple(_with_wheel_rate(ride, bicycle) for ride in rides)
-
-
-def bicycle_priors(path: str | os.PathLike[str]) -> dict[str, Prior]:
-    """Read priors from a text file of BicycleParameters.
-
-    Values without a standard deviation are ignored, because their accuracy is not given.
-
-    **Arguments:**
-
-    - `path`: the path of the file.
-
-    **Returns:** by name, (value, standard deviation).
-    """
-    values, deviations = read_bicycle_file(path)
-    return {name: (values[name], deviation) for name, deviation in deviations.items() if deviation > 0}
+    converted = []
+    for ride in as_trials(rides):
+        initial: dict[str, Any] = dict(ride.initial)
+        if "speed" in initial:
+            initial[WHEEL] = -initial.pop("speed") / float(bicycle.rR)
+        elif WHEEL not in initial and WHEEL not in ride.measured:
+            raise ValueError(
+                f"{ride.name}: the speed is missing. Pass Trial(..., initial={{'speed': v}}) [m/s], or measure {WHEEL}."
+            )
+        converted.append(ride.with_initial_state(initial))
+    return tuple(converted)
 
 
 def frame_inertia(part: str, **more: Any) -> Inertia:
@@ -178,15 +171,3 @@ def frame_inertia(part: str, **more: Any) -> Inertia:
     moments, center = (f"I{part}xx", f"I{part}yy", f"I{part}zz"), (f"x{part}", None, f"z{part}")
     products = (None, f"I{part}xz", None)
     return Inertia(moments, products, mass=f"m{part}", center=center, **{"fixed": (f"m{part}",), **more})
-
-
-def _with_wheel_rate(ride: Trial, bicycle: WhippleBicycle) -> Trial:
-    initial: dict[str, Any] = dict(ride.initial)
-    if "speed" in initial:
-        initial["rear_wheel_rate"] = -initial.pop("speed") / float(bicycle.rR)
-    elif "rear_wheel_rate" not in initial and "rear_wheel_rate" not in ride.measured:
-        raise ValueError(
-            f"{ride.name}: the speed is missing. Pass Trial(..., initial={{'speed': v}}) [m/s], or measure "
-            "rear_wheel_rate."
-        )
-    return ride.with_initial_state(initial)

@@ -298,7 +298,7 @@ class CollocationFit:
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Confidence intervals by name, truncated at the bounds of the parameters."""
         half_widths = t_quantile(level, np.inf) * np.array([*self.standard_errors.values()])
-        return dict(zip(self.names, intervals(self.parameters, jnp.asarray(self._theta), half_widths), strict=True))
+        return intervals(self.parameters, self._theta, half_widths)
 
     @functools.cached_property
     def _at_samples(self) -> list[tuple[Trial, dict[str, np.ndarray], dict[str, np.ndarray]]]:

@@ -14,8 +14,7 @@ import numpy as np
 from ..._scalarjit.compat import on_device
 from ..problem.model import Unknowns
 from ..problem.problem import Problem
-from ..result.comparison import Plausible
-from ..result.diagnostics import AT_A_MINIMUM
+from ..result.diagnostics import AT_A_MINIMUM, Plausible
 from ..result.fit_result import Fit
 from ..result.linearized import LinearizedProblem, Score, linearized_problem, score_test
 from ..result.statistics import serial_correlation

@@ -14,12 +14,12 @@ from ..._common.lookup import refuse_unknown
 from ..problem.from_declarations import parameters_of
 from ..problem.specification import refuse_other
 from ..problem.trial import refuse
-from ..result.comparison import Plausible, energy_sources, plausible_of
-from ..result.diagnostics import refuse_unless_at_a_minimum
+from ..result.diagnostics import Plausible, plausible_of, refuse_unless_at_a_minimum
 from ..result.fit_result import Fit
+from ..result.linearized import trial_folds
 from ..result.statistics import check_level
+from ..result.studies import energy_sources
 from ..result.tables import Rows, Tables, html_tables, text_tables
-from ..result.validation import trial_folds
 from ..solve.fit import solve
 from ..solve.optimizers import LeastSquares
 from .candidates import (

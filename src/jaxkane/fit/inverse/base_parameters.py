@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._common.lookup import refuse_unknown
+from ..._common.lookup import positive_number, refuse_unknown
 from ..._kane.consistent_state import assemble
 from ..._kane.constraint_residuals import has_configuration_constraints
 from ..._kane.regressor import Bodies
@@ -21,6 +21,7 @@ from ..._system.parameters import leaf_name
 from ..._system.system import System
 from ..result.identifiability import combination
 from ..result.statistics import Clusters, infinite_along, jackknife
+from ..result.tables import text_table
 from .kinematics import KinematicSamples, Motions, kinematic_samples
 from .regressor import Names, Regressor, RegressorSpec, check_linear, input_names, regressor_spec
 
@@ -80,27 +81,21 @@ class BaseParameters:
         """Base parameters (b,) of parameters (p,)."""
         return self.matrix @ np.asarray(values)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         b, p = len(self.places), len(self.names)
         only = ". Only their ratios can be determined, because no known force acts" if self.ratios_only else ""
         estimated = bool(np.isfinite(self.estimates).any())
+        errors = ["(fixed)" if i == self.fixed else f"+- {error:.2g}" for i, error in enumerate(self.deviations)]
+        columns = [self.texts, [f"{x:.5g}" for x in self.of(self.values)], self.base_units]
+        columns += [[f"{x:.5g}" for x in self.estimates], errors] if estimated else []
         lines = [f"{b} base parameters of {p} parameters{only}. Rank{' of these data' * estimated}: {self.count}"]
-        width = max((len(text) for text in self.texts), default=0)
-        now = self.of(self.values)
-        for i, (text, unit) in enumerate(zip(self.texts, self.base_units, strict=True)):
-            number = f"{now[i]:12.5g}"
-            if estimated:
-                error = "(fixed)" if i == self.fixed else f"+- {self.deviations[i]:.2g}"
-                number += f"  {self.estimates[i]:12.5g}  {error}"
-            lines.append(f"{text:<{width}}  {number} {unit}".rstrip())
+        lines += [text_table([*zip(*columns, strict=True)], left=(0, 2, 4))] if b else []
         if self.without_influence:
             lines.append(f"without influence: {', '.join(self.without_influence)}")
         lines += [f"not determined by these data: {text}" for text in self.undetermined]
         if estimated:
             lines.append(f"unexplained: {100 * self.unexplained:.3g} % of the equations' size")
         return "\n".join(lines)
-
-    __repr__ = __str__
 
 
 def base_parameters(
@@ -135,29 +130,25 @@ def base_parameters(
 
     **Raises:** `ValueError` in the cases of `regressor`, and for trajectories without accelerations.
     """
-    if isinstance(system, Regressor):
-        return _of_regressor(system, sigma, flat)
-    spec = regressor_spec(system, bodies, parameters)
-    check_linear(spec, np.zeros((), jnp.result_type(float)), None)
-    structure = base_structure(spec)
-    if motions is None:
-        return structure
-    samples = kinematic_samples(system, motions, spacing=spacing)
-    return estimated(structure, system.speeds, *equations_at(spec, samples), sigma, flat)
-
-
-def _of_regressor(regressor: Regressor, sigma: Mapping[str, float] | None, flat: float) -> BaseParameters:
-    n, p = regressor.matrix.shape[-2:]
-    if regressor.matrix.ndim < 3:
+    if not isinstance(system, Regressor):
+        spec = regressor_spec(system, bodies, parameters)
+        check_linear(spec, np.zeros((), jnp.result_type(float)), None)
+        structure = base_structure(spec)
+        if motions is None:
+            return structure
+        samples = kinematic_samples(system, motions, spacing=spacing)
+        return estimated(structure, system.speeds, *equations_at(spec, samples), sigma, flat)
+    n, p = system.matrix.shape[-2:]
+    if system.matrix.ndim < 3:
         raise ValueError(
             "base_parameters: the Regressor contains one instant only. Compute it at many instants: jax.vmap(lambda "
             "t, q, u, u_dot: regressor(system, t, q, u, u_dot))(...)."
         )
-    Y, tau = np.asarray(regressor.matrix).reshape(-1, n, p), np.asarray(regressor.forces).reshape(-1, n)
+    Y, tau = np.asarray(system.matrix).reshape(-1, n, p), np.asarray(system.forces).reshape(-1, n)
     finite = _finite(Y, tau)
-    Y, tau, values = Y[finite], tau[finite], np.asarray(regressor.values).reshape(-1, p)[0]
-    structure = _structure(regressor.names, regressor.units, values, Y, tau)
-    return estimated(structure, regressor.speeds, Y, tau, np.zeros(len(Y), int), sigma, flat)
+    Y, tau, values = Y[finite], tau[finite], np.asarray(system.values).reshape(-1, p)[0]
+    structure = _structure(system.names, system.units, values, Y, tau)
+    return estimated(structure, system.speeds, Y, tau, np.zeros(len(Y), int), sigma, flat)
 
 
 # ---- the equations at samples of trajectories
@@ -182,7 +173,7 @@ def equations_at(spec: RegressorSpec, samples: KinematicSamples) -> tuple[np.nda
 
 @jit
 def _equations(spec, t, q, u, inputs, u_dot):
-    rows = jax.vmap(spec.at)(t, q, u, inputs, u_dot)
+    rows, _ = jax.vmap(spec.at)(t, q, u, inputs, u_dot)
     return rows.matrix, rows.forces
 
 
@@ -245,8 +236,8 @@ def states_for(spec: RegressorSpec) -> KinematicSamples:
 # ---- which combinations are determined
 
 
+# Order of a body's parameters. If columns are linearly dependent, the earliest parameter leads the combination.
 _ORDER = ("Ixx", "Ixy", "Ixz", "Iyz", "Izz", "mx", "my", "mz", "Iacross", "Iyy", "m")
-"""Order of a body's parameters. If columns are linearly dependent, the earliest parameter leads the combination."""
 
 
 def base_structure(spec: RegressorSpec) -> BaseParameters:
@@ -270,18 +261,22 @@ def _structure(
     # length and mass.
     forces = norms * np.abs(values)
     sensitive = (norms > eps**0.75 * norms.max(initial=0.0)) | (forces > eps**0.75 * forces.max(initial=0.0))
-    bodies = list(dict.fromkeys(name.rpartition(".")[0] for name in names))
-
-    def priority(i: int) -> tuple[int, int]:
-        """Bodies in their order and their parameters in that of `_ORDER`. All other parameters come last."""
-        body, _, last = names[i].rpartition(".")
-        return (bodies.index(body), _ORDER.index(last)) if last in _ORDER else (len(names), i)
-
-    order = sorted(np.flatnonzero(sensitive).tolist(), key=priority)
-    places = _independent(W / np.where(sensitive, norms, 1.0), order, eps**0.5)
+    parts = [name.rpartition(".")[::2] for name in names]
+    bodies = [body for body, _ in parts]
+    # Bodies in their order, and their parameters in that of `_ORDER`. All other parameters come last.
+    ranks = [
+        (bodies.index(body), _ORDER.index(last)) if last in _ORDER else (len(names), i)
+        for i, (body, last) in enumerate(parts)
+    ]
+    places: list[int] = []
+    for i in sorted(np.flatnonzero(sensitive).tolist(), key=ranks.__getitem__):
+        known, column = W[:, places] / norms[places], W[:, i] / norms[i]
+        rest = column - known @ np.linalg.lstsq(known, column, rcond=None)[0]
+        if np.linalg.norm(rest) > eps**0.5:  # linearly independent of the previous columns
+            places.append(i)
     B, b = np.zeros((len(places), len(names))), len(places)
     if places:
-        rest = [i for i in order if i not in places]
+        rest = [i for i in np.flatnonzero(sensitive).tolist() if i not in places]
         beta = np.linalg.lstsq(W[:, places] / norms[places], W[:, rest] / norms[rest], rcond=None)[0]
         beta = np.where(np.abs(beta) > eps**0.5, beta, 0.0)
         B[:, rest] = beta * norms[rest] / norms[places][:, None]
@@ -307,20 +302,6 @@ def _structure(
     )
 
 
-def _independent(W: np.ndarray, order: Sequence[int], tolerance: float) -> list[int]:
-    """Places of the columns that are linearly independent of the previous ones in this order (Gram-Schmidt)."""
-    Q, places = np.zeros((len(W), 0)), []
-    for i in order:
-        rest = W[:, i]
-        for _ in range(2):  # orthogonalizing twice suffices against rounding errors
-            rest = rest - Q @ (Q.T @ rest)
-        size = np.linalg.norm(rest)
-        if size > tolerance:
-            Q = np.column_stack([Q, rest / size])
-            places.append(i)
-    return places
-
-
 def _text(names: Sequence[str], row: np.ndarray, place: int, factors: Sequence[str]) -> str:
     """A base parameter as text, such as `link1.Izz + 0.04 link2.m`."""
     words = [names[place]]
@@ -338,8 +319,8 @@ def _texts_with_lengths(structure: BaseParameters, spec: RegressorSpec, states: 
     if not rest:
         return structure.texts
     B = matrix[:, rest]
-    # The power of a parameter in each factor, from a change of the parameter by 10 %.
-    powers_of: list[tuple[str, float, np.ndarray]] = []
+    # By name of a parameter, its value and its power in each factor, from a change of the parameter by 10 %.
+    powers: dict[str, tuple[float, np.ndarray]] = {}
     with_path, tree = jax.tree_util.tree_flatten_with_path(spec.system)
     leaves = [leaf for _, leaf in with_path]
     for k, (path, leaf) in enumerate(with_path):
@@ -349,35 +330,28 @@ def _texts_with_lengths(structure: BaseParameters, spec: RegressorSpec, states: 
         W = equations_at(spec.of(changed), states)[0].reshape(-1, len(structure.names))
         changed_B = np.linalg.lstsq(W[:, places], W[:, rest], rcond=None)[0]
         with np.errstate(divide="ignore", invalid="ignore"):
-            powers = np.where(B != 0.0, np.log(changed_B / B) / np.log(1.1), 0.0)
-        if np.any(np.abs(powers) > 1e-5) or not np.all(np.isfinite(powers)):
-            powers_of.append((leaf_name(path), float(leaf), powers))
+            power = np.where(B != 0.0, np.log(changed_B / B) / np.log(1.1), 0.0)
+        if not np.all(np.abs(power) <= 1e-5):
+            powers[leaf_name(path)] = abs(float(leaf)), power
+
+    def factor(j: int, c: int) -> str:
+        """A factor such as `2 L1^2 L2`. A number if a power is not an integer or the number in front is not simple."""
+        each = {name: (value, power[j, c]) for name, (value, power) in powers.items()}
+        if all(np.isfinite(power) and abs(power - np.rint(power)) <= 1e-4 for _, power in each.values()):
+            size = abs(B[j, c]) / np.prod([value ** np.rint(power) for value, power in each.values()])
+            simple = [f"{x:g}" * (x != 1) for x in (1.0, 2.0, 0.5, 0.25, 4.0) if abs(size - x) < 1e-6 * x]
+            words = [name if round(n) == 1 else f"{name}^{round(n)}" for name, (_, n) in each.items() if round(n)]
+            if words and simple:
+                return " ".join([*filter(None, simple), *words])
+        return f"{abs(B[j, c]):.4g}"
+
     texts = []
     for j, place in enumerate(places):
         factors = [f"{abs(x):.4g}" for x in matrix[j]]
         for c in np.flatnonzero(B[j]).tolist():
-            product = _product(abs(B[j, c]), [(name, value, powers[j, c]) for name, value, powers in powers_of])
-            factors[rest[c]] = product or factors[rest[c]]
+            factors[rest[c]] = factor(j, c)
         texts.append(_text(structure.names, matrix[j], place, factors))
     return tuple(texts)
-
-
-def _product(size: float, powers: Sequence[tuple[str, float, float]]) -> str:
-    """A factor as text, such as `2 L1^2 L2`. Empty if a power is not an integer or the numerical factor is not a simple
-    one.
-    """
-    words = []
-    for name, value, power in powers:
-        whole = round(power) if np.isfinite(power) else 0
-        if not np.isfinite(power) or abs(power - whole) > 1e-4:
-            return ""
-        if whole:
-            words.append(name if whole == 1 else f"{name}^{whole}")
-            size /= abs(value) ** whole
-    near = [number for number in (1.0, 2.0, 0.5, 0.25, 4.0) if abs(size - number) < 1e-6 * number]
-    if not words or not near:
-        return ""
-    return " ".join([f"{near[0]:g}"] * (near[0] != 1.0) + words)
 
 
 # ---- estimates by least squares of the equation error
@@ -401,11 +375,6 @@ def estimated(
 
     The unknowns z are scaled deviations from the base parameters b0 of the system: b = b0 + scale z, A z = rest.
     """
-    if sigma is not None:
-        refuse_unknown(sigma, speeds, "`sigma` contains unknown speeds:", "the independent speeds are")
-        bad = [name for name in speeds if name not in sigma or not sigma[name] > 0]
-        if bad:
-            raise ValueError(f"`sigma` of {', '.join(bad)} is missing or not positive. Pass a number for every speed.")
     W: Any = Y[:, :, list(structure.places)].astype(float)  # (N,n,b)
     b0, b = structure.of(structure.values), W.shape[2]
     size = np.sqrt(np.mean((np.abs(W) @ np.abs(b0)) ** 2, axis=0)) + np.abs(tau).max(axis=0)  # (n,)
@@ -423,7 +392,10 @@ def estimated(
     free = [j for j in range(b) if j != fixed]
     A, rest = W[:, :, free] * scale[free], tau.astype(float) - W @ b0  # (N,n,m) (N,n)
 
-    deviation: Any = np.array([sigma[name] for name in speeds]) if sigma else np.ones(len(speeds))
+    deviation: Any = np.ones(len(speeds))
+    if sigma is not None:
+        refuse_unknown(sigma, speeds, "`sigma` contains unknown speeds:", "the independent speeds are")
+        deviation = np.array([positive_number(sigma.get(name), f"`sigma` of {name}") for name in speeds])
     s, V, z = _least_squares(A / deviation[:, None], rest / deviation)
     degrees_of_freedom = rest.size - int(np.sum(s > 0))
     if not sigma and degrees_of_freedom <= 0:
@@ -462,11 +434,9 @@ def estimated(
 def _least_squares(A: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Singular values (m,), zero if they are rounding errors, a row (m, m) for each, and the solution z (m,)."""
     m = A.shape[2]
-    rows = np.column_stack([A.reshape(-1, m), rest.ravel()])
-    R = np.linalg.qr(np.vstack([rows, np.zeros((m + 1, m + 1))]), mode="r")
-    U, s, V = np.linalg.svd(R[:, :m])
+    U, s, V = np.linalg.svd(np.vstack([A.reshape(-1, m), np.zeros((m, m))]), full_matrices=False)
     known = s > _ROUNDING * s.max(initial=0.0)
-    z = V[known].T @ ((U.T @ R[:, m])[:m][known] / s[known])
+    z = V[known].T @ ((U[: rest.size].T @ rest.ravel())[known] / s[known])
     return np.where(known, s, 0.0), V, z
 
 

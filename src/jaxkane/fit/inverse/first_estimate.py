@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,6 +21,7 @@ from ..problem.from_declarations import parameters_of
 from ..problem.parameters import Parameters
 from ..problem.trial import Trial
 from ..result.diagnostics import describe_bodies
+from ..result.tables import text_table
 from .base_parameters import BaseParameters, base_structure, equations_at, estimated, states_for
 from .kinematics import Motions, kinematic_samples, max_spacing
 from .regressor import RegressorSpec, check_linear
@@ -59,19 +61,10 @@ class FirstEstimate:
     def ok(self) -> bool:
         return self.distance <= 3.0 and not self.infeasibility
 
-    def __str__(self) -> str:
-        width = max(map(len, self.values))
-        lines = [f"{'':<{width}}         start      estimate"]
-        lines += [f"{name:<{width}}  {self.starts[name]:12.5g}  {x:12.5g}" for name, x in self.values.items()]
-        lines += [
-            *self.bodies,
-            "",
-            str(self.base),
-            f"the nearest feasible bodies are {self.distance:.2g} standard deviations from these",
-        ]
-        return "\n".join([*lines, *[self.infeasibility] * bool(self.infeasibility)])
-
-    __repr__ = __str__
+    def __repr__(self) -> str:
+        rows = [("", "start", "estimate"), *((n, f"{self.starts[n]:.5g}", f"{x:.5g}") for n, x in self.values.items())]
+        nearest = f"the nearest feasible bodies are {self.distance:.2g} standard deviations from these"
+        return "\n".join([text_table(rows), *self.bodies, "", str(self.base), nearest, self.infeasibility]).rstrip()
 
 
 def first_estimate(
@@ -113,7 +106,17 @@ def first_estimate(
     """
     parameters = parameters_of(system, free)
     spec = _regressor_spec(system, parameters)
-    _check_linear(spec, parameters)
+    states = states_for(spec)
+    Y, _, _ = equations_at(spec, states)
+    for i, name in enumerate(parameters.names):
+        x = 0.3 * jnp.eye(len(parameters.names), dtype=parameters.start.dtype)[i]
+        after, _, _ = equations_at(spec.of(parameters.apply(system, x)[0]), states)
+        if after.shape != Y.shape or np.abs(after - Y).max() > 1e-6 * np.abs(Y).max():
+            raise ValueError(
+                f"{type(system).__name__}: the equations of motion are not linear in {name}, which changes lengths, "
+                "positions or inputs. Omit it here, and free it in the fit."
+            )
+    check_linear(spec, np.zeros((), jnp.result_type(float)), None)
     base, spacing = _best_estimate(spec, motions, sigma, spacing)
     x, feasible, distance = _projection(spec, parameters, base)
     result, values = parameters.apply(system, x)[0], np.asarray(parameters.values(x))
@@ -168,25 +171,6 @@ def _regressor_spec(system: System, parameters: Parameters) -> RegressorSpec:
     return RegressorSpec(regressor_model(system, bodies), tuple(places), tuple(names), tuple(units))
 
 
-def _check_linear(spec: RegressorSpec, parameters: Parameters) -> None:
-    """Reject free parameters that change the columns, because they affect the geometry and not only the inertia of
-    bodies.
-    """
-    states = states_for(spec)
-    Y, _, _ = equations_at(spec, states)
-    for i, name in enumerate(parameters.names):
-        x = np.zeros(len(parameters.names))
-        x[i] = 0.3
-        changed, _ = parameters.apply(spec.system, jnp.asarray(x, parameters.start.dtype))
-        after, _, _ = equations_at(spec.of(changed), states)
-        if after.shape != Y.shape or np.abs(after - Y).max() > 1e-6 * np.abs(Y).max():
-            raise ValueError(
-                f"{type(spec.system).__name__}: the equations of motion are not linear in {name}, which changes "
-                "lengths, positions or inputs. Omit it here, and free it in the fit."
-            )
-    check_linear(spec, np.zeros((), jnp.result_type(float)), None)
-
-
 def _best_estimate(
     spec: RegressorSpec, motions: Motions, sigma: Mapping[str, float] | None, spacing: float | None
 ) -> tuple[BaseParameters, float]:
@@ -226,28 +210,24 @@ def _projection(
         row = np.zeros(len(base.places))
         row[base.fixed] = 10.0 * np.sqrt(max(eigenvalues.max(initial=0.0), 1e-300))
         root = np.vstack([root, row])
-    # `least_squares` calls `residuals` and `slopes` at the same x. Both come from one evaluation.
-    memory: dict[bytes, Any] = {}
 
-    def evaluate(x: np.ndarray) -> Any:
-        if x.tobytes() not in memory:
-            memory.clear()
-            at = jnp.asarray(x, parameters.start.dtype)
-            memory[x.tobytes()] = jax.device_get(_values_with_slopes(spec, parameters, at))
-        return memory[x.tobytes()]
+    @functools.lru_cache(1)  # `least_squares` calls `residuals` and `slopes` at the same x
+    def evaluate(x: bytes) -> Any:
+        at = jnp.asarray(np.frombuffer(x), parameters.start.dtype)
+        return jax.device_get(_values_with_slopes(spec, parameters, at))
 
     def residuals(x: Any) -> np.ndarray:
-        values, priors = evaluate(x)[0]
+        values, priors = evaluate(x.tobytes())[0]
         return np.concatenate([root @ (base.of(values) - base.estimates), _PULL * x, priors])
 
     def slopes(x: Any) -> np.ndarray:
-        values, priors = evaluate(x)[1]
+        values, priors = evaluate(x.tobytes())[1]
         return np.vstack([root @ base.matrix @ values, _PULL * np.eye(len(x)), priors])
 
     jac: Any = slopes
     x = least_squares(residuals, np.zeros(len(parameters.names)), jac, method="trf", x_scale=1.0, max_nfev=200).x
     distance = float(np.linalg.norm(residuals(x)[: len(root)]))
-    return jnp.asarray(x, parameters.start.dtype), base.of(evaluate(x)[0][0]), distance
+    return jnp.asarray(x, parameters.start.dtype), base.of(evaluate(x.tobytes())[0][0]), distance
 
 
 @jit

@@ -34,16 +34,11 @@ def _speeds_and_rates(system, t, q, q_dot, q_ddot):
     zero = jnp.zeros(len(system.speeds), q.dtype)
 
     def speeds(t, q, q_dot):
+        slopes = jax.jacfwd(lambda u: coordinate_rates(system, t, q, u))(zero)
+        return jnp.linalg.pinv(slopes) @ (q_dot - coordinate_rates(system, t, q, zero))
 
-        def rates(u):
-            return coordinate_rates(system, t, q, u)
-
-        return jnp.linalg.pinv(jax.jacfwd(rates)(zero)) @ (q_dot - rates(zero))
-
-    def along(t, q, q_dot, q_ddot):
-        return jax.jvp(speeds, (t, q, q_dot), (jnp.ones_like(t), q_dot, q_ddot))
-
-    return jax.vmap(along)(t, q, q_dot, q_ddot)
+    one = jnp.ones_like(t)
+    return jax.vmap(lambda x, x_dot: jax.jvp(speeds, x, x_dot))((t, q, q_dot), (one, q_dot, q_ddot))
 
 
 def max_spacing(trial: Trial, channels: Mapping[str, np.ndarray]) -> float:
@@ -64,11 +59,7 @@ def spline(trial: Trial, name: str, y: np.ndarray, spacing: float) -> Any:
     """The least-squares spline with knots of this spacing. Knots without measurements between them are left out."""
     finite = np.isfinite(y)
     t, y = trial.t[finite], y[finite]
-    if len(t) < 3 * (DEGREE + 1):
-        raise ValueError(
-            f"{trial.name}: {name} has {len(t)} samples. Accelerations need at least {3 * (DEGREE + 1)}. Omit this "
-            "trial."
-        )
+    _refuse_few(f"{trial.name}: {name} has {len(t)} samples", len(t), "Omit this trial")
     weights = None if name not in trial.sigma else 1.0 / trial.sigma[name][finite]
     n = max(1, round((t[-1] - t[0]) / spacing))
     inner, last = [], 0
@@ -83,25 +74,9 @@ def spline(trial: Trial, name: str, y: np.ndarray, spacing: float) -> Any:
     return make_lsq_spline(t, y, knots, DEGREE, w=weights)
 
 
-def _check_unwrapped(system: System, trial: Trial) -> None:
-    """Reject wrapped angles.
-
-    Only angular coordinates are checked. Rates, inputs and lengths do not wrap, and an impact may change them by 2 pi
-    between two samples.
-
-    **Raises:** `ValueError` for an angle with a discontinuity of a whole turn.
-    """
-    for name in system.coordinates:
-        if name not in trial.measured or system.units.get(name) not in (None, "rad"):
-            continue
-        finite = np.isfinite(trial.measured[name])
-        t, steps = trial.t[finite], np.abs(np.diff(trial.measured[name][finite]))
-        usual = np.median(steps) if steps.size else np.inf
-        if usual < 0.8 and np.any(np.abs(steps - 2 * np.pi) < 0.2 + 2 * usual):
-            raise ValueError(
-                f"{trial.name}: {name} jumps by a whole turn at t = {t[steps.argmax()]:g} s. Make the angle continuous "
-                "with np.unwrap."
-            )
+def _refuse_few(which: str, n: int, remedy: str) -> None:
+    if n < 3 * (DEGREE + 1):
+        raise ValueError(f"{which}. Accelerations need at least {3 * (DEGREE + 1)}. {remedy}.")
 
 
 def covered(t: np.ndarray, channels: Mapping[str, np.ndarray], spacing: float) -> np.ndarray:
@@ -144,20 +119,18 @@ class KinematicSamples:
     trial: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        t = np.asarray(self.t, float)
-        if t.ndim != 1:
-            raise ValueError(f"KinematicSamples: `t` must be times (n,), got the shape {t.shape}.")
+        t, trial = np.asarray(self.t, float), self.trial
+        trial = np.zeros(t.shape, int) if trial is None else np.asarray(trial)
         rows = {name: np.asarray(getattr(self, name), float) for name in ("q", "u", "u_dot")}
         inputs = {name: np.asarray(x, float) for name, x in self.inputs.items()}
         inputs = {name: np.full(t.shape, x) if x.ndim == 0 else x for name, x in inputs.items()}
-        trial = np.zeros(t.shape, int) if self.trial is None else np.asarray(self.trial)
-        wrong = [f"`{k}` {x.shape}" for k, x in rows.items() if x.ndim != 2 or len(x) != len(t)]
-        wrong += [f"`{k}` {x.shape}" for k, x in {"trial": trial, **inputs}.items() if x.shape != t.shape]
+        wrong = [f"`{k}` {x.shape}" for k, x in rows.items() if x.ndim != 2 or x.shape[:1] != t.shape]
+        wrong += [f"`{k}` {x.shape}" for k, x in {"t": t, "trial": trial, **inputs}.items() if x.shape != (t.size,)]
         if wrong or rows["u"].shape != rows["u_dot"].shape:
+            shapes = ", ".join(wrong or [f"`{k}` {rows[k].shape}" for k in ("u", "u_dot")])
             raise ValueError(
-                f"KinematicSamples: with {len(t)} times, `q`, `u` and `u_dot` need a row for each time, and `inputs` "
-                "and `trial` a number for each time; got "
-                f"{', '.join(wrong) or 'u ' + str(rows['u'].shape) + ', u_dot ' + str(rows['u_dot'].shape)}."
+                f"KinematicSamples: with {t.size} times (n,), `q`, `u` and `u_dot` need a row for each time, and "
+                f"`inputs` and `trial` a number for each time; got {shapes}."
             )
         columns = np.column_stack([t, *rows.values(), *inputs.values()])
         finite = np.all(np.isfinite(columns), axis=1)
@@ -166,8 +139,7 @@ class KinematicSamples:
                 "KinematicSamples: every instant contains a number that is not finite. Pass at least one instant at "
                 "which all numbers are finite."
             )
-        keep = {"t": t, **rows, "trial": trial}
-        for name, x in keep.items():
+        for name, x in {"t": t, **rows, "trial": trial}.items():
             object.__setattr__(self, name, x[finite])
         object.__setattr__(self, "inputs", {name: x[finite] for name, x in inputs.items()})
 
@@ -202,9 +174,14 @@ def kinematic_samples(system: System, motions: Motions, *, spacing: float | None
     trajectory that is too short.
     """
     motions = as_trajectory(motions)
-    if isinstance(motions, (KinematicSamples, Trial, Trajectory)):
-        motions = [motions]
-    parts = [_of_one(system, motion, spacing) for motion in motions]
+    parts: list[KinematicSamples] = []
+    for motion in [motions] if isinstance(motions, (KinematicSamples, Trial, Trajectory)) else motions:
+        one = as_trajectory(motion)
+        if not isinstance(one, (KinematicSamples, Trial, Trajectory)):
+            found = type(motion).__name__
+            raise TypeError(f"`motions` must contain only Trial, Trajectory or KinematicSamples, got {found}.")
+        one = _of_trajectory(system, one) if isinstance(one, Trajectory) else one
+        parts.append(_of_trial(system, one, spacing) if isinstance(one, Trial) else one)
     if not parts:
         raise ValueError("`motions` is empty. Pass a Trial, a Trajectory, or KinematicSamples.")
     n_q, n_u, known = len(system.coordinates), len(system.speeds), (*system.inputs, *system.states)
@@ -229,17 +206,6 @@ def kinematic_samples(system: System, motions: Motions, *, spacing: float | None
     return KinematicSamples(**joined, inputs=inputs, trial=np.unique(pairs, axis=0, return_inverse=True)[1].ravel())
 
 
-def _of_one(system: System, motion: Any, spacing: float | None) -> KinematicSamples:
-    motion = as_trajectory(motion)
-    if isinstance(motion, KinematicSamples):
-        return motion
-    if isinstance(motion, Trajectory):
-        return _of_trajectory(system, motion)
-    if isinstance(motion, Trial):
-        return _of_trial(system, motion, spacing)
-    raise TypeError(f"`motions` must contain only Trial, Trajectory or KinematicSamples, got {type(motion).__name__}.")
-
-
 def _of_trajectory(system: System, ride: Trajectory) -> KinematicSamples:
     """Samples of a trajectory, with accelerations from a spline through the speeds.
 
@@ -250,10 +216,7 @@ def _of_trajectory(system: System, ride: Trajectory) -> KinematicSamples:
         raise ValueError("The trajectory is a batch. Pass its members one by one, or use KinematicSamples.")
     t, q, u = (np.asarray(x) for x in (ride.t, ride.q, ride.u))
     there = np.all(np.isfinite(np.column_stack([t, q, u])), axis=1)
-    if there.sum() < 3 * (DEGREE + 1):
-        raise ValueError(
-            f"The trajectory has {there.sum()} times. Accelerations need at least {3 * (DEGREE + 1)}. Save more times."
-        )
+    _refuse_few(f"The trajectory has {there.sum()} times", int(there.sum()), "Save more times")
     u_dot = np.full(u.shape, np.nan)
     u_dot[there] = make_interp_spline(t[there], u[there], DEGREE)(t[there], 1)
     u_dot[np.flatnonzero(there)[[*range(3), *range(-3, 0)]]] = np.nan  # splines are inaccurate at the ends
@@ -270,20 +233,26 @@ def _of_trial(system: System, trial: Trial, spacing: float | None) -> KinematicS
             "`jaxkane.fit.inverse.kinematics.KinematicSamples(t, q, u, u_dot, inputs)` instead of the trial."
         )
     refuse_unknown(trial.inputs, system.inputs, f"{trial.name}: {type(system).__name__} has no input named", "it has")
-    _check_unwrapped(system, trial)
+    for name in system.coordinates:
+        # Only angular coordinates wrap. An impact may change a rate or a length by 2 pi between two samples.
+        finite = np.isfinite(trial.measured[name]) & (system.units.get(name) in (None, "rad"))
+        t, steps = trial.t[finite], np.abs(np.diff(trial.measured[name][finite]))
+        usual = np.median(steps) if steps.size else np.inf
+        if usual < 0.8 and np.any(np.abs(steps - 2 * np.pi) < 0.2 + 2 * usual):
+            raise ValueError(
+                f"{trial.name}: {name} jumps by a whole turn at t = {t[steps.argmax()]:g} s. Make the angle continuous "
+                "with np.unwrap."
+            )
     if spacing is None:
         spacing = max_spacing(trial, channels)
     splines = {name: spline(trial, name, y, spacing) for name, y in channels.items()}
     inputs = {name: spline(trial, name, y, spacing)(trial.t) for name, y in trial.inputs.items()}
     inputs |= {name: splines[name](trial.t) for name in system.states if name in splines}
 
-    def at(order):
-        return np.column_stack([splines[name](trial.t, order) for name in system.coordinates])
-
-    q, q_dot, q_ddot = at(0), at(1), at(2)
-    u, u_dot = (np.array(x) for x in _speeds_and_rates(system, *map(jnp.asarray, (trial.t, q, q_dot, q_ddot))))
+    x = [np.column_stack([splines[name](trial.t, order) for name in system.coordinates]) for order in range(3)]
+    u, u_dot = (np.array(y) for y in _speeds_and_rates(system, *map(jnp.asarray, (trial.t, *x))))
     for i, name in enumerate(system.speeds):
         if name in splines:
             u[:, i], u_dot[:, i] = splines[name](trial.t), splines[name](trial.t, 1)
     u_dot[~covered(trial.t, channels, spacing)] = np.nan
-    return KinematicSamples(trial.t, q, u, u_dot, inputs)
+    return KinematicSamples(trial.t, x[0], u, u_dot, inputs)

@@ -91,38 +91,30 @@ class RegressorSpec(eqx.Module):
         """The same specification for a system with other values."""
         return eqx.tree_at(lambda spec: spec.model.system, self, system)
 
+    def own(self, dtype: Any) -> Array:
+        """The values of the parameters that belong to no body."""
+        leaves = jax.tree.leaves(self.system)
+        entries = [jnp.ravel(leaves[leaf])[place].astype(dtype) for leaf, place in self.places]
+        return jnp.stack(entries) if entries else jnp.zeros(0, dtype)
+
     def values(self, t: Array, q: Array) -> Array:
         """The values of the parameters. They do not depend on time and coordinates."""
         n = len(self.system.speeds) + len(self.system.dependent_speeds)
-        of_bodies = parameter_values(self.model, t, q, jnp.zeros(n, q.dtype))
-        return jnp.concatenate([of_bodies, self.own().astype(q.dtype)])
+        return jnp.concatenate([parameter_values(self.model, t, q, jnp.zeros(n, q.dtype)), self.own(q.dtype)])
 
-    def own(self) -> Array:
-        """The values of the parameters that belong to no body."""
-        leaves = jax.tree.leaves(self.system)
-        entries = [jnp.ravel(leaves[leaf])[place] for leaf, place in self.places]
-        return jnp.stack(entries) if entries else jnp.zeros(0, jnp.result_type(float))
-
-    def with_values(self, values: Array) -> System:
-        """The system with other values of the parameters that belong to no body."""
-        leaves, structure = jax.tree.flatten(self.system)
-        for i, (leaf, place) in enumerate(self.places):
-            flat = jnp.ravel(leaves[leaf]).at[place].set(values[i].astype(leaves[leaf].dtype))
-            leaves[leaf] = flat.reshape(leaves[leaf].shape)
-        return jax.tree.unflatten(structure, leaves)
-
-    def at(self, t: Array, q: Array, u: Array, inputs: Mapping[str, Array], u_dot: Array) -> Regressor:
-        return self.with_kinematics(t, q, u, inputs, u_dot)[0]
-
-    def with_kinematics(
+    def at(
         self, t: Array, q: Array, u: Array, inputs: Mapping[str, Array], u_dot: Array
     ) -> tuple[Regressor, RegressorKinematics]:
-        parts = self.model.bodies
-        kinematics, own = regressor_kinematics(self.model, t, q, u, inputs, u_dot), self.own().astype(q.dtype)
+        parts, leaves, structure = self.model.bodies, *jax.tree.flatten(self.system)
+        kinematics, own = regressor_kinematics(self.model, t, q, u, inputs, u_dot), self.own(q.dtype)
         Y, values = regressor_columns(kinematics, parts), self.values(t, q)
 
         def along(own):
-            return unbalanced(self.with_values(own), t, q, u, inputs, u_dot)
+            changed = list(leaves)
+            for x, (leaf, place) in zip(own, self.places, strict=True):
+                flat = jnp.ravel(changed[leaf]).at[place].set(x.astype(changed[leaf].dtype))
+                changed[leaf] = flat.reshape(changed[leaf].shape)
+            return unbalanced(jax.tree.unflatten(structure, changed), t, q, u, inputs, u_dot)
 
         if self.places:
             Y = jnp.concatenate([Y, jax.jacfwd(along)(own)], axis=1)
@@ -162,7 +154,7 @@ def regressor_spec(system: System, bodies: Bodies, parameters: Names) -> Regress
 
 @jit
 def regressor_at(spec: RegressorSpec, t, q, u, inputs, u_dot):
-    return spec.with_kinematics(t, q, u, inputs, u_dot)
+    return spec.at(t, q, u, inputs, u_dot)
 
 
 # ---- whether the equations are linear in the parameters that have columns
@@ -179,132 +171,107 @@ def check_linear(spec: RegressorSpec, t: Any, q: Any) -> None:
     if _CHECKED.known(key, False):
         return
 
-    def value(x):
-        # A value that is only differentiated can be made concrete with stop_gradient; a traced one cannot.
-        return jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x
-
-    system, t, q = jax.tree.map(value, (spec.system, t, q))
+    # A value that is only differentiated can be made concrete with stop_gradient; a traced one cannot.
+    at = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x, (spec.system, t, q))
     with concretely():
-        _CHECKED.keep(key, _Linearity(spec, system, t, q).check())
+        _CHECKED.keep(key, _is_checked(spec, *at))
 
 
-class _Linearity:
-    """Evaluates the equations at a random state and changes one parameter after another."""
+def _is_checked(spec: RegressorSpec, system: System, t: Any, q: Any) -> bool:
+    """Check all parameters at a random state by changing one number of the system after another.
 
-    def __init__(self, spec: RegressorSpec, system: System, t: Any, q: Any):
-        rng = np.random.default_rng(0)
-        self.system, t, q = at_random_point((system, t, q), rng)
-        self.name = type(system).__name__
-        # Include all parameters of the named bodies, because the fixed ones may depend on the same numbers.
-        every = regressor_model(system, [part.name for part in spec.model.bodies])
-        self.spec = eqx.tree_at(lambda s: s.model, spec, every)
-        self.columns = np.array([name in spec.names for name in self.spec.names], bool)
-        self.of_bodies = np.arange(len(self.columns)) < len(self.columns) - len(spec.places)
-        dtype = q.dtype
-        q = (np.nan_to_num(q) + rng.uniform(-0.1, 0.1, q.shape)).astype(dtype)  # avoid zero, a frequent special case
-        n = len(system.speeds)
-        rows = [jnp.asarray(rng.uniform(0.5, 1.5, n) * rng.choice((-1.0, 1.0), n), dtype) for _ in range(2)]
-        inputs = {name: jnp.asarray(0.7, dtype) for name in input_names(system)}
-        self.state = jnp.asarray(t, dtype), jnp.asarray(q), rows[0], inputs, rows[1]
-        self.tolerance = float(jnp.finfo(dtype).eps) ** 0.5
+    **Returns:** whether all numbers were finite, so that the check was possible.
+    """
+    rng = np.random.default_rng(0)
+    system, t, q = at_random_point((system, t, q), rng)
+    # Include all parameters of the named bodies, because the fixed ones may depend on the same numbers.
+    every = eqx.tree_at(lambda s: s.model, spec, regressor_model(system, [part.name for part in spec.model.bodies]))
+    has_column = np.array([name in spec.names for name in every.names], bool)
+    of_bodies = np.arange(len(has_column)) < len(has_column) - len(spec.places)
+    q = (np.nan_to_num(q) + rng.uniform(-0.1, 0.1, q.shape)).astype(q.dtype)  # avoid zero, a frequent special case
+    n = len(system.speeds)
+    u, u_dot = (jnp.asarray(rng.uniform(0.5, 1.5, n) * rng.choice((-1.0, 1.0), n), q.dtype) for _ in range(2))
+    inputs = {name: jnp.asarray(0.7, q.dtype) for name in input_names(system)}
+    state, tolerance = (jnp.asarray(t, q.dtype), jnp.asarray(q), u, inputs, u_dot), float(jnp.finfo(q.dtype).eps) ** 0.5
 
-    def evaluate(self, system: System) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        equations, k = jax.device_get(regressor_at(self.spec.of(system), *self.state))
-        Y, values, tau, known = equations.matrix, equations.values, equations.forces, ~self.columns
+    def evaluate(system: System) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        equations, k = jax.device_get(regressor_at(every.of(system), *state))
+        Y, values, tau = equations.matrix, equations.values, equations.forces
         pieces = {
             "Y": Y,
             "tau": tau,
-            "pi": values[self.of_bodies],
-            "own": values[self.columns & self.of_bodies],
-            "right": tau - Y[:, known] @ values[known],
-            "of bodies": Y[:, self.of_bodies],
+            "pi": values[of_bodies],
+            "own": values[has_column & of_bodies],
+            "right": tau - Y[:, ~has_column] @ values[~has_column],
+            "of bodies": Y[:, of_bodies],
             "moving": np.concatenate([x.ravel() for x in (k.V, k.W, k.a, k.alpha, k.omega)]),
         }
         return pieces, k.g
 
-    def check(self) -> bool:
-        """Check all parameters.
-
-        **Returns:** whether all numbers were finite, so that the check was possible.
-        """
-        pieces, g = self.evaluate(self.system)
-        if not all(np.all(np.isfinite(x)) for x in pieces.values()):
-            return False
-        self._check_weights(g)
-        for path, is_own, changes in self._changes(pieces):
-            if is_own:
-                self._check_own(leaf_name(path), changes)
-            elif "pi" in changes and "moving" not in changes:
-                self._check_of_body(leaf_name(path), changes)
-        return True
-
-    def _changes(self, pieces: Mapping[str, np.ndarray]) -> Iterator[tuple[Any, bool, set[str]]]:
-        """The quantities that change with each number of the system. Numbers that belong to no body come first."""
-        with_path, structure = jax.tree_util.tree_flatten_with_path(self.system)
-        leaves = [leaf for _, leaf in with_path]
-        size = np.abs(pieces["Y"]).max() + np.abs(pieces["tau"]).max()
-        own = list(self.spec.places)
-        every = [(i, place) for i, leaf in enumerate(leaves) for place in range(np.size(leaf))]
-        for i, place in [*own, *(one for one in every if one not in own)]:
-            path, leaf = with_path[i]
-            changed = np.array(leaf)
-            changed.flat[place] = 1.3 * changed.flat[place] + (0.1 if changed.flat[place] >= 0 else -0.1)
-            system = jax.tree.unflatten(structure, [*leaves[:i], jnp.asarray(changed), *leaves[i + 1 :]])
-            after, _ = self.evaluate(system)
-            changes = {k for k, x in pieces.items() if self._differs(after[k], x, size * (k in ("tau", "right")))}
-            yield path, (i, place) in own, changes | ({"mass"} if i in self.spec.model.leaves else set())
-
-    def _differs(self, x: np.ndarray, y: np.ndarray, size: float) -> bool:
+    def differs(x: np.ndarray, y: np.ndarray, size: float) -> bool:
         """Whether a number, or a column of a matrix, has changed by more than rounding errors."""
-        if not x.size:
-            return False
-        own = np.abs(y).max(axis=0) if y.ndim == 2 else np.abs(y)
-        size = np.maximum(size, own + 1e-6 * np.abs(y).max())
-        return not bool(np.all(np.abs(x - y) <= self.tolerance * size))
+        own = np.abs(y).max(axis=0, initial=0.0) if y.ndim == 2 else np.abs(y)
+        return bool(np.any(~(np.abs(x - y) <= tolerance * np.maximum(size, own + 1e-6 * np.abs(y).max(initial=0.0)))))
 
-    def _check_own(self, parameter: str, changes: set[str]) -> None:
-        if "own" in changes:
-            raise ValueError(
-                f"{self.name}: {parameter} is a parameter of a body in `bodies`, for which there already are columns. "
-                "Omit it from `parameters`, or omit the body from `bodies`."
-            )
-        if changes & {"Y", "right"}:
-            raise ValueError(
-                f"{self.name}: the equations of motion are not linear in {parameter}, because its column or the "
-                "right-hand side changes with its value. If two parameters are multiplied, such as a stiffness and a "
-                "rest angle, name only one of them."
-            )
-
-    def _check_of_body(self, parameter: str, changes: set[str]) -> None:
-        if "of bodies" in changes:
-            raise ValueError(
-                f"{self.name}: the weight per mass depends on {parameter}, a parameter of the position of a mass "
-                "centre. If gravity is not uniform, the equations are not linear in the first moment of a body. Omit "
-                "the body from `bodies`."
-            )
-        # The right side may depend on lengths, but not on masses.
-        if "mass" not in changes or not changes & {"Y", "tau"}:
-            return
+    pieces, g = evaluate(system)
+    if not all(np.all(np.isfinite(x)) for x in pieces.values()):
+        return False
+    weightless = ~np.any(g != 0, axis=1)
+    lone = [part.name for part, none in zip(spec.model.bodies, weightless, strict=True)
+            if none and part.has_constant_mass]  # fmt: skip
+    # The weight of a body whose mass is a plain number may also be one, like other loads.
+    if lone and not weightless.all():
         raise ValueError(
-            f"{self.name}: {parameter} changes the parameters of a body, and also loads other than its weight. The "
-            "right-hand side would then depend on the unknown parameters. Write weights as jk.weight(motion, "
-            "gravity). Use separate parameters for other loads, such as friction that is proportional to the mass, or "
-            "omit the body from `bodies`."
+            f"{type(system).__name__}: no weight was found for {', '.join(lone)}, whose mass is a constant in the "
+            "code, although other bodies have a weight. Use jk.weight(motion, gravity), or omit the body from `bodies`."
+        )
+    with_path, structure = jax.tree_util.tree_flatten_with_path(system)
+    leaves, size = [leaf for _, leaf in with_path], np.abs(pieces["Y"]).max() + np.abs(pieces["tau"]).max()
+    places = [(i, place) for i, leaf in enumerate(leaves) for place in range(np.size(leaf))]
+    for i, place in dict.fromkeys([*spec.places, *places]):  # numbers that belong to no body come first
+        changed = np.array(leaves[i])
+        changed.flat[place] = 1.3 * changed.flat[place] + (0.1 if changed.flat[place] >= 0 else -0.1)
+        after, _ = evaluate(jax.tree.unflatten(structure, [*leaves[:i], jnp.asarray(changed), *leaves[i + 1 :]]))
+        changes = {k for k, x in pieces.items() if differs(after[k], x, size * (k in ("tau", "right")))}
+        parameter = leaf_name(with_path[i][0])
+        refusals = iter(())
+        if (i, place) in spec.places:
+            refusals = _refusals_of_own(parameter, changes)
+        elif "pi" in changes and "moving" not in changes:
+            refusals = _refusals_of_body(parameter, changes, i in spec.model.leaves)
+        for reason in refusals:
+            raise ValueError(f"{type(system).__name__}: {reason}")
+    return True
+
+
+def _refusals_of_own(parameter: str, changes: set[str]) -> Iterator[str]:
+    if "own" in changes:
+        yield (
+            f"{parameter} is a parameter of a body in `bodies`, for which there already are columns. Omit it from "
+            "`parameters`, or omit the body from `bodies`."
+        )
+    if changes & {"Y", "right"}:
+        yield (
+            f"the equations of motion are not linear in {parameter}, because its column or the right-hand side changes "
+            "with its value. If two parameters are multiplied, such as a stiffness and a rest angle, name only one of "
+            "them."
         )
 
-    def _check_weights(self, g: np.ndarray) -> None:
-        """Reject bodies without a weight whose mass is a plain number, if other bodies have a weight.
 
-        Their weight may also be a plain number, which cannot be distinguished from other loads.
-        """
-        weightless = ~np.any(g != 0, axis=1)
-        lone = [part.name for part, none in zip(self.spec.model.bodies, weightless, strict=True)
-                if none and part.has_constant_mass]  # fmt: skip
-        if lone and not weightless.all():
-            raise ValueError(
-                f"{self.name}: no weight was found for {', '.join(lone)}, whose mass is a constant in the code, "
-                "although other bodies have a weight. Use jk.weight(motion, gravity), or omit the body from `bodies`."
-            )
+def _refusals_of_body(parameter: str, changes: set[str], changes_mass: bool) -> Iterator[str]:
+    if "of bodies" in changes:
+        yield (
+            f"the weight per mass depends on {parameter}, a parameter of the position of a mass centre. If gravity is "
+            "not uniform, the equations are not linear in the first moment of a body. Omit the body from `bodies`."
+        )
+    # The right side may depend on lengths, but not on masses.
+    if changes_mass and changes & {"Y", "tau"}:
+        yield (
+            f"{parameter} changes the parameters of a body, and also loads other than its weight. The right-hand side "
+            "would then depend on the unknown parameters. Write weights as jk.weight(motion, gravity). Use separate "
+            "parameters for other loads, such as friction that is proportional to the mass, or omit the body from "
+            "`bodies`."
+        )
 
 
 def regressor(

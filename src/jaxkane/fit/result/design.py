@@ -25,6 +25,7 @@ from ..problem.trial import Trial
 from ..problem.windows import Windows, state_names
 from ..solve.linearization import by_next, jacobian_of, map_windows, starts_of
 from .statistics import infinite_along
+from .tables import text_table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,17 +63,14 @@ class Design:
     def correlation(self) -> np.ndarray:
         return _correlation(self.covariance)
 
-    def __str__(self) -> str:
-        lines = [f"{'parameter':<22}{'std. error before':>18}{'after':>12}{'ratio':>8}"]
+    def __repr__(self) -> str:
+        rows = [("parameter", "std. error before", "after", "ratio")]
         for name, after in self.standard_errors.items():
-            lines.append(f"{name:<22}{self.before[name]:>18.3g}{after:>12.3g}{after / self.before[name]:>8.2f}")
-        off_diagonal = ~np.eye(len(self.names), dtype=bool)
-        before, after = (
-            np.abs(_correlation(c)[off_diagonal]).max(initial=0.0) for c in (self.covariance_before, self.covariance)
+            rows.append((name, f"{self.before[name]:.3g}", f"{after:.3g}", f"{after / self.before[name]:.2f}"))
+        largest = (
+            np.abs(np.tril(_correlation(C), -1)).max(initial=0.0) for C in (self.covariance_before, self.covariance)
         )
-        return "\n".join([*lines, f"largest correlation: {before:.3f} before, {after:.3f} after"])
-
-    __repr__ = __str__
+        return "{}\nlargest correlation: {:.3f} before, {:.3f} after".format(text_table(rows), *largest)
 
 
 def _correlation(covariance: np.ndarray) -> np.ndarray:
@@ -131,13 +129,23 @@ def design(
     t = jnp.asarray(t, jnp.result_type(float))
     if criterion not in ("D", "A"):
         raise ValueError(f"design: `criterion` must be 'D' or 'A', got {criterion!r}.")
-    plan = _Plan(t, inputs, dict(rms or {}), dict(sigma), initial)
+
+    def signals(coefficients: Any, t: Array) -> dict[str, Array]:
+        samples = dict(inputs(coefficients, t))
+        for name, size in (rms or {}).items():
+            samples[name] = size * samples[name] / jnp.sqrt(jnp.mean(samples[name] ** 2))
+        return samples
+
+    def planned(coefficients: Any, measured: Mapping[str, Any]) -> Trial:
+        own = {name: np.asarray(x) for name, x in signals(coefficients, t).items()}
+        return Trial(t, measured, own, sigma=sigma, initial=initial, name="plan")
+
     for name in ("noise", "errors"):
         if options.get(name) is not None:
             raise ValueError(
                 f"design: `{name}` is not supported, because a design assumes white normal errors. Omit it."
             )
-    problem = Problem.of(system, plan.trial(coefficients), free, **options)
+    problem = Problem.of(system, planned(coefficients, {name: np.zeros(t.shape) for name in sigma}), free, **options)
     names, about = problem.parameters.names, as_names(about or (), "about")
     refuse_unknown(about, names, "`about` contains unknown names:", "the free parameters are")
     places = np.array([names.index(name) for name in about or names])
@@ -146,58 +154,30 @@ def design(
             "design: all `inputs` are constant at the initial coefficients. Pass inputs that vary, or "
             "`Simulation(step=...)`."
         )
-    objective = objective_of(problem, t, plan.signals, places, criterion, limits or {})
+    objective = objective_of(problem, t, signals, places, criterion, limits or {})
     first, best, history = _minimized(problem, objective, coefficients, steps, rate, progress)
     scales = np.linalg.norm(np.asarray(problem.parameters.slopes(problem.start.parameters)), axis=1)
-    before, after = (covariance_of(np.asarray(x.information)) * np.outer(scales, scales) for x in (first, best))
-    trial = plan.predicted(problem, best)
-    return Design(best.coefficients, trial.inputs, trial, names, after, before, history)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Plan:
-    """A trial that has not been measured yet: its times (n_t,), and the input as a function of coefficients."""
-
-    t: Array
-    inputs: Callable[[Any, Array], Mapping[str, Array]]
-    rms: dict[str, float]
-    sigma: dict[str, float]
-    initial: Mapping[str, Any] | None
-
-    def signals(self, coefficients: Any, t: Array) -> dict[str, Array]:
-        """Samples (n_t,) by name, scaled to their root mean squares."""
-        signals = dict(self.inputs(coefficients, t))
-        for name, size in self.rms.items():
-            signals[name] = size * signals[name] / jnp.sqrt(jnp.mean(signals[name] ** 2))
-        return signals
-
-    def trial(self, coefficients: Any, measured: Mapping[str, Any] | None = None) -> Trial:
-        """The trial. By default all measurements are zero."""
-        inputs = {name: np.asarray(x) for name, x in self.signals(coefficients, self.t).items()}
-        zeros = {name: np.zeros(self.t.shape) for name in self.sigma}
-        return Trial(self.t, measured or zeros, inputs, sigma=self.sigma, initial=self.initial, name="plan")
-
-    def predicted(self, problem: Problem, best: _Iterate) -> Trial:
-        """The trial with the predicted measurements."""
-        rows = _joined(problem, [np.asarray(x) for x in best.simulated])
-        trial = self.trial(best.coefficients, dict(zip(problem.channels, rows, strict=True)))
-        if not problem.model.nuisance.has_defects:
-            return trial
+    before, after = (
+        covariance_of(np.asarray(information)) * np.outer(scales, scales) for _, (information, *_) in (first, best)
+    )
+    coefficients, (_, windows, simulated) = best
+    trial = planned(coefficients, _joined(problem, problem.channels, [*np.asarray(simulated)]))
+    if problem.model.nuisance.has_defects:
         # The initial state of every window is that of the trajectory.
-        rides = dataclasses.replace(problem, windows=best.windows).trajectories(problem.start)
-        states = _joined(problem, [np.concatenate([ride.q, ride.u, ride.x], axis=1).T for ride in rides])
-        return trial.with_initial_state(dict(zip(state_names(problem.system), states, strict=True)))
+        rides = dataclasses.replace(problem, windows=windows).trajectories(problem.start)
+        states = [np.concatenate([ride.q, ride.u, ride.x], axis=1).T for ride in rides]
+        trial = trial.with_initial_state(_joined(problem, state_names(system), states))
+    return Design(coefficients, trial.inputs, trial, names, after, before, history)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Iterate:
-    """One step of the search: the value of the objective and the quantities computed with it (see `Objective`)."""
+def _joined(problem: Problem, names: Sequence[str], of_windows: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """Samples of the whole trial by name, from the rows (m, n_t) of its windows."""
+    pairs = zip(of_windows, problem.slices, strict=True)
+    return dict(zip(names, np.concatenate([rows[:, :n] for rows, (_, _, n) in pairs], axis=1), strict=True))
 
-    value: float
-    coefficients: Any
-    information: Array
-    windows: Windows
-    simulated: Array
+
+# The coefficients of one step of the search, and the quantities computed with them (see `Objective`).
+_Iterate = tuple[Any, tuple[Array, Windows, Array]]
 
 
 def _minimized(
@@ -220,35 +200,28 @@ def _minimized(
 
     adam = optax.adam(optax.cosine_decay_schedule(rate, max(steps, 1), 0.1))
     state, c, history = adam.init(coefficients), coefficients, []
-    first = best = None
+    iterates: list[_Iterate] = []  # the first and the best
     for _ in tqdm(range(steps + 1), disable=not progress, desc="design"):
         value, slope, aux = gradient(c, problem.model, problem.windows)
         if not np.isfinite(float(value)):
             break
-        iterate = _Iterate(float(value), c, *aux)
-        first = first or iterate
-        best = iterate if best is None or iterate.value < best.value else best
-        history.append(iterate.value)
+        if not history or float(value) < min(history):
+            iterates[1:] = [(c, aux)]
+        history.append(float(value))
         with jax.numpy_dtype_promotion("standard"):
             updates, state = adam.update(slope, state, c)
             c = optax.apply_updates(c, updates)
-    if first is None or best is None:
+    if not history:
         raise ValueError(
             "design: with the initial coefficients, the simulation fails or the data have no information about the "
             "parameters. Pass other coefficients."
         )
-    return first, best, tuple(history)
+    return iterates[0], iterates[-1], tuple(history)
 
 
-def _joined(problem: Problem, of_windows: Sequence[np.ndarray]) -> np.ndarray:
-    """Rows (m, n_t) of the whole trial from those of its windows."""
-    pairs = zip(of_windows, problem.slices, strict=True)
-    return np.concatenate([rows[:, :n] for rows, (_, _, n) in pairs], axis=1)
-
-
+# A function of coefficients, model and windows. It returns the objective, and a tuple of the information about the
+# scaled parameters (p, p), the windows, and the predicted measurements (W, n_c, n_t).
 Objective = Callable[[Any, Model, Windows], tuple[Array, tuple[Array, Windows, Array]]]
-"""A function of coefficients, model and windows. It returns the objective, and a tuple of the information about the
-scaled parameters (p, p), the windows, and the predicted measurements (W, n_c, n_t)."""
 
 
 def objective_of(

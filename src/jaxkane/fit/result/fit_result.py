@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,25 +20,19 @@ from ..problem.model import Unknowns
 from ..problem.parameters import Parameters, places_of
 from ..problem.problem import STEP_TOLERANCE, Problem, residual_deviation, step_errors
 from ..problem.specification import refuse_other
-from ..problem.trial import check_records
+from ..problem.trial import trial_names
 from ..solve.linearization import Linearization
 from ..solve.variance_components import degrees_of_freedom
 from . import diagnostics as diagnostics
 from . import statistics as statistics
 from .identifiability import Identifiability, identifiability_at
-from .linearized import folds_of, linearized_problem
-from .posterior import Laplace, laplace, marginal_likelihood
-from .saved_fits import FitState, read_fit, write_fit
-from .smoother import Smoothed, smoothed
-from .statistics import ByTrial, ResidualTest, clusters_of, infinite_along, intervals
-from .tables import costs_in_words, dataframe, dataset, json_text, parameter_rows, text_table
-
-if TYPE_CHECKING:
-    import pandas as pd
+from .linearized import Posterior, linearized_problem, trial_folds
+from .statistics import ByTrial, ResidualTest, infinite_along
+from .tables import Export, costs_in_words, read_fit
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
-class Fit(FitState):
+@dataclasses.dataclass(frozen=True)
+class Fit(Export, Posterior):
     """The result of a fit.
 
     Print it for a table. `jaxkane.fit.report(fit)` returns more, and `jaxkane.fit.save_report(fit, path)` writes a page
@@ -46,7 +40,6 @@ class Fit(FitState):
 
     - `system`: the system with the estimates. `systems`: the same by trial, if parameters differ between trials.
     - `estimates`, `start`: estimates and initial guesses by name, gains and delays included.
-    - `deviations`: standard deviations of the distributions over groups.
     - `standard_errors`: formal standard errors by name, from the inverse of J^T J with the nuisance parameters
         eliminated. The data are weighted by the variance of the residuals, priors by their own standard deviations.
         They are correct if the residuals are independent, the scaled residuals have equal variance, and the model is
@@ -54,20 +47,10 @@ class Fit(FitState):
     - `clustered_errors`: cluster-robust standard errors by name, for residuals that are correlated within a cluster.
         They are computed with a linearized jackknife that leaves out each cluster in turn. `clusters` states the
         cluster unit. NaN without clusters. Infinite for a parameter that one cluster alone determines.
-    - `errors`: the standard errors on which `intervals` are based: clustered, formal or infinite. `error_kinds` states
-        the kind by name.
-    - `intervals(level)`: confidence intervals by name.
     - `correlation` (p, p): correlation of the estimates, in the order of `names`.
     - `cost`: sum of squared residuals. With process noise or `errors`: minus twice the log likelihood.
     - `history`: the cost at the initial guess and after each step.
-    - `aic`, `bic`: information criteria.
-    - `measurement_errors`: by channel, the estimated parameters of the error model (`errors`).
     - `status`, `message`: why the fit ended, as one word and as a sentence.
-    - `held_out_cost`: sum of squares of trials that are left out in turn, linearized at the estimates. Initial states
-        and trial unknowns of a trial that is left out are estimated from that trial. `cross_validate` runs new fits
-        instead. Priors of parameters are used, but their squares are not included. Parameters at a bound are fixed. NaN
-        with one trial, with process noise or `errors`, if the fit has not converged, and if one fold alone determines a
-        parameter.
     - `identifiability`: singular values and directions of the sensitivity, and the combinations of parameters that the
         data do not determine.
     - `residuals`: by trial and channel, (simulated - measured) / sigma (n_t,), NaN in gaps. With process noise: the
@@ -76,13 +59,17 @@ class Fit(FitState):
     - `fitted`: by trial and channel, the simulated measurements (n_t,). With process noise: predictions from all
         earlier measurements.
     - `tests`: by trial and channel, a `ResidualTest`.
-    - `variance_accounted_for`: by channel, over all samples that the fit uses.
-    - `nuisance`: by trial and name, values of the trial unknowns and of the initial states of the windows. With process
-        noise, initial states that have a standard deviation are part of the filter (`smoothed`).
-    - `step_error`: change of the residuals if the integration steps are refined.
     - `failed`: by name, trials that could not be simulated, with the reason. The fit does not contain them.
-    - `notes`: warnings and remarks, as sentences.
     """
+
+    problem: Problem
+    point: Unknowns
+    linearization: Linearization
+    step_errors: np.ndarray  # (W,), see `problem.step_errors`
+    history: tuple[float, ...]
+    status: str
+    method: str
+    failed: Mapping[str, str] = dataclasses.field(default_factory=dict, hash=False)
 
     @classmethod
     def of(
@@ -119,26 +106,24 @@ class Fit(FitState):
         `sigma` is used as it was passed, unless `errors` estimates its scale. Priors are not part of the likelihood.
         Unknowns that the filter integrates out (`noise`) are not counted. NaN with a distribution over groups.
         """
-        return 2 * self._n_maximized - 2 * self._log_likelihood
+        return self._criterion(2.0)
 
     @property
     def bic(self) -> float:
         """The Bayesian information criterion (Schwarz 1978), with the likelihood of `aic`."""
-        n = np.count_nonzero(np.asarray(self.problem.windows.weight) > 0)
-        return self._n_maximized * math.log(n) - 2 * self._log_likelihood
+        return self._criterion(math.log(np.count_nonzero(np.asarray(self.problem.windows.weight) > 0)))
 
-    @property
-    def _n_maximized(self) -> float:
+    def _criterion(self, per_unknown: float) -> float:
+        problem, n = self.problem, self.problem.model.nuisance
         if self.parameters.distributions:  # the cost does not integrate out the groups
             return math.nan
-        n, T = self.problem.model.nuisance, self.problem.clusters  # with process noise each trial is one window
-        known = np.isfinite(np.concatenate([n.start_deviation, n.trial_deviation])).sum()
-        return self.problem.size[1] - (T * int(known) if self.problem.model.noise is not None else 0)
-
-    @property
-    def _log_likelihood(self) -> float:
-        of_nuisance = float(np.sum(statistics.nuisance_prior_rows(self.problem, self.point)[0][:, :, -1] ** 2))
-        return statistics.log_likelihood(self.problem, self.cost - self.linearization.prior_squares - of_nuisance)
+        n_maximized = problem.size[1]
+        if problem.model.noise is not None:  # each trial is one window
+            known = np.isfinite(np.concatenate([n.start_deviation, n.trial_deviation])).sum()
+            n_maximized -= problem.clusters * int(known)
+        of_nuisance = float(np.sum(statistics.nuisance_prior_rows(problem, self.point)[0][:, :, -1] ** 2))
+        squares = self.cost - self.linearization.prior_squares - of_nuisance
+        return per_unknown * n_maximized - 2 * statistics.log_likelihood(problem, squares)
 
     @property
     def measurement_errors(self) -> dict[str, dict[str, float]]:
@@ -242,13 +227,8 @@ class Fit(FitState):
             ending = f"converged: {', '.join(at_bound)} rests at its bound"
         elif self.status == "converged" and not self.identifiability.ok:
             ending = "the cost has converged, but not every parameter is determined"
-        no_freedom = diagnostics.no_degrees_of_freedom(self.problem, self.variance)
-        notes = (*self.identifiability.messages, *no_freedom, *self._coarse_steps)
+        notes = (*self.identifiability.messages, *diagnostics.numerical_limits(self))
         return "; ".join([ending, *(note.rstrip(".") for note in notes)])
-
-    @property
-    def _coarse_steps(self) -> tuple[str, ...]:
-        return (diagnostics.coarse_steps(self.problem, self.step_error),) if self.too_coarse else ()
 
     @property
     def ok(self) -> bool:
@@ -288,10 +268,7 @@ class Fit(FitState):
 
         NaN for a validated fit, because its parameters were estimated from other data (`validate`).
         """
-        return self._of_estimates(self.identifiability.covariance)
-
-    def _of_estimates(self, covariance: np.ndarray) -> np.ndarray:
-        return np.full_like(covariance, np.nan) if self.status == "validated" else covariance
+        return self.identifiability.covariance * (math.nan if self.status == "validated" else 1.0)
 
     @property
     def standard_errors(self) -> dict[str, float]:
@@ -304,7 +281,7 @@ class Fit(FitState):
         Residuals of different clusters are assumed to be independent. The unit is "trial", "window", or "part" (of a
         window). ("", 0) if there are too few clusters.
         """
-        return clusters_of(self.problem, self.linearization)
+        return statistics.clusters_of(self.problem, self.linearization)
 
     @functools.cached_property
     def _jackknife(self) -> statistics.Jackknife:
@@ -325,7 +302,7 @@ class Fit(FitState):
     @property
     def clustered_covariance(self) -> np.ndarray:
         """Covariance (p, p), in the parameters' units, robust to residuals that are correlated within `clusters`."""
-        return self._of_estimates(self._jackknife.covariance)
+        return self._jackknife.covariance * (math.nan if self.status == "validated" else 1.0)
 
     @property
     def clustered_errors(self) -> dict[str, float]:
@@ -364,10 +341,6 @@ class Fit(FitState):
         kind = "none" if self.autocorrelation else "formal"
         return {name: self.clusters[0] if c else kind for name, c in zip(self.names, clustered, strict=True)}
 
-    def _by_kind(self, clustered: Any, formal: Any, none: Any) -> dict[str, float]:
-        pairs = zip(self.error_kinds.values(), np.broadcast_to(clustered, len(self.names)), formal, strict=True)
-        return self._by_name([f if k == "formal" else none if k == "none" else c for k, c, f in pairs])
-
     @property
     def errors(self) -> dict[str, float]:
         """Standard errors by name, used for all intervals.
@@ -375,8 +348,9 @@ class Fit(FitState):
         They are cluster-robust if `uses_clustered_errors`, else formal. If one cluster alone determines a parameter,
         its error is formal if all residuals are white, and infinite otherwise.
         """
+        none = math.nan if self.status == "validated" else math.inf
         formal, clustered = (np.sqrt(C.diagonal()) for C in (self.covariance, self.clustered_covariance))
-        return self._by_kind(clustered, formal, np.nan if self.status == "validated" else np.inf)
+        return self._by_kind(clustered, {"formal": formal, "none": none})
 
     @property
     def degrees_of_freedom(self) -> dict[str, float]:
@@ -388,7 +362,11 @@ class Fit(FitState):
         formal = np.full(len(self.names), self.identifiability.degrees_of_freedom)
         if self.parameters.distributions:
             formal = degrees_of_freedom(self.problem, self.point, self.linearization)
-        return self._by_kind(self._jackknife.degrees_of_freedom, formal, 1.0)
+        return self._by_kind(self._jackknife.degrees_of_freedom, {"formal": formal, "none": 1.0})
+
+    def _by_kind(self, clustered: np.ndarray, other: Mapping[str, Any]) -> dict[str, float]:
+        kinds = np.array([*self.error_kinds.values()], str)
+        return self._by_name(np.select([kinds == kind for kind in other], [*other.values()], clustered))
 
     def half_widths(self, level: float = 0.95) -> np.ndarray:
         """Half-widths of the intervals (p,), in the parameters' units.
@@ -411,8 +389,7 @@ class Fit(FitState):
 
         **Raises:** `ValueError` if `level` is not between 0 and 1.
         """
-        ends = intervals(self.parameters, self.point.parameters, self.half_widths(level))
-        return dict(zip(self.names, ends, strict=True))
+        return statistics.intervals(self.parameters, self.point.parameters, self.half_widths(level))
 
     @property
     def correlation(self) -> np.ndarray:
@@ -471,7 +448,7 @@ class Fit(FitState):
     @property
     def trial_names(self) -> tuple[str, ...]:
         """Names of the trials. Repeated names are numbered."""
-        return statistics.trial_names(self.problem)
+        return trial_names(self.problem.trials)
 
     @property
     def nuisance(self) -> dict[str, dict[str, Any]]:
@@ -495,76 +472,23 @@ class Fit(FitState):
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
         """Warnings and remarks about the fit, as sentences."""
-        problem, mean_squared = self.problem, self.mean_normalized_innovation_squared
-        return (
-            *diagnostics.not_converged(self.status),
-            *(f"{name} is left out: {why}." for name, why in self.failed.items()),
-            *(() if self.status == "validated" else self._notes_on_parameters),
-            *diagnostics.outlier_trials(self.residuals),
-            *diagnostics.correlated_residuals(self.serial_correlation, self.uses_clustered_errors, self.clusters),
-            *(diagnostics.wrong_noise(self.residuals, mean_squared) if problem.model.noise is not None else ()),
-            *(() if problem.model.errors is not None else self._wrong_sigma),
-            *diagnostics.no_degrees_of_freedom(problem, self.variance),
-            *self._coarse_steps,
-            *diagnostics.infeasible_bodies(problem, self.point),
-            *diagnostics.starts_at_zero(problem),
-            *diagnostics.left_out_for_delays(problem),
-            *self._unrecorded_inputs,
-            *check_records(problem.trials),
-            *diagnostics.wrong_units(problem, self.fitted),
-            *diagnostics.poorly_fitted_channels(self.tests, self.variance),
-        )
-
-    @property
-    def _wrong_sigma(self) -> tuple[str, ...]:
-        """Notes on `sigma`. If the scales are estimated (`errors`), `variance` is only the ratio of residuals to
-        degrees of freedom.
-        """
-        freedom = self.identifiability.degrees_of_freedom
-        return tuple(diagnostics.wrong_sigma(self.problem, self.variance, freedom))
-
-    @property
-    def _notes_on_parameters(self) -> tuple[str, ...]:
-        """Notes on the parameters that were fitted."""
-        parameters, identifiability, x = self.parameters, self.identifiability, self.point.parameters
-        coloured = self.autocorrelation > 0
-        follow = [f"{name} = {value:.5g} ± {error:.2g}" for name, (value, error) in self.dependent.items()]
-        return (
-            *filter(None, [identifiability.rank_message]),
-            *identifiability.messages,
-            *diagnostics.determined_by_one(self._jackknife.leverage, self.error_kinds, self.clusters[0]),
-            *diagnostics.correlated_parameters(parameters, self.correlation),
-            *diagnostics.bodies_at_the_boundary(parameters, self.point.parameters),
-            *(diagnostics.far_from_start(parameters, self.start, self.estimates, self.errors) if coloured else ()),
-            *(f"{text} follows from the other parameters." for text in follow),
-            *diagnostics.sums_at_bounds(parameters, x),
-            *diagnostics.equal_groups(self.deviations, self.standard_errors),
-            *diagnostics.few_groups(parameters),
-            *diagnostics.known_by_prior(parameters, identifiability.given_sigma_errors),
-        )
-
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write this fit to one file. `jaxkane.fit.load(path, problem)` reads it.
-
-        The file is written completely or not at all. It contains numbers only.
-
-        **Arguments:**
-
-        - `path`: file to write.
-
-        **Returns:** the path.
-        """
-        return write_fit(Path(path).expanduser(), self)
+        return tuple(diagnostics.notes(self))
 
     @functools.cached_property
     def held_out_cost(self) -> float:
-        """Sum of squares of trials that are left out in turn, linearized at the estimates."""
-        T = len(self.problem.trials)
-        if T < 2 or self.problem.model.has_likelihood or self.status not in diagnostics.AT_A_MINIMUM:
+        """Sum of squares of trials that are left out in turn, linearized at the estimates.
+
+        Initial states and trial unknowns of a trial that is left out are estimated from that trial. `cross_validate`
+        runs new fits instead. Priors of parameters are used, but their squares are not included. Parameters at a bound
+        are fixed. NaN with one trial, with process noise or `errors`, if the fit has not converged, and if one fold
+        alone determines a parameter.
+        """
+        trials = self.problem.trials
+        if len(trials) < 2 or self.problem.model.has_likelihood or self.status not in diagnostics.AT_A_MINIMUM:
             return math.nan
         linearized = linearized_problem(self.linearization)
         free = [i for i, name in enumerate(self.names) if name not in self.identifiability.at_bound]
-        cost = float(np.sum(linearized.costs_left_out(free, folds_of(None, T))))
+        cost = float(np.sum(linearized.costs_left_out(free, trial_folds(None, trials)[0])))
         return cost if math.isfinite(cost) else math.nan
 
     @property
@@ -590,107 +514,12 @@ class Fit(FitState):
         rides = self.problem.trajectories(self.point)
         return [(self.trial_names[k], ride) for (k, _, _), ride in zip(self.problem.slices, rides, strict=True)]
 
-    def smoothed(self) -> dict[str, Smoothed]:
-        """The trajectory of each trial of a fit with process noise, estimated from all measurements of the trial.
-
-        The method is the extended Bryson-Frazier smoother. It is equivalent to the Rauch-Tung-Striebel smoother and
-        does not need the inverse of the covariance. An initial state or an offset without a standard deviation has a
-        diffuse prior. The uncertainty of the parameters is not included.
-
-        **Returns:** by trial, a `Smoothed` with mean and covariance.
-
-        **Raises:** `ValueError` for a fit without process noise. Use `trajectories`.
-        """
-        return smoothed(self)
-
-    def laplace(self) -> Laplace:
-        """The Laplace approximation of the posterior. Nuisance parameters are integrated out, `sigma` is used as it was
-        passed.
-
-            log evidence = log p(measurements | unknowns) + log p(unknowns) + 1/2 log det(2 pi C)
-
-        All terms are evaluated at the minimum. C is the covariance of all unknowns in their own units. `Free.scale` and
-        the initial guess do not affect the result (MacKay, Bayesian interpolation, Neural Computation 4, 1992). The
-        result is exact if the trajectory is linear in all unknowns.
-
-        The prior of a parameter is its Gaussian prior, truncated at its bounds, or uniform between two `bounds`.
-        Without a prior and without two bounds, the prior is improper and the evidence is NaN. Initial states and
-        offsets without a standard deviation have a prior density of one per unit. Compare only models with the same
-        such unknowns, or pass standard deviations.
-
-        **Returns:** a `Laplace`.
-
-        **Raises:** `ValueError` with the names of parameters that the data do not determine, and for a fit that is not
-        at a minimum.
-        """
-        return laplace(self)
-
-    def marginal_likelihood(self) -> float:
-        """The log density of the measurements at the estimates, with initial states and trial unknowns integrated out.
-
-            log p = -1/2 sum of squares + log priors - 1/2 log det (J^T J / 2 pi)
-
-        J is the Jacobian with respect to the initial states of all windows and the trial unknowns. With process noise,
-        the filter computes this density. Both are equal if the trajectory is linear, each window is one sample long,
-        and the `defect_std` of the windows is the process noise of one step. Initial states and offsets without a
-        standard deviation have a prior density of one per unit.
-
-        **Returns:** the log density.
-        """
-        return marginal_likelihood(self)
-
-    def to_pandas(self, level: float = 0.95) -> pd.DataFrame:
-        """A table with one row per parameter.
-
-        **Arguments:**
-
-        - `level`: confidence level of the intervals, between 0 and 1.
-
-        **Returns:** a `pandas.DataFrame` with the columns `unit`, `start`, `estimate`, `error` (from `errors`), `lower`
-        and `upper` (from `intervals(level)`).
-        """
-        return dataframe(self, level)
-
-    def to_xarray(self) -> Any:
-        """Measurements and residuals as an `xarray.Dataset`.
-
-        Requires xarray: `pip install 'jaxkane[xarray]'`.
-
-        **Returns:** a dataset of `measured`, `fitted`, `sigma` and `residual`, each (trial, channel, sample), with the
-        coordinate `t` (trial, sample) [s]. Shorter trials and channels that a trial does not measure are padded with
-        NaN.
-        """
-        return dataset(self)
-
-    def to_json(self) -> str:
-        """The contents of the report as JSON text: estimates, errors, tests, costs, notes, versions.
-
-        NaN becomes null. Infinity becomes the text "Infinity" or "-Infinity", which `float` reads.
-        """
-        return json_text(self)
-
-    def table(self, truth: Mapping[str, float] | System | None = None) -> str:
-        """A text table of the parameters: name, initial guess, estimate, standard error and 95 % interval.
-
-        **Arguments:**
-
-        - `truth`: true values, by name or as a system. If passed, the table contains them and the deviation from them.
-
-        **Returns:** the table.
-
-        **Raises:** `ValueError` for a name in `truth` that is neither free nor a parameter; `TypeError` for a system of
-        another class.
-        """
-        return text_table(parameter_rows(self, truth))
-
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         bodies = diagnostics.describe_bodies(self.parameters, self.point.parameters)
         if (errors := self.problem.model.errors) is not None:
             bodies = [*bodies, errors.described(self.problem.channels)]
         end = f"{self.problem.cost_name} {costs_in_words(self)} by {self.method}"
         return "\n".join([self.title, self.table(), *bodies, f"{end}: {diagnostics.STATUS[self.status]}", *self.notes])
-
-    __repr__ = __str__
 
 
 def load(path: str | os.PathLike[str], problem: Problem) -> Fit:
@@ -714,4 +543,4 @@ def load(path: str | os.PathLike[str], problem: Problem) -> Fit:
     or if the file is damaged; `FileNotFoundError`.
     """
     refuse_other(problem, Problem, "load", "load(path, Problem.of(system, trials, free))")
-    return Fit(**vars(read_fit(Path(path).expanduser(), problem)))
+    return Fit(**read_fit(Path(path).expanduser(), problem))

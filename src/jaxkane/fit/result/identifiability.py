@@ -109,14 +109,9 @@ class Identifiability:
         """Standard errors (p,) with `sigma` as it was passed, independent of the residuals. Infinite for undetermined
         parameters.
         """
-        s = self.singular_values
-        return np.sqrt(self.in_units(np.diag(s[s > 0] ** -2.0)).diagonal())
-
-    def in_units(self, covariance: np.ndarray) -> np.ndarray:
-        """The covariance (p, p) of the parameters from a covariance (k, k) along the determined rows of `vectors`."""
         known = self.singular_values > 0
-        to_units = self.scales[:, None] * self.vectors[known].T
-        return infinite_along(to_units @ covariance @ to_units.T, self.vectors[~known])
+        to_units = self.scales[:, None] * self.vectors[known].T / self.singular_values[known]
+        return np.sqrt(infinite_along(to_units @ to_units.T, self.vectors[~known]).diagonal())
 
     @property
     def rows(self) -> Rows:
@@ -125,10 +120,8 @@ class Identifiability:
         rows = [[combination(self.names, row), f"{s:.4g}", f"{deviation:.2g}"] for row, s, deviation in values]
         return [("direction (scaled parameters)", "singular value", "deviation"), *rows]
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return "\n".join([text_table(self.rows), *filter(None, [self.rank_message]), *self.messages])
-
-    __repr__ = __str__
 
 
 def identifiability(problem: Problem, *, flat: float = 0.5, at: Unknowns | None = None) -> Identifiability:
@@ -190,24 +183,21 @@ def identifiability_at(
     no_influence = before <= 1e4 * eps * most
     s, V = _by_singular_values(A, no_influence, 1e3 * eps * most)
     inverse = (V[s > 0].T / s[s > 0] ** 2) @ V[s > 0]
-    priors = prior_information(problem, point, eliminated)
-    of_priors = to_x.T @ priors.information @ to_x
-    n_data, n_unknown = problem.size[0] - priors.number, problem.size[1]
+    information, determined, n_priors, prior_squares = prior_information(problem, point, eliminated)
+    of_priors = to_x.T @ information @ to_x
+    n_data, n_unknown = problem.size[0] - n_priors, problem.size[1]
     by_parameters = p - np.sum(inverse * of_priors) if fitted else 0.0
-    degrees_of_freedom = n_data - (n_unknown - p) + priors.determined - by_parameters
+    degrees_of_freedom = n_data - (n_unknown - p) + determined - by_parameters
     variance = 1.0
     if sigma == "estimated" and problem.model.noise is None:  # a filter has an absolute noise level
-        variance = (at.squares - priors.squares) / degrees_of_freedom if degrees_of_freedom > 1e-3 else np.nan
+        variance = (at.squares - prior_squares) / degrees_of_freedom if degrees_of_freedom > 1e-3 else np.nan
     # Without a degree of freedom `sigma` cannot be checked and is used as it is.
     along = V @ formal_covariance(inverse, of_priors, 1.0 if np.isnan(variance) else variance) @ V.T
     covariance = formal_covariance(inverse, of_priors, variance) * np.outer(scales, scales)
     # Near a bound the slope of the bijection vanishes. This does not mean that the data are insensitive.
     alone = np.count_nonzero(to_values, axis=1) <= 1
     at_bound = alone & (scales < 1e-3 * np.asarray(parameters.scale))
-
-    def named(which):
-        return tuple(name for name, there in zip(names, which, strict=True) if there)
-
+    beyond, names_of = _beyond(*eliminated.rows, at_bound, variance), np.array(names, str)
     result = Identifiability(
         names=names,
         units=parameters.units,
@@ -215,9 +205,9 @@ def identifiability_at(
         singular_values=s,
         vectors=V,
         deviations=np.where(s > 0, np.sqrt(np.maximum(along.diagonal(), 0.0)), np.inf),
-        without_influence=named(no_influence & ~at_bound),
-        at_bound=named(at_bound),
-        beyond=named(_beyond(*eliminated.rows, at_bound, variance)),
+        without_influence=tuple(names_of[no_influence & ~at_bound].tolist()),
+        at_bound=tuple(names_of[at_bound].tolist()),
+        beyond=tuple(names_of[beyond].tolist()),
         undetermined=(),
         variance=float(variance),
         degrees_of_freedom=float(degrees_of_freedom),
@@ -312,27 +302,25 @@ def _direction(of: Identifiability, i: int, row: np.ndarray) -> Direction:
     s, deviation = of.singular_values[i], of.deviations[i]
     order = [j for j in np.argsort(-np.abs(row), kind="stable") if abs(row[j]) > 0.1]
     parts = tuple((of.names[j], float(row[j])) for j in order)
-    first = parts[0][0]
-    if len(parts) == 1 and first in of.at_bound:
-        text = f"{first} rests at its bound, which the data do not contradict."
-        if first in of.beyond:
-            text = f"{first} is at its bound, and its best value is beyond it. It may compensate for missing physics."
-    elif len(parts) == 1 and first in of.without_influence:
-        text = f"{first} has no influence on these data at these values, so a fit does not change it."
-    elif len(parts) == 1 and s == 0:
-        text = f"{first} cannot be distinguished from unknown initial values and offsets."
-    elif len(parts) == 1:
-        unit = f" {of.units[order[0]]}" * bool(of.units[order[0]])
-        error = deviation * of.scales[order[0]]
-        text = f"{first} is undetermined: its standard deviation is {error:.2g}{unit}, {deviation:.2g} of its scale."
-    else:
-        size = min(deviation, 1.0)
-        together = ", ".join(
-            f"{name} by {share * size * of.scales[j]:+.2g}{' ' * bool(of.units[j])}{of.units[j]}"
-            for j, (name, share) in zip(order, parts, strict=True)
-        )
-        how = "changes nothing" if s == 0 else f"changes the fit by {size / deviation:.2g} standard deviations"
-        text = f"{', '.join(name for name, _ in parts)} trade off: moving {together} together {how}."
+    first, alone, units = parts[0][0], len(parts) == 1, [f" {unit}".rstrip() for unit in of.units]
+    size, error = min(deviation, 1.0), f"{deviation * of.scales[order[0]]:.2g}{units[order[0]]}"
+    changes = [f"{of.names[j]} by {row[j] * size * of.scales[j]:+.2g}{units[j]}" for j in order]
+    how = "changes nothing" if s == 0 else f"changes the fit by {size / deviation:.2g} standard deviations"
+    texts = (
+        (
+            alone and first in of.beyond,
+            f"{first} is at its bound, and its best value is beyond it. It may compensate for missing physics.",
+        ),
+        (alone and first in of.at_bound, f"{first} rests at its bound, which the data do not contradict."),
+        (
+            alone and first in of.without_influence,
+            f"{first} has no influence on these data at these values, so a fit does not change it.",
+        ),
+        (alone and s == 0, f"{first} cannot be distinguished from unknown initial values and offsets."),
+        (alone, f"{first} is undetermined: its standard deviation is {error}, {deviation:.2g} of its scale."),
+        (True, f"{', '.join(n for n, _ in parts)} trade off: moving {', '.join(changes)} together {how}."),
+    )
+    text = next(text for applies, text in texts if applies)
     return Direction(float(s), float(deviation), parts, text)
 
 

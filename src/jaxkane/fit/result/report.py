@@ -137,7 +137,11 @@ class _Section:
         if self.table:
             kind = "stacked" if self.stacked else "wide"
             parts.append(f'<div class="{kind}">{html_table(self.table, self.left)}</div>')
-        parts += [_picture(figure, self.heading) for figure in self.figures()]
+        for figure in self.figures():
+            buffer = io.StringIO()
+            figure.savefig(buffer, format="svg")
+            drawing = buffer.getvalue()[buffer.getvalue().index("<svg") :]
+            parts.append(f'<figure role="img" aria-label="{html.escape(self.heading)}">{drawing}</figure>')
         if self.details:
             table = f'<div class="wide">{html_table(self.details)}</div>'
             parts.append(f"<details><summary>Every trial</summary>{table}</details>")
@@ -145,15 +149,18 @@ class _Section:
 
 
 def _sections(fit: Fit, truth: Any = None, trials: int | None = 6) -> Iterator[_Section]:
-    notes = (*fit.notes, *check_signs(fit))
+    notes, n_c = (*fit.notes, *check_signs(fit)), len(fit.problem.channels)
     fine = () if notes else ("Every parameter is determined, and nothing looks suspicious.",)
     yield _Section("", (fit.title, _ending(fit), *fine), notes)
+    kind = "formal, for independent residuals of equal size"
+    if fit.uses_clustered_errors:
+        kind = f"cluster-robust, by {fit.clusters[0]}"
     estimates = parameter_rows(fit, truth, detailed=True)
     yield _Section(
         "Parameter estimates",
-        [_errors(fit)],
+        [f"Errors and intervals are {kind}, but for those marked otherwise."],
         table=estimates,
-        figures=lambda: [_draw_estimates(fit)],
+        figures=lambda: [_drawn(lambda axes: plot.estimates(fit, start=True, ax=axes), 8, 0.9 + 0.45 * len(fit.names))],
         stacked=True,
     )
     yield _Section("Identifiability", table=fit.identifiability.rows)
@@ -165,12 +172,15 @@ def _sections(fit: Fit, truth: Any = None, trials: int | None = 6) -> Iterator[_
         "Residual analysis",
         table=_channel_rows(fit),
         details=_residual_rows(fit),
-        figures=lambda: [_draw_residuals(fit), _draw_costs(fit)],
+        figures=lambda: [
+            _drawn(lambda axes: _draw_residuals(fit, axes), 9, 1.9 * n_c, n_c, 2, width_ratios=(1, 1.4)),
+            _drawn(lambda axes: plot.costs(fit, ax=axes), 2.4 + 0.9 * n_c, 2.1 + 0.3 * min(len(fit.trial_names), 30)),
+        ],
         stacked=True,
     )
     if fit.problem.model.nuisance.trial:
         yield _Section("Offsets and gains of each trial", table=_bias_rows(fit, brief=True), details=_bias_rows(fit))
-    yield _Section("Settings", table=[("setting", "value"), *_settings(fit)], left=(0, 1))
+    yield _Section("Settings", table=_settings(fit), left=(0, 1))
 
 
 def _sections_of_studies(
@@ -180,7 +190,9 @@ def _sections_of_studies(
     forward_selection: ForwardSelection | None,
 ) -> Iterator[_Section]:
     if profiles:
-        yield _Section("Profile likelihood", figures=lambda: [_draw_profiles(fit, profiles)])
+        n = len(profiles)
+        drawn = _drawn(lambda axes: plot.profiles(fit, profiles, axes=axes), 3.4 * n, 2.6, 1, n)
+        yield _Section("Profile likelihood", figures=lambda: [drawn])
     if cross_validation:
         left_out: Any = cross_validate(fit) if cross_validation is True else cross_validation
         usage = "save_report(fit, path, cross_validation=True)"
@@ -211,31 +223,26 @@ def _ending(fit: Fit) -> str:
     return f"{name[0].upper()}{name[1:]} {costs_in_words(fit)} {how} {size}"
 
 
-def _errors(fit: Fit) -> str:
-    if fit.uses_clustered_errors:
-        return f"Errors and intervals are cluster-robust, by {fit.clusters[0]}, but for those marked otherwise."
-    return "Errors and intervals are formal, for independent residuals of equal size, but for those marked otherwise."
-
-
 def _channel_rows(fit: Fit) -> Rows:
-    rows = []
+    head = ("channel", "variance accounted for", "rms [σ]", "neighbours' correlation", "trials with white residuals")
+    rows: list[Sequence[str]] = [head]
     for channel, share in fit.variance_accounted_for.items():
         tests = [channels[channel] for channels in fit.tests.values() if channel in channels]
-        white, rms = sum(t.is_white for t in tests), np.sqrt(np.nanmean([t.rms**2 for t in tests]))
-        row = [channel, f"{100 * share:.1f} %", f"{rms:.2f}", f"{np.nanmean([t.autocorrelation for t in tests]):.2f}"]
-        rows.append([*row, f"{white} of {len(tests)}"])
-    head = ("channel", "variance accounted for", "rms [σ]", "neighbours' correlation", "trials with white residuals")
-    return [head, *rows]
+        rms, neighbours = np.nanmean([t.rms**2 for t in tests]) ** 0.5, np.nanmean([t.autocorrelation for t in tests])
+        white = f"{sum(t.is_white for t in tests)} of {len(tests)}"
+        rows.append([channel, f"{100 * share:.1f} %", f"{rms:.2f}", f"{neighbours:.2f}", white])
+    return rows
 
 
 def _residual_rows(fit: Fit) -> Rows:
-    rows = []
-    for name, channels in fit.tests.items():
-        for channel, t in channels.items():
-            row = [name, channel, str(t.n), f"{100 * t.variance_accounted_for:.1f} %", f"{t.rms:.2f}", f"{t.mean:+.2f}"]
-            rows.append([*row, f"{t.ljung_box:.2g}", f"{t.runs:.2g}"])
-    head = ("trial", "channel", "samples", "accounted for", "rms [σ]", "mean [σ]", "p, Ljung-Box", "p, runs")
-    return [head, *rows]
+    rows: list[Sequence[str]] = [
+        ("trial", "channel", "samples", "accounted for", "rms [σ]", "mean [σ]", "p, Ljung-Box", "p, runs")
+    ]
+    for name, tests in fit.tests.items():
+        for channel, t in tests.items():
+            sizes = [f"{100 * t.variance_accounted_for:.1f} %", f"{t.rms:.2f}", f"{t.mean:+.2f}"]
+            rows.append([name, channel, str(t.n), *sizes, f"{t.ljung_box:.2g}", f"{t.runs:.2g}"])
+    return rows
 
 
 def _bias_rows(fit: Fit, brief: bool = False) -> Rows:
@@ -246,61 +253,50 @@ def _bias_rows(fit: Fit, brief: bool = False) -> Rows:
     return [["trial", *names], *([name, *(f"{value:.4g}" for value in row)] for name, row in shown.items())]
 
 
-def _settings(fit: Fit) -> Iterator[tuple[str, str]]:
+def _settings(fit: Fit) -> Rows:
     problem, s = fit.problem, fit.problem.model.settings
     steps = np.asarray(problem.windows.step)
     how = f"steps of {steps.min():.3g} to {steps.max():.3g} s" if s.step is not None else f"rtol {float(s.rtol):g}"
-    finer = f"finer: {fit.step_error:.2g} standard deviations"
-    yield "simulation", f"{type(s.solver).__name__}, {how}, {finer}"
     lengths = np.asarray(problem.windows.t[:, -1] - problem.windows.t[:, 0])
     kind = "chained" if problem.model.nuisance.has_defects else "with free starts"
-    yield "windows", f"{len(lengths)} of {lengths.min():.3g} to {lengths.max():.3g} s, {kind}"
-    yield "unknown at their starts", ", ".join(problem.model.nuisance.start) or "nothing"
-    yield "measured", ", ".join(problem.channels)
-    yield "method", fit.method
     packages = ("jaxkane", "jax", "diffrax", "equinox", "numpy")
-    yield "versions", ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
-    yield "machine", f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
-    yield "written", datetime.datetime.now().astimezone().isoformat(timespec="minutes")
+    return [
+        ("setting", "value"),
+        ("simulation", f"{type(s.solver).__name__}, {how}, finer: {fit.step_error:.2g} standard deviations"),
+        ("windows", f"{len(lengths)} of {lengths.min():.3g} to {lengths.max():.3g} s, {kind}"),
+        ("unknown at their starts", ", ".join(problem.model.nuisance.start) or "nothing"),
+        ("measured", ", ".join(problem.channels)),
+        ("method", fit.method),
+        ("versions", ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)),
+        ("machine", f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"),
+        ("written", datetime.datetime.now().astimezone().isoformat(timespec="minutes")),
+    ]
 
 
-def _picture(figure: Any, text: str) -> str:
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg")
-    drawing = buffer.getvalue()
-    return f'<figure role="img" aria-label="{html.escape(text)}">{drawing[drawing.index("<svg") :]}</figure>'
-
-
-def _figure(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Any, Any]:
-    """A figure that is not registered in pyplot, and its axes."""
+def _drawn(
+    draw: Callable[[Any], Any], width: float, height: float, rows: int = 1, columns: int = 1, **options: Any
+) -> Any:
+    """A figure that is not registered in pyplot. `draw` draws on its axes."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False, **options)
-
-
-def _draw_estimates(fit: Fit) -> Any:
-    figure, axes = _figure(8, 0.9 + 0.45 * len(fit.names))
-    plot.estimates(fit, start=True, ax=axes)
+    draw(figure.subplots(rows, columns, squeeze=False, **options))
     return figure
 
 
 def _draw_trials(fit: Fit, number: int | None) -> Iterator[Any]:
     """Measured and fitted values, three trials per figure."""
-    T, rows = len(fit.trial_names), 2 * len(fit.problem.channels)
+    T, n_c = len(fit.trial_names), len(fit.problem.channels)
     chosen = np.unique(np.linspace(0, T - 1, min(T, number or T)).astype(int)).tolist()
-    for some in [chosen[i : i + 3] for i in range(0, len(chosen), 3)]:
-        heights = [3, 1.2] * len(fit.problem.channels)
-        options = {"sharex": "col", "sharey": "row", "height_ratios": heights}
-        figure, axes = _figure(1.0 + 3.2 * len(some), 1.0 * rows, rows, len(some), **options)
-        plot.fits(fit, some, axes=axes)
-        yield figure
+    for some in (chosen[i : i + 3] for i in range(0, len(chosen), 3)):
+        options = {"sharex": "col", "sharey": "row", "height_ratios": [3, 1.2] * n_c}
+        size = 1.0 + 3.2 * len(some), 2.0 * n_c, 2 * n_c, len(some)
+        yield _drawn(lambda axes, some=some: plot.fits(fit, some, axes=axes), *size, **options)
 
 
-def _draw_residuals(fit: Fit) -> Any:
+def _draw_residuals(fit: Fit, axes: Any) -> None:
     """By channel, a histogram of the residuals with the normal density, and their autocorrelation."""
     channels, grid = fit.problem.channels, np.linspace(-4, 4, 200)
-    figure, axes = _figure(9, 1.9 * len(channels), len(channels), 2, width_ratios=(1, 1.4))
     for (left, right), channel in zip(axes, channels, strict=True):
         every = [r[channel] for r in fit.residuals.values() if channel in r]
         flat = np.concatenate(every)
@@ -315,16 +311,3 @@ def _draw_residuals(fit: Fit) -> Any:
         right.set_ylim(min(-0.3, 1.1 * mean.min()), 1)
     axes[-1, 0].set_xlabel("residual [σ]; line: white noise with the given sigma")
     axes[-1, 1].set_xlabel("lag [samples]; autocorrelation, band: white noise")
-    return figure
-
-
-def _draw_costs(fit: Fit) -> Any:
-    figure, axes = _figure(2.4 + 0.9 * len(fit.problem.channels), 2.1 + 0.3 * min(len(fit.trial_names), 30))
-    plot.costs(fit, ax=axes)
-    return figure
-
-
-def _draw_profiles(fit: Fit, profiles: Sequence[Profile]) -> Any:
-    figure, axes = _figure(3.4 * len(profiles), 2.6, 1, len(profiles))
-    plot.profiles(fit, profiles, axes=axes)
-    return figure

@@ -12,14 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-from jaxtyping import Array
 from scipy import stats
 
 from ..._common.lookup import real_number
 from ..problem.model import Unknowns
 from ..problem.parameters import Parameters
 from ..problem.problem import Problem
-from ..problem.trial import trial_names as names_of
+from ..problem.trial import trial_names
 from ..solve.blocks import Blocks, Eliminated, eliminate
 from ..solve.linearization import Linearization
 
@@ -53,9 +52,9 @@ class Jackknife(NamedTuple):
     leverage: np.ndarray
 
 
+# Above this leverage, a cluster-robust variance is unreliable (MacKinnon, Nielsen and Webb, Journal of Econometrics
+# 232, 2023).
 LARGEST_LEVERAGE = 0.9
-"""Above this leverage, a cluster-robust variance is unreliable (MacKinnon, Nielsen and Webb, Journal of Econometrics
-232, 2023)."""
 
 
 def jackknife(clusters: Clusters, combinations: np.ndarray | None = None) -> Jackknife:
@@ -109,8 +108,8 @@ def jackknife(clusters: Clusters, combinations: np.ndarray | None = None) -> Jac
     return Jackknife(covariance, freedom, leverage)
 
 
+# Largest number of clusters with exact degrees of freedom. With more, Satterthwaite's approximation is used.
 MOST_EXACT = 200
-"""Largest number of clusters with exact degrees of freedom. With more, Satterthwaite's approximation is used."""
 
 
 def _freedom_of(weights: np.ndarray) -> float:
@@ -147,9 +146,9 @@ def infinite_along(covariance: np.ndarray, directions: np.ndarray) -> np.ndarray
 
 
 FEWEST_TRIALS_OF_A_TEST = 3
+# Smallest number of trials, of windows, and of independent samples per part, with which these are used as clusters. The
+# number of parameters does not matter, because `jackknife` computes leverage and degrees of freedom of each.
 FEWEST_TRIALS, FEWEST_WINDOWS, FEWEST_SAMPLES = 4, 8, 5.0
-"""Smallest number of trials, of windows, and of independent samples per part, with which these are used as clusters.
-The number of parameters does not matter, because `jackknife` computes leverage and degrees of freedom of each."""
 
 
 def clusters_of(problem: Problem, at: Linearization) -> tuple[str, int]:
@@ -271,25 +270,20 @@ def nuisance_prior_rows(problem: Problem, point: Unknowns) -> tuple[np.ndarray, 
     return counted[..., None] * rows, int(counted.sum())
 
 
-class PriorInformation(NamedTuple):
-    """The information of all priors.
+def prior_information(
+    problem: Problem, point: Unknowns, eliminated: Eliminated
+) -> tuple[np.ndarray, float, int, float]:
+    """The information of all priors of a problem whose linearization at the point is `eliminated`.
 
-    - `information` (p, p): about the unconstrained parameters, including priors of initial states and trial unknowns,
+    **Returns:** (information, determined, number, squares).
+
+    - information (p, p): about the unconstrained parameters, including priors of initial states and trial unknowns,
         which depend on the parameters.
-    - `determined`: number of initial states and trial unknowns that priors determine. It is fractional if the data
+    - determined: number of initial states and trial unknowns that priors determine. It is fractional if the data
         contribute.
-    - `number`: number of priors.
-    - `squares`: sum of their squared residuals.
+    - number: number of priors.
+    - squares: sum of their squared residuals.
     """
-
-    information: np.ndarray
-    determined: float
-    number: int
-    squares: float
-
-
-def prior_information(problem: Problem, point: Unknowns, eliminated: Eliminated) -> PriorInformation:
-    """The information of the priors of a problem whose linearization at the point is `eliminated`."""
     (of_nuisance, number), parameters = nuisance_prior_rows(problem, point), problem.parameters
     blocks, p, determined = eliminated.blocks, parameters.size, 0.0
     # The standard deviations of distributions over groups are relative to that of the residuals, so these are treated
@@ -310,18 +304,18 @@ def prior_information(problem: Problem, point: Unknowns, eliminated: Eliminated)
         R = np.linalg.qr(np.concatenate([np.asarray(blocks.R), e**0.5 * of_nuisance], axis=1), mode="r")
         with_more = eliminate(eqx.tree_at(lambda blocks: blocks.R, blocks, R.astype(blocks.R.dtype)), 0.0)
         determined = (with_more.log_determinant - eliminated.log_determinant) / e
-    return PriorInformation(information, determined, number, float(squares + np.sum(of_nuisance[:, :, -1] ** 2)))
+    return information, determined, number, float(squares + np.sum(of_nuisance[:, :, -1] ** 2))
 
 
-def intervals(parameters: Parameters, x: Array, half: np.ndarray) -> list[tuple[float, float]]:
-    """Intervals with the half-widths `half` (p,) around every parameter, truncated at its bounds."""
+def intervals(parameters: Parameters, x: Any, half: np.ndarray) -> dict[str, tuple[float, float]]:
+    """By name, intervals with the half-widths `half` (p,) around the parameters at x (p,), truncated at the bounds."""
     values = np.asarray(parameters.values(x))
     ends = np.clip([values - half, values + half], *np.expand_dims(parameters.bounds.T, 1))
-    return [(float(low), float(high)) for low, high in ends.T]
+    return {name: (float(low), float(high)) for name, low, high in zip(parameters.names, *ends, strict=True)}
 
 
+# By name of the trial and of the channel, samples (n_t,).
 ByTrial = dict[str, dict[str, np.ndarray]]
-"""By name of the trial and of the channel, samples (n_t,)."""
 
 
 def check_level(level: float) -> None:
@@ -336,11 +330,6 @@ def t_quantile(level: float, degrees_of_freedom: float) -> float:
     return float(stats.t.ppf(0.5 * (1 + level), degrees_of_freedom)) if degrees_of_freedom > 0 else float("nan")
 
 
-def trial_names(problem: Problem) -> tuple[str, ...]:
-    """Names of the trials. Repeated names are numbered."""
-    return names_of(problem.trials)
-
-
 def by_trial(problem: Problem, simulated: np.ndarray) -> ByTrial:
     """Simulated measurements of windows (W, n_c, n_t), joined by trial and channel. NaN outside the windows."""
     joined = [
@@ -352,7 +341,7 @@ def by_trial(problem: Problem, simulated: np.ndarray) -> ByTrial:
             series[first : first + n] = y[problem.channels.index(channel), :n]
     for series in (series for channels in joined for series in channels.values()):
         series.flags.writeable = False  # cached results depend on it
-    return dict(zip(trial_names(problem), joined, strict=True))
+    return dict(zip(trial_names(problem.trials), joined, strict=True))
 
 
 def variance_accounted_for(measured: Sequence[np.ndarray], fitted: Sequence[np.ndarray]) -> float:
@@ -373,12 +362,9 @@ def autocorrelations(series: Iterable[np.ndarray], n: int) -> np.ndarray:
     measured = [r[np.isfinite(r)] for r in series]
     square = sum(float(r @ r) for r in measured) / max(sum(r.size for r in measured), 1)
 
-    def of(lag: int) -> float:
-        pairs = sum(max(r.size - lag, 0) for r in measured)
-        products = sum(float(r[lag:] @ r[:-lag]) for r in measured)
-        return products / pairs / square if pairs and square > 0 else 0.0
-
-    return np.array([of(lag) for lag in range(1, n + 1)])
+    pairs = np.array([sum(max(r.size - lag, 0) for r in measured) for lag in range(1, n + 1)])
+    products = np.array([sum(float(r[lag:] @ r[:-lag]) for r in measured) for lag in range(1, n + 1)])
+    return products / np.maximum(pairs, 1) / (square or 1.0)
 
 
 def serial_correlation(residuals: ByTrial) -> dict[str, float]:

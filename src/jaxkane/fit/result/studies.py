@@ -1,7 +1,8 @@
-"""Studies of a fit: multiple starts, profile likelihood, bootstrap, and a check of signs."""
+"""Studies of a fit: multiple starts, profile likelihood, bootstrap, and checks of signs and of the power of loads."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
@@ -14,7 +15,9 @@ import numpy as np
 from scipy.stats import norm, qmc
 from tqdm import tqdm
 
-from ..._common.lookup import hint, real_number
+from ..._common.lookup import positive_number, real_number, refuse_unknown, whole_number
+from ..._kane.api import generalized_active_forces
+from ..._scalarjit.compat import on_device
 from ..problem.model import Unknowns
 from ..problem.problem import Problem
 from ..problem.specification import refuse_other
@@ -28,7 +31,7 @@ from .statistics import FEWEST_TRIALS, bootstrap_steps, clustered, t_quantile
 from .tables import text_table
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True)
 class MultiStart:
     """The result of `multi_start`: fits from several initial guesses. Print it for a table.
 
@@ -66,7 +69,7 @@ class MultiStart:
         slack = 0.25 * np.nan_to_num(self.best.variance, nan=1.0) + 1e-9 * self.best.linearization.squares
         return [f for f in self.fits if f.cost <= self.best.cost + slack]
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         names = self.best.names
         rows = [("sum of squares", "steps", "ended", *names)]
         for f in self.fits:
@@ -80,8 +83,6 @@ class MultiStart:
         if self.untried:
             lines.append(f"Interrupted: {self.untried} more initial guesses were not tried.")
         return "\n".join([*lines, *self.failures])
-
-    __repr__ = __str__
 
 
 def multi_start(
@@ -119,8 +120,7 @@ def multi_start(
     **Raises:** `ValueError` if no guess can be simulated.
     """
     refuse_other(problem, Problem, "multi_start", "multi_start(fit.problem)")
-    if n < 1:
-        raise ValueError(f"multi_start: `n`, the number of initial guesses, must be at least one, got {n}.")
+    whole_number(n, 1, "multi_start: `n`, the number of initial guesses,")
     if not 0 <= real_number(spread, "`spread`") < math.inf:
         raise ValueError(
             "multi_start: `spread`, the distance of the guesses in scales, must be finite and not negative, got "
@@ -136,28 +136,26 @@ def multi_start(
     if len(points) > n:
         costs = np.nan_to_num([problem.cost(point) for point in points], nan=np.inf)
         points = [points[i] for i in np.argsort(costs)[:n]]
-    fits, failures, untried = [], [], 0
-    for i, point in enumerate(tqdm(points, disable=not progress, desc="initial guesses")):
+    fits, failures = [], []
+    for point in tqdm(points, disable=not progress, desc="initial guesses"):
         values = np.asarray(problem.parameters.values(point.parameters)).tolist()
         guess = dict(zip(problem.parameters.names, values, strict=True))
         try:
             fits.append((minimize(problem, optimizer, steps=steps, start=point, callback=callback), guess))
         except ValueError as error:
             failures.append(f"From {', '.join(f'{k} = {v:.4g}' for k, v in guess.items())}: {error}")
-            continue
         except KeyboardInterrupt:  # before its first step
             if not fits:
                 raise
-            untried = len(points) - i
             break
-        if fits[-1][0].status == "interrupted":
-            untried = len(points) - i - 1
+        if fits and fits[-1][0].status == "interrupted":
             break
     if not fits:
         raise ValueError(
             f"multi_start: none of the {n} initial guesses can be simulated. Pass a smaller `spread`. The last error "
             f"was: {failures[-1]}"
         )
+    untried = len(points) - len(fits) - len(failures)
     fits.sort(key=lambda pair: pair[0].cost)
     return MultiStart(tuple(f for f, _ in fits), tuple(g for _, g in fits), tuple(failures), untried)
 
@@ -209,10 +207,9 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
     data do not determine, and if no fit with the parameter fixed converges.
     """
     refuse_other(fit, Fit, "profile", "profile(fit(...), name)")
-    if name not in fit.names:
-        raise ValueError(f"{name} is not a free parameter; {hint(name, fit.names, 'the free parameters are')}")
-    if n < 3 or not (span is None or 0 < span < np.inf):
-        raise ValueError(f"profile: `n` must be at least 3, and `span` must be positive; got n = {n}, span = {span}.")
+    refuse_unknown([str(name)], fit.names, "profile: `name`: there is no free parameter", "the free parameters are")
+    whole_number(n, 3, "profile: `n`")
+    span = None if span is None else positive_number(span, "profile: `span`")
     refuse_unless_at_a_minimum(fit.status, "profile")
     i, error, best = fit.names.index(name), fit.standard_errors[name], fit.estimates[name]
     prior = float(fit.parameters.prior_mean[i]), float(fit.parameters.prior_deviation[i])
@@ -283,7 +280,7 @@ def _crossings(values: np.ndarray, costs: np.ndarray, limit: float) -> tuple[flo
     return ends[0], ends[1]
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True)
 class Bootstrap:
     """The result of `bootstrap`: estimates from trials (or windows) that are resampled with replacement. Print it for a
     table.
@@ -346,8 +343,7 @@ def bootstrap(fit: Fit, *, n: int = 2000, seed: int = 0) -> Bootstrap:
     """
     refuse_other(fit, Fit, "bootstrap", "bootstrap(fit(...))")
     refuse_unless_at_a_minimum(fit.status, "bootstrap")
-    if not isinstance(n, int) or isinstance(n, bool) or n < 100:
-        raise ValueError(f"bootstrap: `n` must be an integer of at least 100, got {n!r}.")
+    whole_number(n, 100, "bootstrap: `n`")
     if fit.status == "validated":
         raise ValueError(
             "bootstrap: the parameters were not estimated from these trials. Pass the fit that estimated them."
@@ -383,35 +379,66 @@ def check_signs(fit: Fit) -> tuple[str, ...]:
     """
     if not any(poorly_fitted_channels(fit.tests, fit.variance)):
         return ()
-    notes, problem = [], fit.problem
+    problem, windows, notes = fit.problem, fit.problem.windows, []
     # Start at the estimates and at the initial guess: with a wrong sign, the estimates may be far from the true values.
     ends = (fit.point, problem.start)
+    cases: list[tuple[str, Windows, Sequence[Unknowns]]] = []
     for i, name in enumerate(problem.system.inputs):
-        if name not in problem.model.sampled_inputs:
-            continue
-        flipped = problem.windows.inputs.at[:, i].multiply(-1.0)
-        notes += _if_better(fit, eqx.tree_at(lambda w: w.inputs, problem.windows, flipped), ends, f"the input {name}")
-    for c, channel in enumerate(problem.channels):
-        flipped = problem.windows.measured.at[:, c].multiply(-1.0)
-        notes += _if_better(fit, eqx.tree_at(lambda w: w.measured, problem.windows, flipped), ends, channel)
+        if name in problem.model.sampled_inputs:
+            inputs = windows.inputs.at[:, i].multiply(-1.0)
+            cases.append((f"the input {name}", eqx.tree_at(lambda w: w.inputs, windows, inputs), ends))
+    for i, channel in enumerate(problem.channels):
+        measured = windows.measured.at[:, i].multiply(-1.0)
+        cases.append((channel, eqx.tree_at(lambda w: w.measured, windows, measured), ends))
     for name in (name for name, learned in zip(fit.names, fit.parameters.learned, strict=True) if not learned):
+        values = zip((fit.estimates, fit.start), ends, strict=True)
+        with contextlib.suppress(ValueError):  # outside its bounds
+            cases.append((f"the parameter {name}", windows, [problem.at({name: -of[name]}, end) for of, end in values]))
+    for what, changed, points in cases:
+        other = dataclasses.replace(problem, windows=changed)
         try:
-            values = zip((fit.estimates, fit.start), ends, strict=True)
-            flips = [problem.at({name: -of[name]}, end) for of, end in values]
-        except ValueError:  # outside its bounds
+            cost = min(solve_nuisance(other, point, steps=4)[1].cost for point in points)
+            if cost > 0.5 * fit.cost:
+                cost = uninterrupted(search(other, LeastSquares(rtol=1e-2), steps=4, start=points[-1])).cost
+        except ValueError:
             continue
-        notes += _if_better(fit, problem.windows, flips, f"the parameter {name}")
+        if cost < 0.5 * fit.cost:
+            notes.append(f"{what} seems to have the wrong sign: with the other sign the sum of squares is {cost:.4g}.")
     return tuple(notes)
 
 
-def _if_better(fit: Fit, windows: Windows, ends: Sequence[Unknowns], what: str) -> list[str]:
-    problem = dataclasses.replace(fit.problem, windows=windows)
-    try:
-        costs = [solve_nuisance(problem, point, steps=4)[1].cost for point in ends]
-        if min(costs) > 0.5 * fit.cost:
-            costs = [uninterrupted(search(problem, LeastSquares(rtol=1e-2), steps=4, start=ends[-1])).cost]
-    except ValueError:
-        return []
-    if min(costs) < 0.5 * fit.cost:
-        return [f"{what} seems to have the wrong sign: with the other sign the sum of squares is {min(costs):.4g}."]
-    return []
+# Largest number of samples of a fitted trajectory at which `energy_sources` evaluates the loads.
+MOST_SAMPLES = 2000
+
+
+def energy_sources(fit: Fit) -> dict[str, str]:
+    """By name, a sentence for each parameter that acts like a negative damping.
+
+        theta dP/dtheta >= 0   with   P = sum F_r u_r
+
+    The condition is checked at all samples of the fitted trajectory and again with reversed speeds. The power of
+    gravity, a spring or a motor changes its sign with the speeds. The power of friction does not and is negative. This
+    detects a damping parameter without bounds whose estimate has the wrong sign.
+    """
+    problem, rides = fit.problem, fit.problem.trajectories(fit.point)
+
+    def joined(of):
+        return np.concatenate([np.asarray(of(ride)) for ride in rides])
+
+    samples = {"t": joined(lambda r: r.t), "q": joined(lambda r: r.q), "u": joined(lambda r: r.u)}
+    samples |= {name: joined(lambda r, name=name: r.values[name]) for name in rides[0].values}
+    finite = np.flatnonzero(np.all([np.isfinite(x.reshape(len(x), -1)).all(axis=1) for x in samples.values()], axis=0))
+    rows = finite[:: max(1, len(finite) // MOST_SAMPLES)]
+    t, q, u, *values = (on_device(np.concatenate([x[rows], x[rows]])) for x in samples.values())
+    u = on_device(np.asarray(u) * np.repeat([1.0, -1.0], len(rows))[:, None])
+
+    def power(x: Any, t: Any, q: Any, u: Any, *values: Any) -> Any:
+        system = problem.parameters.apply(problem.system, x)[0]
+        return generalized_active_forces(system, t, q, u, dict(zip(rides[0].values, values, strict=True))) @ u
+
+    slopes = jax.jit(jax.vmap(jax.jacfwd(power), in_axes=(None, *(0 for _ in samples))))
+    P = np.asarray(slopes(fit.point.parameters, t, q, u, *values)) * np.sign([*fit.estimates.values()])  # (2 n, p)
+    adds = (P.min(axis=0) >= -1e-9 * P.max(axis=0)) & (P.max(axis=0) > 0)
+    words = "adds energy at every sample of the fitted motion, like a negative damping"
+    entries = zip(fit.parameters.entries, adds, fit.estimates.items(), strict=True)
+    return {name: f"{name} = {value:.4g} {words}" for entry, add, (name, value) in entries if add and entry.targets}

@@ -1,6 +1,4 @@
-"""A fit as data (pandas, xarray, JSON), and tables as text and HTML. A table is a list of rows, the first is the
-header.
-"""
+"""A fit as data (pandas, xarray, JSON, a file), and tables as text and HTML. The first row of a table is its header."""
 
 from __future__ import annotations
 
@@ -9,17 +7,27 @@ import html
 import importlib.metadata
 import json
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..._common.files import differences
 from ..._common.lookup import refuse_unknown
+from ..._scalarjit.compat import on_device
 from ..._system.system import System
 from ..problem.declarations import leaf_names
+from ..problem.model import Prediction, Simulation
+from ..problem.problem import Problem
+from ..problem.trial import trial_names
+from ..solve.blocks import Blocks
+from ..solve.checkpoints import described, read_state, tree_of, write_state
+from ..solve.linearization import Linearization
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,12 +38,10 @@ Tables = Sequence[tuple[str, Rows]]  # with their headings
 
 def text_table(rows: Rows, left: Sequence[int] = (0,)) -> str:
     """Rows in aligned columns. The columns `left` are left-aligned."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-
-    def place(i, cell):
-        return cell.ljust(widths[i]) if i in left else cell.rjust(widths[i])
-
-    return "\n".join("  ".join(place(i, cell) for i, cell in enumerate(row)).rstrip() for row in rows)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    sides = ["<" if i in left else ">" for i in range(len(widths))]
+    lines = ([f"{cell:{side}{n}}" for cell, side, n in zip(row, sides, widths, strict=True)] for row in rows)
+    return "\n".join("  ".join(cells).rstrip() for cells in lines)
 
 
 def html_text(text: str) -> str:
@@ -119,83 +125,212 @@ def _true_values(fit: Any, truth: Mapping[str, float] | System | None) -> dict[s
     return {name: float(jnp.ravel(leaves[leaf])[place]) for name, (leaf, place, _) in targets.items()}
 
 
-def dataframe(fit: Any, level: float) -> pd.DataFrame:
-    """See `Fit.to_pandas`."""
-    import pandas as pd  # importing pandas takes half a second
+class Export:
+    """The methods of a `Fit` that return or write its contents as data."""
 
-    lower, upper = np.array([*fit.intervals(level).values()]).reshape(-1, 2).T
-    columns = {
-        "unit": fit.parameters.units,
-        "start": [*fit.start.values()],
-        "estimate": [*fit.estimates.values()],
-        "error": [*fit.errors.values()],
-        "lower": lower,
-        "upper": upper,
-    }
-    return pd.DataFrame(columns, index=pd.Index(fit.names, name="parameter"))
+    def to_pandas(self: Any, level: float = 0.95) -> pd.DataFrame:
+        """A table with one row per parameter.
+
+        **Arguments:**
+
+        - `level`: confidence level of the intervals, between 0 and 1.
+
+        **Returns:** a `pandas.DataFrame` with the columns `unit`, `start`, `estimate`, `error` (from `errors`), `lower`
+        and `upper` (from `intervals(level)`).
+        """
+        import pandas as pd  # importing pandas takes half a second
+
+        lower, upper = np.array([*self.intervals(level).values()]).reshape(-1, 2).T
+        columns = {
+            "unit": self.parameters.units,
+            "start": [*self.start.values()],
+            "estimate": [*self.estimates.values()],
+            "error": [*self.errors.values()],
+            "lower": lower,
+            "upper": upper,
+        }
+        return pd.DataFrame(columns, index=pd.Index(self.names, name="parameter"))
+
+    def to_xarray(self: Any) -> Any:
+        """Measurements and residuals as an `xarray.Dataset`.
+
+        Requires xarray: `pip install 'jaxkane[xarray]'`.
+
+        **Returns:** a dataset of `measured`, `fitted`, `sigma` and `residual`, each (trial, channel, sample), with the
+        coordinate `t` (trial, sample) [s]. Shorter trials and channels that a trial does not measure are padded with
+        NaN.
+        """
+        try:
+            import xarray
+        except ImportError as error:
+            raise ImportError("to_xarray needs xarray. Install it: pip install 'jaxkane[xarray]'") from error
+        trials, channels = self.problem.trials, self.problem.channels
+        n_t, names = max(len(trial.t) for trial in trials), self.trial_names
+
+        def padded(x: Any) -> np.ndarray:
+            return np.pad(np.asarray(x, float), (0, n_t - len(x)), constant_values=np.nan)
+
+        rows = {
+            "measured": [trial.measured for trial in trials],
+            "fitted": [self.fitted[name] for name in names],
+            "sigma": [trial.sigma for trial in trials],
+            "residual": [self.residuals[name] for name in names],
+        }
+        values = {what: [[padded(row.get(c, ())) for c in channels] for row in of] for what, of in rows.items()}
+        t = ("trial", "sample"), [padded(trial.t) for trial in trials], {"units": "s"}
+        axes = ("trial", "channel", "sample")
+        coords = {"trial": [*names], "channel": [*channels], "t": t}
+        return xarray.Dataset({what: (axes, np.array(array)) for what, array in values.items()}, coords)
+
+    def to_json(self: Any) -> str:
+        """The contents of the report as JSON text: estimates, errors, tests, costs, notes, versions.
+
+        NaN becomes null. Infinity becomes the text "Infinity" or "-Infinity", which `float` reads.
+        """
+        identifiability = self.identifiability
+        columns = self.to_pandas().assign(standard_error=self.standard_errors, clustered_error=self.clustered_errors)
+        report = {
+            "system": type(self.problem.system).__name__,
+            "title": self.title,
+            "status": self.status,
+            "message": self.message,
+            "ok": self.ok,
+            "notes": self.notes,
+            "failed": self.failed,
+            "method": self.method,
+            "cost_name": self.problem.cost_name,
+            "cost": self.cost,
+            "history": self.history,
+            "held_out_cost": self.held_out_cost,
+            "variance": self.variance,
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "step_error": self.step_error,
+            "parameters": columns.to_dict("index"),
+            "correlation": self.correlation,
+            "directions": [
+                {"direction": row[0], "singular_value": s, "deviation": deviation}
+                for row, s, deviation in zip(
+                    identifiability.rows[1:], identifiability.singular_values, identifiability.deviations, strict=True
+                )
+            ],
+            "variance_accounted_for": self.variance_accounted_for,
+            "costs": self.costs,
+            "tests": {
+                name: {channel: dataclasses.asdict(test) for channel, test in tests.items()}
+                for name, tests in self.tests.items()
+            },
+            "nuisance": self.nuisance,
+            "versions": _versions(),
+        }
+        return json.dumps(_plain(report), allow_nan=False, indent=1)
+
+    def table(self: Any, truth: Mapping[str, float] | System | None = None) -> str:
+        """A text table of the parameters: name, initial guess, estimate, standard error and 95 % interval.
+
+        **Arguments:**
+
+        - `truth`: true values, by name or as a system. If passed, the table contains them and the deviation from them.
+
+        **Returns:** the table.
+
+        **Raises:** `ValueError` for a name in `truth` that is neither free nor a parameter; `TypeError` for a system of
+        another class.
+        """
+        return text_table(parameter_rows(self, truth))
+
+    def save(self: Any, path: str | os.PathLike[str]) -> Path:
+        """Write this fit to one file. `jaxkane.fit.load(path, problem)` reads it.
+
+        The file is written completely or not at all. It contains numbers only.
+
+        **Arguments:**
+
+        - `path`: file to write.
+
+        **Returns:** the path.
+        """
+        path, parameters, windows = Path(path).expanduser(), self.problem.parameters, self.problem.windows
+        key = {
+            "fit": {
+                "status": self.status,
+                "method": self.method,
+                "failed": dict(self.failed),
+                "deviations": parameters.deviations.tolist(),
+                "places": np.asarray(parameters.places).tolist(),
+                "rest": np.asarray(parameters.rest).tolist(),
+            },
+            "versions": ", ".join(f"{name} {version}" for name, version in _versions().items()),
+            **described(self.problem),
+        }
+        trees = {
+            "point": self.point,
+            "step": (windows.step, self.problem.model.settings.rtol),
+            "history": np.array(self.history),
+            "R": self.linearization.blocks.R,
+            "prediction": self.linearization.prediction,
+            "step_errors": self.step_errors,
+            "errors": self.problem.model.errors,
+        }
+        write_state(path, key, trees)
+        return path
 
 
-def dataset(fit: Any) -> Any:
-    """See `Fit.to_xarray`."""
-    try:
-        import xarray
-    except ImportError as error:
-        raise ImportError("to_xarray needs xarray. Install it: pip install 'jaxkane[xarray]'") from error
-    trials, channels = fit.problem.trials, fit.problem.channels
-    t = np.full((len(trials), max(len(trial.t) for trial in trials)), np.nan)
-    values = {what: np.full((len(trials), len(channels), t.shape[1]), np.nan) for what in ("measured", "fitted")}
-    values |= {what: values["measured"].copy() for what in ("sigma", "residual")}
-    for k, (name, trial) in enumerate(zip(fit.trial_names, trials, strict=True)):
-        n = len(trial.t)
-        t[k, :n] = trial.t
-        rows = (trial.measured, fit.fitted[name], trial.sigma, fit.residuals[name])
-        for array, row in zip(values.values(), rows, strict=True):
-            for j, channel in enumerate(channels):
-                if channel in row:
-                    array[k, j, :n] = row[channel]
-    axes = ("trial", "channel", "sample")
-    coords = {"trial": [*fit.trial_names], "channel": [*channels], "t": (("trial", "sample"), t, {"units": "s"})}
-    return xarray.Dataset({what: (axes, array) for what, array in values.items()}, coords)
+def _versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in ("jaxkane", "jax", "diffrax")}
 
 
-def json_text(fit: Any) -> str:
-    """See `Fit.to_json`."""
-    identifiability = fit.identifiability
-    columns = dataframe(fit, 0.95).assign(standard_error=fit.standard_errors, clustered_error=fit.clustered_errors)
-    report = {
-        "system": type(fit.problem.system).__name__,
-        "title": fit.title,
-        "status": fit.status,
-        "message": fit.message,
-        "ok": fit.ok,
-        "notes": fit.notes,
-        "failed": fit.failed,
-        "method": fit.method,
-        "cost_name": fit.problem.cost_name,
-        "cost": fit.cost,
-        "history": fit.history,
-        "held_out_cost": fit.held_out_cost,
-        "variance": fit.variance,
-        "degrees_of_freedom": fit.degrees_of_freedom,
-        "step_error": fit.step_error,
-        "parameters": columns.to_dict("index"),
-        "correlation": fit.correlation,
-        "directions": [
-            {"direction": row[0], "singular_value": s, "deviation": deviation}
-            for row, s, deviation in zip(
-                identifiability.rows[1:], identifiability.singular_values, identifiability.deviations, strict=True
+# Largest relative difference of the cost that `load` accepts if the code has changed since the fit was saved.
+SAME_COST = 1e-6
+
+
+def read_fit(path: Path, problem: Problem) -> dict[str, Any]:
+    """The fields of the `Fit` in a file. See `load`."""
+    saved, arrays = read_state(path)
+    of_fit: dict[str, Any] = saved.pop("fit", {})
+    if not of_fit:
+        raise ValueError(f"{path} is the checkpoint of a fit, not a saved fit. Pass it as `checkpoint=` of the fit.")
+    names, failed = trial_names(problem.trials), of_fit["failed"]
+    if failed and failed.keys() <= {*names}:
+        kept = [trial for name, trial in zip(names, problem.trials, strict=True) if name not in failed]
+        problem = problem.with_trials(kept)
+    step, rtol = tree_of(path, arrays, "step", (problem.windows.step, problem.model.settings.rtol))
+    if problem.chooses_steps and step.shape == problem.windows.step.shape:
+        problem = problem.with_steps(step)
+    elif (problem.specification.simulation or Simulation()).chooses:
+        problem = problem.with_tolerances(rtol)
+    parameters = problem.parameters.with_deviations(np.array(of_fit["deviations"]))
+    if parameters.inequalities and {*of_fit["places"]} < {*np.asarray(parameters.places).tolist()}:  # some at a bound
+        kept = np.flatnonzero(np.isin(np.asarray(parameters.places), of_fit["places"]))
+        parameters = parameters.subset(kept.tolist(), problem.start.parameters)
+        parameters = dataclasses.replace(parameters, rest=on_device(np.array(of_fit["rest"], parameters.rest.dtype)))
+    problem = dataclasses.replace(problem, model=dataclasses.replace(problem.model, parameters=parameters))
+    key = described(problem)
+    wrong = differences(*({k: d[k] for k in d if k not in ("program", "versions")} for d in (saved, key)))
+    if wrong:
+        raise ValueError(
+            f"{path} contains the fit of another problem, which differs in {wrong}. Create the problem with the "
+            "original arguments."
+        )
+    of_filter = jnp.zeros(()) if problem.model.noise is not None else None
+    cost = jnp.zeros(()) if problem.model.has_likelihood else None
+    prediction = Prediction(jnp.zeros(()), jnp.zeros(()), of_filter, cost, of_filter)
+    like = {"point": problem.start, "errors": problem.model.errors, "prediction": prediction}
+    like |= dict.fromkeys(("R", "step_errors", "history"), 0.0)
+    state: dict[str, Any] = {name: tree_of(path, arrays, name, tree) for name, tree in like.items()}
+    point, model = state["point"], dataclasses.replace(problem.model, errors=state["errors"])
+    problem = dataclasses.replace(problem, model=model)
+    at = Linearization(Blocks.of(model, state["R"], problem.by_trial, point.parameters), state["prediction"])
+    if saved["program"] != key["program"]:
+        now = problem.cost(point)
+        if not abs(now - at.cost) <= SAME_COST * at.squares:
+            raise ValueError(
+                f"{path}: the {problem.cost_name} is now {now:.6g}, but was {at.cost:.6g} when the fit was saved (by "
+                f"{saved['versions']}). The code has changed since then. Fit again, for example from `start=`, or "
+                "install these versions."
             )
-        ],
-        "variance_accounted_for": fit.variance_accounted_for,
-        "costs": fit.costs,
-        "tests": {
-            name: {channel: dataclasses.asdict(test) for channel, test in tests.items()}
-            for name, tests in fit.tests.items()
-        },
-        "nuisance": fit.nuisance,
-        "versions": {name: importlib.metadata.version(name) for name in ("jaxkane", "jax", "diffrax")},
-    }
-    return json.dumps(_plain(report), allow_nan=False, indent=1)
+    fields = {"problem": problem, "point": point, "linearization": at, "step_errors": np.asarray(state["step_errors"])}
+    rest = {name: of_fit[name] for name in ("status", "method", "failed")}
+    return {**fields, "history": tuple(np.asarray(state["history"], float).tolist()), **rest}
 
 
 def _plain(value: Any) -> Any:

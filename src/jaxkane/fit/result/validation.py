@@ -1,17 +1,19 @@
-"""Validation of parameters on trials that they were not estimated from: validation, cross-validation, prediction."""
+"""Validation of parameters on trials that they were not estimated from: validation, cross-validation, prediction; and
+comparison of fits.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from ..._common.lookup import positive_number
+from ..._common.lookup import hint, positive_number, refuse_unknown
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
 from ..problem.declarations import Free, leaf_names
@@ -19,24 +21,24 @@ from ..problem.from_declarations import parameters_of
 from ..problem.model import Unknowns
 from ..problem.problem import Problem, finer
 from ..problem.specification import ProblemSpec, refuse_other, with_options
-from ..problem.trial import Trial, as_trials
+from ..problem.trial import Trial, as_trials, trial_names
 from ..solve.blocks import Blocks
 from ..solve.fit import search, uninterrupted, with_distributions
 from ..solve.linearization import Linearization
 from ..solve.local_unknowns import Unsimulated, solve_nuisance
 from ..solve.optimizers import LeastSquares
-from .diagnostics import AT_A_MINIMUM, STATUS
+from .diagnostics import AT_A_MINIMUM, STATUS, plausible_of
 from .fit_result import Fit
-from .linearized import folds_of
-from .statistics import LARGEST_LEVERAGE, intervals, t_quantile, trial_names
-from .tables import Rows, text_table
+from .linearized import trial_folds
+from .statistics import LARGEST_LEVERAGE, intervals, t_quantile
+from .tables import Rows, Tables, html_tables, text_table, text_tables
 
 if TYPE_CHECKING:
     import pandas as pd
 
+# Largest number of samples of padding windows, which have zero weight. Simulating this many samples a few times takes
+# as long as compiling a program without padding.
 MOST_ADDED_SAMPLES = 100_000
-"""Largest number of samples of padding windows, which have zero weight. Simulating this many samples a few times takes
-as long as compiling a program without padding."""
 
 
 @with_options
@@ -64,24 +66,37 @@ def validate(fit: Fit | System, trials: Sequence[Trial] | Trial, **options: Any)
     """
     if isinstance(fit, System):
         # A problem needs at least one free parameter. It is fixed below, like the others.
-        spec, x, room, method = ProblemSpec(fit, _first_number(fit), **options), None, None, "given values"
+        spec, room, method = ProblemSpec(fit, _first_number(fit), **options), None, "given values"
     else:
         refuse_other(fit, Fit, "validate", "validate(fit(...), trials) or validate(system, trials, unknown=...)")
         if options:
             raise TypeError(f"validate: the options {', '.join(options)} are already part of the Fit. Omit them.")
-        spec, x, room = fit.problem.specification, fit.point.parameters, fit.problem.windows.shape
-        method = fit.method
-    problem, failed = _posed(fit, spec, trials), {}
-    names = trial_names(problem)
+        spec, room, method = fit.problem.specification, fit.problem.windows.shape, fit.method
+
+    def posed(trials: Sequence[Trial] | Trial) -> Problem:
+        """The problem of these trials, with the tolerances and the error models of the fit. Fixed steps are chosen for
+        these trials.
+        """
+        if isinstance(fit, Fit):
+            problem = Problem.with_first_steps(spec, trials, fit.parameters)
+            return problem.as_fine_as(fit.problem).with_errors_of(fit.problem)
+        problem = Problem.with_first_steps(spec, trials)
+        none = problem.parameters.subset((), problem.start.parameters)
+        return dataclasses.replace(problem, model=eqx.tree_at(lambda m: m.parameters, problem.model, none))
+
+    problem, failed = posed(trials), {}
+    names = trial_names(problem.trials)
     while True:
-        if x is None:
-            none = problem.parameters.subset((), problem.start.parameters)
-            problem = dataclasses.replace(problem, model=eqx.tree_at(lambda m: m.parameters, problem.model, none))
-        parameters = problem.start.parameters if x is None else x
+        x = fit.point.parameters if isinstance(fit, Fit) else problem.start.parameters
         lost, fits = {}, []
         for part, numbers in problem.parts(room, MOST_ADDED_SAMPLES):
+            first = dataclasses.replace(part.start, parameters=x)
             try:
-                fits.append(_validated(part, dataclasses.replace(part.start, parameters=parameters), method))
+                part = finer(part, first) if part.chooses_steps else part
+                # Gauss-Newton steps converge quadratically. After a relative decrease below 1e-4, the next one is a
+                # rounding error.
+                point, at = solve_nuisance(part, first, steps=20, rtol=1e-4)
+                fits.append(uninterrupted(Fit.of(part, point, at, (at.cost,), "validated", method)))
             except Unsimulated as error:
                 lost |= {numbers[k]: why for k, why in error.reasons.items()}
         failed |= {names[k]: why for k, why in lost.items()}
@@ -94,18 +109,8 @@ def validate(fit: Fit | System, trials: Sequence[Trial] | Trial, **options: Any)
                 f"validate: none of these trials can be simulated with these parameters: {name}, {why}. Check the "
                 "initial values of the trials."
             )
-        problem = _posed(fit, spec, [problem.trials[k] for k in kept])
+        problem = posed([problem.trials[k] for k in kept])
         names = tuple(names[k] for k in kept)
-
-
-def _posed(fit: Fit | System, spec: ProblemSpec, trials: Sequence[Trial] | Trial) -> Problem:
-    """The problem of these trials, with the tolerances and the error models of the fit. Fixed steps are chosen for
-    these trials.
-    """
-    if not isinstance(fit, Fit):
-        return Problem.with_first_steps(spec, trials)
-    problem = Problem.with_first_steps(spec, trials, fit.parameters)
-    return problem.as_fine_as(fit.problem).with_errors_of(fit.problem)
 
 
 def _first_number(system: System) -> Any:
@@ -118,18 +123,6 @@ def _first_number(system: System) -> Any:
             if parameters_of(system, Free(name, bounds=(None, None))).size:
                 return Free(name, bounds=(None, None))
     raise ValueError(f"{type(system).__name__} has no parameter. Declare one with jk.parameter().")
-
-
-def _validated(problem: Problem, first: Unknowns, method: str) -> Fit:
-    """Estimate only the nuisance parameters.
-
-    **Raises:** `Unsimulated` if windows cannot be simulated with these parameters.
-    """
-    if problem.chooses_steps:
-        problem = finer(problem, first)
-    # Gauss-Newton steps converge quadratically. After a relative decrease below 1e-4, the next one is a rounding error.
-    point, at = solve_nuisance(problem, first, steps=20, rtol=1e-4)
-    return uninterrupted(Fit.of(problem, point, at, (at.cost,), "validated", method))
 
 
 def _joined(problem: Problem, fits: Sequence[Fit]) -> Fit:
@@ -223,17 +216,15 @@ class CrossValidation:
         half = t_quantile(level, K - 1) * np.std(own, axis=1, ddof=1) * (1 + 1 / K) ** 0.5
         errors = np.array([*self.fit.standard_errors.values()])
         half = np.where(np.isfinite(errors), half, errors)
-        return dict(zip(self.fit.names, intervals(self.fit.parameters, self.fit.point.parameters, half), strict=True))
+        return intervals(self.fit.parameters, self.fit.point.parameters, half)
 
     @property
     def conclusion(self) -> str:
         """How well trials that were not used in a fit are predicted, as a sentence."""
         lost = [name for name, cost in zip(self.trials, self.held_out, strict=True) if np.isinf(cost)]
-        reasons = [*self.failures]
-        if lost:
-            reasons.append(f"{', '.join(lost)} cannot be simulated with the parameters of the others.")
-        if reasons:
-            return " ".join(reasons)
+        if lost or self.failures:
+            end = [f"{', '.join(lost)} cannot be simulated with the parameters of the others."] * bool(lost)
+            return " ".join([*self.failures, *end])
         if self.cost_name != "sum of squares":
             drop = self.at_start.sum() - self.held_out.sum()
             return f"The held-out {self.cost_name} of all trials is {drop:.4g} below that of the initial guess."
@@ -248,40 +239,8 @@ class CrossValidation:
         cells = [[name, str(n), *(f"{cost:.5g}" for cost in costs)] for name, n, *costs in rows]
         return [("trial left out", "residuals", "spread", "start", "fitted", "held out"), *cells]
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return f"{text_table(self.rows)}\n{self.conclusion}"
-
-    __repr__ = __str__
-
-
-def trial_folds(
-    folds: int | str | Sequence[Sequence[int]] | None, trials: Sequence[Trial]
-) -> tuple[list[list[int]], str]:
-    """Groups of trials that are left out together, and their description as text.
-
-    **Raises:** `ValueError` for folds that do not leave out each trial exactly once, and for a label that a trial does
-    not have.
-    """
-    if not isinstance(folds, str):
-        groups = folds_of(folds, len(trials))
-        alone = all(len(group) == 1 for group in groups)
-        return groups, "each trial alone" if alone else f"{len(groups)} folds of the trials"
-    missing = [trial.name for trial in trials if folds not in trial.labels]
-    if missing:
-        known = ", ".join(sorted({label for trial in trials for label in trial.labels})) or "none"
-        raise ValueError(
-            f"`folds`: {missing[0]} has no label {folds!r}; the labels of these trials are: {known}. Pass Trial(..., "
-            f"labels={{{folds!r}: ...}})."
-        )
-    by_label: dict[str | float, list[int]] = {}
-    for k, trial in enumerate(trials):
-        by_label.setdefault(trial.labels[folds], []).append(k)
-    if len(by_label) < 2:
-        raise ValueError(
-            f"`folds`: all trials have the same {folds}, {trials[0].labels[folds]!r}, so none can be left out. Use "
-            "another label."
-        )
-    return list(by_label.values()), f"each {folds}: {', '.join(str(label) for label in by_label)}"
 
 
 def cross_validate(fit: Fit, folds: int | str | Sequence[Sequence[int]] | None = None) -> CrossValidation:
@@ -332,18 +291,17 @@ def cross_validate(fit: Fit, folds: int | str | Sequence[Sequence[int]] | None =
             # The error models are those of the other trials. Estimated from the held-out ones, they would hide poor
             # predictions.
             held_out[group] = costs_by_trial(fit.problem.with_errors_of(trained.problem), trained.point)[group]
-        estimates.append(dict(zip(fit.names, values.tolist(), strict=True)))
-    owner = np.asarray(fit.problem.windows.trial)
+        estimates.append(values)
     counts = np.sum(np.asarray(fit.problem.windows.weight) > 0, axis=(1, 2))
     return CrossValidation(
         fit=fit,
         trials=fit.trial_names,
-        n=np.array([counts[owner == k].sum() for k in range(T)]),
+        n=np.bincount(np.asarray(fit.problem.windows.trial), counts, T).astype(int),
         at_start=costs_by_trial(fit.problem, fit.problem.start),
         fitted=costs_by_trial(fit.problem, fit.point),
         held_out=held_out,
         spread=spread_by_trial(fit.problem),
-        estimates={name: np.array([of_fold[name] for of_fold in estimates]) for name in fit.names},
+        estimates=dict(zip(fit.names, np.array(estimates).T, strict=True)),
         cost_name=fit.problem.cost_name,
         held_out_kind=kind,
         failures=tuple(failures),
@@ -374,13 +332,16 @@ def spread_by_trial(problem: Problem) -> np.ndarray:
     """
     windows, owner = problem.windows, np.asarray(problem.windows.trial)
     y, weight = np.asarray(windows.measured), np.asarray(windows.weight) ** 2  # (W, n_c, n_t)
-    spread = []
-    for k in range(len(problem.trials)):
-        y_k, w_k = y[owner == k], weight[owner == k]
-        total = w_k.sum(axis=(0, 2), keepdims=True)
-        mean = np.sum(w_k * y_k, axis=(0, 2), keepdims=True) / np.where(total > 0, total, 1.0)
-        spread.append(np.sum(w_k * (y_k - mean) ** 2))
-    return np.array(spread)
+
+    def total(x: np.ndarray) -> np.ndarray:
+        """Sums by trial and channel (T, n_c)."""
+        sums = np.zeros((len(problem.trials), x.shape[1]))
+        np.add.at(sums, owner, x.sum(axis=2))
+        return sums
+
+    weights = total(weight)
+    mean = total(weight * y) / np.where(weights > 0, weights, 1.0)
+    return total(weight * (y - mean[owner][:, :, None]) ** 2).sum(axis=1)
 
 
 def predict(
@@ -419,9 +380,7 @@ def predict(
     import pandas as pd
 
     refuse_other(fit, Fit, "predict", "predict(fit(...), trials, ahead=(0.1, 0.5))")
-    times = np.atleast_1d(np.asarray(ahead, float))
-    if not (times.ndim == 1 and times.size and np.all(np.isfinite(times)) and np.all(times > 0)):
-        raise ValueError(f"predict: `ahead` must be positive times [s], got {ahead}.")
+    times = np.array([positive_number(x, "predict: `ahead` [s]") for x in np.ravel(np.asarray(ahead, float))])
     spec = fit.problem.specification
     past = (spec.window or float(times.max())) if past is None else positive_number(past, "predict: `past`")
     pieces, origins = [], []
@@ -462,3 +421,171 @@ def predict(
                     rows.append((name, channel, h, piece.t[i], y[i], simulated[i], error, residual))
     columns = ["trial", "channel", "ahead", "t", "measured", "predicted", "error", "residual"]
     return pd.DataFrame(rows, columns=columns)
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """The result of `compare`. Print it for the tables.
+
+    - `fits`: the fits by name.
+    - `held_out`: by name, the validation of each fit on the held-out trials. Empty without held-out trials.
+    - `bound_violations`: by name of the fit, a sentence for each estimate that is not plausible.
+    """
+
+    fits: Mapping[str, Fit]
+    held_out: Mapping[str, Fit]
+    bound_violations: Mapping[str, tuple[str, ...]]
+
+    @property
+    def tables(self) -> Tables:
+        """The tables, each as a heading and rows. The first row is the header."""
+        units = {n: u for fit in self.fits.values() for n, u in zip(fit.names, fit.parameters.units, strict=True)}
+        labels = {name: f"{name} [{unit}]" if unit else name for name, unit in units.items()}
+        tables = [("Parameters, with the errors of their intervals", _rows("parameter", labels, self.fits, _estimate))]
+        tables.append(("All", self._sums()))
+        violations = [[name, violation] for name, of_fit in self.bound_violations.items() for violation in of_fit]
+        if violations:
+            tables.append(("Bound violations", [["fit", "violation"], *violations]))
+        for where, fits in (("", self.fits), ("Held out: ", self.held_out)):
+            if fits:
+                channels = {channel: channel for fit in fits.values() for channel in fit.problem.channels}
+                trials = {name: name for fit in fits.values() for name in (*fit.trial_names, *fit.failed)}
+                heading = f"{where}Sum of squares and variance accounted for, by channel"
+                tables.append((heading, _rows("channel", channels, fits, _of_channel)))
+                tables.append((f"{where}Sum of squares, by trial", _rows("trial", trials, fits, _of_trial)))
+        return tables
+
+    def _sums(self) -> Rows:
+        fits, held_out = [*self.fits.values()], self.held_out.values()
+        rows = {"status": [fit.status for fit in fits]}
+        for cost in dict.fromkeys(fit.problem.cost_name for fit in fits):
+            rows[cost] = [f"{fit.cost:.6g}" if fit.problem.cost_name == cost else "" for fit in fits]
+        rows |= {
+            "of trials left out in turn": [f"{fit.held_out_cost:.6g}".replace("nan", "") for fit in fits],
+            "held out": [
+                f"{fit.cost:.6g}"
+                + f" ({len(fit.trial_names)} of {len(fit.trial_names) + len(fit.failed)} trials)" * bool(fit.failed)
+                for fit in held_out
+            ],
+            "residuals": [str(fit.problem.size[0]) for fit in fits],
+            "unknowns": [str(fit.problem.size[1]) for fit in fits],
+            "variance of a residual": [f"{fit.variance:.3g}" for fit in fits],
+            "residuals' correlation": [f"{fit.autocorrelation:.2f}" for fit in fits],
+        }
+        return [["", *self.fits], *([label, *cells] for label, cells in rows.items() if any(cells))]
+
+    def __repr__(self) -> str:
+        return text_tables(self.tables)
+
+    def _repr_html_(self) -> str:
+        return html_tables(self.tables)
+
+
+def _rows(head: str, labels: Mapping[str, str], fits: Mapping[str, Fit], cell: Callable[[Fit, str], str]) -> Rows:
+    return [[head, *fits], *([label, *(cell(fit, name) for fit in fits.values())] for name, label in labels.items())]
+
+
+def _estimate(fit: Fit, name: str) -> str:
+    return f"{fit.estimates[name]:.5g} ({fit.errors[name]:.2g})" if name in fit.names else ""
+
+
+def _of_channel(fit: Fit, channel: str) -> str:
+    if channel not in fit.problem.channels:
+        return ""
+    squares = sum(of_trial.get(channel, 0.0) for of_trial in fit.costs.values())
+    return f"{squares:.5g}, {100 * fit.variance_accounted_for[channel]:.1f} %"
+
+
+def _of_trial(fit: Fit, trial: str) -> str:
+    return (
+        f"{sum(fit.costs[trial].values()):.5g}" if trial in fit.trial_names else "not simulated" * (trial in fit.failed)
+    )
+
+
+def compare(
+    fits: Mapping[str, Fit] | Sequence[Fit],
+    held_out: Sequence[Trial] | Trial | None = None,
+    *,
+    plausible: Mapping[str, Any] | None = None,
+) -> Comparison:
+    """Compare fits: their costs by channel and by trial, their parameters, and the plausibility of these.
+
+        print(compare({"viscous": one, "with dry friction": other}, held_out=others))
+
+    **Arguments:**
+
+    - `fits`: fits by name. In a sequence, each fit is named after its free parameters.
+    - `held_out`: trials that were not used in any of the fits. Only their initial states and unknowns are estimated
+        (`validate`). For bicycles, construct them with `bicycle_rides`.
+    - `plausible`: plausible ranges, as in `forward_selection`. Names that none of the fits frees are ignored.
+
+    **Returns:** a `Comparison`. Its tables contain the parameters with the errors of their intervals, and the estimates
+    that are not plausible. They also contain the sums of squares of fitted and held-out trials: in total, by channel
+    and by trial.
+
+    **Raises:** `TypeError` for a value that is not a `Fit`; `ValueError` without a fit, and for two fits with the same
+    name.
+    """
+    if isinstance(fits, Fit):
+        raise TypeError(
+            "compare: `fits` is one Fit. Pass fits by name, such as compare({'first': one, 'second': other})."
+        )
+    given = [*(fits.values() if isinstance(fits, Mapping) else fits)]
+    if not given:
+        raise ValueError("compare: `fits` is empty. Pass at least one Fit.")
+    for fit in given:
+        refuse_other(fit, Fit, "compare", "compare({'first': fit(...), 'second': fit(...)})")
+    named = dict(
+        zip(fits if isinstance(fits, Mapping) else [", ".join(fit.names) for fit in given], given, strict=True)
+    )
+    if len(named) < len(given):
+        raise ValueError("compare: two fits have the same free parameters. Name the fits: compare({'first': ...}).")
+    ranges = plausible or {}
+    free = {name for fit in named.values() for name in fit.names}
+    if not free & set(ranges):  # ranges of a whole search may contain names that no fit frees
+        refuse_unknown(ranges, free, "`plausible` contains unknown names:", "the free parameters are")
+    return Comparison(
+        fits=named,
+        held_out={} if held_out is None else {name: validate(fit, held_out) for name, fit in named.items()},
+        bound_violations={
+            name: tuple(plausible_of(fit.parameters, ranges).bound_violations(fit.estimates).values())
+            for name, fit in named.items()
+        },
+    )
+
+
+def compare_estimates(fit: Fit, other: Fit | Mapping[str, float | tuple[float, float]]) -> pd.DataFrame:
+    """Differences between two sets of estimates, in standard errors of the difference.
+
+        z = (estimate - other) / (error^2 + other_error^2)^1/2
+
+        jk.plot.estimates({"Monday": monday, "Tuesday": tuesday})  # the same as a forest plot
+        compare_estimates(fit, {"mass": (2.1, 0.05), "length": 0.6})  # with values from elsewhere
+
+    **Arguments:**
+
+    - `fit`: a `Fit`, whose `errors` are used.
+    - `other`: a fit of other data, or by name a value or (value, standard deviation). If both share data, their
+        errors are correlated, and the denominator of `z` is usually too large.
+
+    **Returns:** a `pandas.DataFrame` with a row for each parameter in both, and the columns `unit`, `estimate`,
+    `error`, `other`, `other_error`, `difference` and `z`. `z` is NaN if an error is not finite.
+
+    **Raises:** `TypeError` if `fit` is not a `Fit`; `ValueError` without a common parameter.
+    """
+    refuse_other(fit, Fit, "compare_estimates", "compare_estimates(fit(...), other)")
+    if isinstance(other, Fit):
+        others = {name: (value, other.errors[name]) for name, value in other.estimates.items()}
+    else:
+        others = {name: value if isinstance(value, tuple) else (value, 0.0) for name, value in other.items()}
+    names = [name for name in fit.names if name in others]
+    if not names:
+        raise ValueError(
+            f"compare_estimates: the two sets have no common parameter; {hint([], fit.names, 'the fit has')}"
+        )
+    frame = fit.to_pandas().loc[names, ["unit", "estimate", "error"]]
+    frame[["other", "other_error"]] = np.array([others[name] for name in names], float)
+    frame["difference"] = frame.estimate - frame.other
+    error = np.hypot(frame.error, frame.other_error)
+    frame["z"] = np.where(np.isfinite(error) & (error > 0), frame.difference / np.where(error > 0, error, 1.0), np.nan)
+    return frame

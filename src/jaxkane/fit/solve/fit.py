@@ -18,10 +18,9 @@ from ..problem.declarations import Items
 from ..problem.model import Simulation, Unknowns
 from ..problem.problem import Problem, finer, residual_deviation
 from ..problem.specification import refuse_other, with_options
-from ..problem.trial import Trial, refuse
+from ..problem.trial import Trial, refuse, trial_names
 from ..result.diagnostics import AT_A_MINIMUM
 from ..result.fit_result import Fit
-from ..result.statistics import trial_names
 from .checkpoints import Checkpoint
 from .local_unknowns import Unsimulated, solve_nuisance, usable
 from .optimizers import Iterate, LeastSquares, Optimizer
@@ -122,7 +121,7 @@ def solve(
     method: Any = LeastSquares() if optimizer is None else optimizer
     if start is not None:
         _refuse_start_of_another(problem, start)
-    names, failed = trial_names(problem), {}
+    names, failed = trial_names(problem.trials), {}
     while True:
         try:
             # A checkpoint belongs to the problem without the excluded trials, so these must be found before it is
