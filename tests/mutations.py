@@ -153,7 +153,7 @@ MUTATIONS = (
     Mutation("events: the last crossing of a cubic instead of the first", "_integrate/events.py",
              "for i in reversed(range(3)):", "for i in range(3):",
              "integrate/test_events.py"),
-    Mutation("tyres: the relaxation has the other sign of camber", "bicycles/_tyre_laws.py",
+    Mutation("tyres: the relaxation has the other sign of camber", "bicycles/_tyre.py",
              "lag = deflection / self.relaxation_length - self.equivalent(camber)",
              "lag = deflection / self.relaxation_length + self.equivalent(camber)",
              "bicycles/test_bicycle_tyres.py bicycles/test_bicycles.py"),

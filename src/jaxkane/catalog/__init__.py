@@ -8,8 +8,8 @@ with `@entry(...)` above it to one of the files, and import the class below. It 
 
 from ._entry import CATALOG as CATALOG
 from ._entry import Entry as Entry
-from ._entry import read_bicycle_file as read_bicycle_file
 from .bicycle import WhippleBicycle as WhippleBicycle
+from .bicycle import read_bicycle_file as read_bicycle_file
 from .contacts import Backlash as Backlash
 from .contacts import Belt as Belt
 from .contacts import BouncingBall as BouncingBall
