@@ -48,7 +48,7 @@ class BouncingBall(System):
 
     coordinates = ("height",)
     speeds = ("climb",)
-    units = dict.fromkeys(coordinates, "m")
+    units = {"height": "m", "climb": "m/s"}
 
     def motion(self, t, q, u):
         N, O = inertial()
