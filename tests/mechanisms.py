@@ -1,5 +1,6 @@
 """Systems that tests of several rooms use."""
 
+import dataclasses
 import itertools
 
 import equinox as eqx
@@ -365,3 +366,8 @@ def moved(system, ts, q, u, u_dep=None):
         events=(),
         adjoint="none",
     )
+
+
+def declared(system):
+    """The declarations of a system's parameters by name, with `positive`, `shape`, `unit` and `within`."""
+    return {f.name: f.metadata["jaxkane"] for f in dataclasses.fields(system) if "jaxkane" in f.metadata}

@@ -331,6 +331,20 @@ def test_the_error_for_a_full_disk_states_the_chunk_and_the_remedy(rides, tmp_pa
     np.testing.assert_array_equal(run(tmp_path).q, rides.q)
 
 
+def test_a_full_disk_is_reported_when_zipfile_raises_another_error(tmp_path, monkeypatch):
+    """`zipfile` raises a ValueError of its own when it closes a file that the disk cut short."""
+
+    def savez(file, **arrays):
+        try:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        finally:
+            raise ValueError("Can't close the ZIP file while there is an open writing handle on it.")
+
+    monkeypatch.setattr(np, "savez", savez)
+    with pytest.raises(OSError, match=r"chunk-00000000.npz could not be written: No space left on device"):
+        run(tmp_path)
+
+
 def test_a_missing_manifest_is_rewritten_only_for_chunks_of_the_same_sweep(copy, finished, rides, tmp_path_factory):
     (copy / "sweep.json").unlink()
     (copy / "chunk-00000032.npz").write_bytes(b"damaged")
