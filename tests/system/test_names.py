@@ -21,10 +21,10 @@ def test_a_hint_is_short():
     names = {"coordinates": tuple(f"angle{i}" for i in range(49)), "speeds": tuple(f"rate{i}" for i in range(49))}
     many = type("Many", (type(PENDULUM),), names)()
     with pytest.raises(ValueError, match=r"\.\.\. \(49 in all\)") as raised:
-        jk.assemble(many, {"wobble": 0.1})
+        jk.accelerations(many, 0.0, {"wobble": 0.1}, {})
     assert len(str(raised.value)) < 250
     with pytest.raises(ValueError, match="did you mean 'angle7' or 'angle47'"):
-        jk.assemble(many, {"angel7": 0.1})
+        jk.accelerations(many, 0.0, {"angel7": 0.1}, {})
 
 
 @pytest.mark.slow
