@@ -109,7 +109,8 @@ class ScheduledGains(Part):
         command = mul(_at(passed, self.follow), values["desired_roll"])
         for i, name in enumerate(self.measured):
             gain = _at(passed, self.gains[:, i])
-            command = sub(command, mul(gain, _state(name, bicycle, q, u, values)))
+            state = next((x[name] for x in (q, u) if name in x), None)
+            command = sub(command, mul(gain, values[name] if state is None else state))
         return {self.command: command}
 
     def _passed(self, v: Component) -> list[Component]:
@@ -128,12 +129,6 @@ def _at(passed: list[Component], values: Any) -> Component:
     for i, share in enumerate(passed):
         value = value + share * (values[i + 1] - values[i])
     return value
-
-
-def _state(name: str, bicycle: Bicycle, q: NamedVector, u: NamedVector, values: Any) -> Component:
-    if name in bicycle.coordinates:
-        return q[name]
-    return u[name] if name in (*bicycle.speeds, *bicycle.dependent_speeds) else values[name]
 
 
 def follow_gain(bicycle: Bicycle, speed: float) -> float:

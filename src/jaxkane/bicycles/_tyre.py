@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -205,8 +205,8 @@ class MagicFormula89(TyreForceLaw):
         a, alpha, Fz, gamma = self.force_coefficients, *self._in_degrees(slip, load, camber)
         # B C D / Fz, with sin(2 atan x) = 2 x / (1 + x^2): a wheel without load then has a finite stiffness factor
         slope = 2.0 * a[3] / a[4] / (1.0 + (Fz / a[4]) ** 2) * (1.0 - a[5] * jnp.abs(gamma))
-        shift = _Shift(a[8] * gamma + a[9] * Fz + a[10], a[11] * Fz * gamma + a[12] * Fz + a[13])
-        return self._carried(_magic(alpha, Fz, a[0], a[1] * Fz + a[2], slope, a[6] * Fz + a[7], shift), load)
+        angle, lifted = alpha + (a[8] * gamma + a[9] * Fz + a[10]), a[11] * Fz * gamma + a[12] * Fz + a[13]
+        return self._carried(_magic(angle, Fz, a[0], a[1] * Fz + a[2], slope, a[6] * Fz + a[7]) + lifted, load)
 
     def moment(self, force, slip, load, camber):
         if self.moment_coefficients is None:
@@ -216,8 +216,8 @@ class MagicFormula89(TyreForceLaw):
         slope = (c[3] * Fz + c[4]) * (1.0 - c[6] * leaning) * jnp.exp(-c[5] * Fz)
         curvature = (c[7] * Fz**2 + c[8] * Fz + c[9]) * (1.0 - c[10] * leaning)
         lifted = (c[14] * Fz**2 + c[15] * Fz) * gamma + c[16] * Fz + c[17]
-        shift = _Shift(c[11] * gamma + c[12] * Fz + c[13], lifted)
-        return self._carried(_magic(alpha, Fz, c[0], c[1] * Fz + c[2], slope, curvature, shift), load)
+        angle = alpha + (c[11] * gamma + c[12] * Fz + c[13])
+        return self._carried(_magic(angle, Fz, c[0], c[1] * Fz + c[2], slope, curvature) + lifted, load)
 
     def _in_degrees(self, slip: Component, load: Component, camber: Component) -> tuple[Component, ...]:
         """Slip angle [deg], load [kN], camber [deg]."""
@@ -229,17 +229,10 @@ class MagicFormula89(TyreForceLaw):
         return jnp.where(load > self.largest_load, jnp.nan, 1.0) * jnp.where(load > 0.0, value, 0.0)
 
 
-class _Shift(NamedTuple):
-    across: Component  # Sh [deg]
-    up: Component  # Sv
-
-
-def _magic(
-    alpha: Component, Fz: Component, C: Component, peak: Component, slope: Component, E: Component, shift: _Shift
-) -> Component:
-    """Y of the formula; `peak` and `slope` are D and B C D over the load."""
-    x = slope / (C * peak) * (alpha + shift.across)
-    return Fz * peak * jnp.sin(C * jnp.arctan(x - E * (x - jnp.arctan(x)))) + shift.up
+def _magic(angle: Component, Fz: Component, C: Component, peak: Component, slope: Component, E: Component) -> Component:
+    """Y - Sv of the formula for the angle alpha + Sh [deg]; `peak` and `slope` are D and B C D over the load."""
+    x = slope / (C * peak) * angle
+    return Fz * peak * jnp.sin(C * jnp.arctan(x - E * (x - jnp.arctan(x))))
 
 
 # mechmotum/bicycle-kickplate-model, tire_data.py at commit 6cc4d65, BSD 3-clause, copyright 2023-2024 Jason K. Moore,
@@ -355,11 +348,6 @@ class Tyre(ParametricModule):
             raise TypeError(f"Tyre: `lateral` must be a law of lateral slip or None, got {called(across)}.")
 
     @property
-    def rolls(self) -> bool:
-        """Whether the tyre rolls without any slip."""
-        return self.lateral is None and self.longitudinal is None
-
-    @property
     def laws(self) -> tuple[tuple[str, TyreForceLaw], ...]:
         """The directions in which it slips, with their laws."""
         laws = (("longitudinal", self.longitudinal), ("lateral", self.lateral))
@@ -386,7 +374,7 @@ class Tyre(ParametricModule):
     def residuals(self, contact: Contact) -> list[Any]:
         """Velocity residuals [m/s]: the velocity of the contact minus its slip."""
         v, (along, across) = contact.point.velocity, contact.slip
-        if self.rolls:
+        if not self.laws:
             return [v]
         return [v.dot(contact.heading) - along, v.dot(contact.across) - across, v.dot(contact.normal)]
 
