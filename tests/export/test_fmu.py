@@ -530,6 +530,7 @@ POWERS = {
 }
 
 
+@pytest.mark.slow
 def test_units_as_powers_of_base_units(tmp_path):
     parameters = {f"p{i}": jk.parameter(1.0, unit=unit) for i, unit in enumerate(POWERS)}
     system = type("Units", (Bob,), {"__annotations__": dict.fromkeys(parameters, jk.Scalar), **parameters})()

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
+from jaxkane._integrate.discontinuities import Discontinuities
+from jaxkane._integrate.events import Events
+from jaxkane._integrate.step_control import StepSizeController
 
 
 def test_a_solver_without_error_estimate_requires_a_fixed_step():
@@ -164,3 +167,15 @@ def test_an_invalid_batch_member_takes_no_steps(adjoint):
     np.testing.assert_array_equal(found.stats["steps"][1:], 0)
     np.testing.assert_array_equal(found.t_end, [1.0, 0.0, 0.0])
     np.testing.assert_allclose(slopes, [-np.sin(2.0) / 4, np.nan, np.nan], atol=1e-7)
+
+
+def test_a_step_ends_at_a_discontinuity_or_halfway_to_it():
+    """A short rest before it would make the next proposal fall below the minimum. It is too rare for a simulation."""
+    tolerance, longest, duration = map(jnp.array, (1e-7, jnp.inf, 2.0))
+    stops = Discontinuities(jnp.array([0.5, 1.0]), jumps=False, restart=False)
+    none = Events((), (), (), (), False, False)
+    for length in (0.1, 0.3, 0.5 - 1e-9, 0.5, 0.7, 1.2):
+        first = jnp.array(length)
+        control = StepSizeController(tolerance, tolerance, None, first, longest, duration, stops, None, none)
+        end, _ = control.init(None, jnp.array(0.0), duration, jnp.zeros(1), None, None, None, 5)
+        assert end == 0.5 or end == min(length, 0.25)
