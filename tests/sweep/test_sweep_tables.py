@@ -213,7 +213,7 @@ def test_a_row_is_a_mapping(read):
 
     none = jk.sweep.sweep(PENDULUM, start, TS, table={"push": []}, **STEPS)
     assert none.q.shape == (0, 6, 2)
-    with pytest.raises(ValueError, match="push has no effect|columns push have no effect"):
+    with pytest.raises(ValueError, match="push has no effect"):
         jk.sweep.sweep(PENDULUM, lambda system, row: REST, TS, table={"push": []}, **STEPS)
 
 
