@@ -167,13 +167,14 @@ def test_temporary_files_of_a_killed_writer_are_removed(name, tmp_path, rides):
 @pytest.mark.parametrize(
     ("bytes_", "message"),
     [
-        (b"", r"sweep\.json cannot be read \(.*damaged.*Choose another folder, or delete"),
-        (bytes(100), r"sweep\.json cannot be read"),
-        (b"\xff\xfe\x00", r"sweep\.json cannot be read"),
-        (b'{"system": {"cl', r"sweep\.json cannot be read"),
-        (b"[1, 2]", r"sweep\.json is not the manifest of a sweep"),
-        (b'{"name": "vacuum"}', r"sweep\.json is not the manifest of a sweep"),
-        (b'{"system": {}, "times": "", "layout": {}}', r"an earlier version of jaxkane"),
+        *(
+            (text, r"sweep\.json is damaged, or not the manifest of a sweep: .*Choose another folder, or delete")
+            for text in (b"", bytes(100), b"\xff\xfe\x00", b'{"system": {"cl', b"[1, 2]", b'{"name": "vacuum"}')
+        ),
+        (
+            b'{"system": {}, "times": "", "layout": {}}',
+            r"differs in .*program \(nothing there",
+        ),
     ],
 )
 def test_unreadable_manifests_are_rejected(bytes_, message, copy):
@@ -234,12 +235,11 @@ def test_swapped_chunks_are_recomputed(copy, finished, rides):
 
 def test_a_file_instead_of_a_folder_is_rejected(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match=r"file is a file\. Pass the name of a folder"):
-        run(tmp_path / "file")
-    with pytest.raises(OSError, match=r"sweep.json could not be written: .* A part of the path is a file"):
-        run(tmp_path / "file" / "sweep")
+    for folder in ("file", "file/sweep"):
+        with pytest.raises(OSError, match=r"sweep.json could not be written: .* A part of the path is a file"):
+            run(tmp_path / folder)
     (tmp_path / "other" / "sweep.json").mkdir(parents=True)
-    with pytest.raises(ValueError, match=r"sweep.json is a folder, not the manifest of a sweep"):
+    with pytest.raises(ValueError, match=r"sweep.json is damaged, or not the manifest of a sweep"):
         run(tmp_path / "other")
 
 
@@ -352,13 +352,11 @@ def test_a_missing_manifest_is_rewritten_only_for_chunks_of_the_same_sweep(copy,
         np.testing.assert_array_equal(run(copy).q, rides.q)
     assert contents(copy) == contents(finished)
     (copy / "sweep.json").unlink()
-    with pytest.raises(
-        ValueError, match=r"has no sweep.json, and its 3 chunks belong to another sweep or cannot be read"
-    ):
+    with pytest.raises(ValueError, match=r"has no sweep.json, and its 3 files are not the chunks of this sweep"):
         run(copy, table={"mass": np.linspace(1.0, 3.0, 70)})
     only_damaged = tmp_path_factory.mktemp("damaged")
     (only_damaged / "chunk-00000000.npz").write_bytes(b"damaged")
-    with pytest.raises(ValueError, match=r"has no sweep.json, and its 1 chunks"):
+    with pytest.raises(ValueError, match=r"has no sweep.json, and its 1 files"):
         run(only_damaged)
 
 
@@ -404,7 +402,7 @@ def test_duplicate_values_and_invalid_options_are_rejected():
             jk.sweep.sweep(*arguments, TS, table=table, **options)
     with pytest.raises(TypeError, match="The column 'mass' of a table is traced"):
         jax.jit(lambda mass: jk.sweep.sweep(Drop(), REST, TS, table={"mass": mass}).q)(np.ones(2))
-    with pytest.raises(ValueError, match="grid: label is text"):
+    with pytest.raises(ValueError, match=r"grid: label must be a row of numbers .* labels in a dict"):
         jk.sweep.grid(label=["a", "b"])
     for push in (np.arange(5.0), np.ma.array([[1.0], [2.0]], mask=[[True], [False]])):
         with pytest.raises(ValueError, match="The input 'push'"):
