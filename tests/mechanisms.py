@@ -1,5 +1,6 @@
 """Systems that tests of several rooms use."""
 
+import dataclasses
 import itertools
 
 import equinox as eqx
@@ -345,3 +346,28 @@ class Sled(jk.System):
     def loads(self, t, q, u, motion, inputs):
         force = inputs["force"] - self.drag * u["v"] - self.stiffness * q["x"]
         return jk.Force(force * motion.N.x, motion["sled"])
+
+
+def moved(system, ts, q, u, u_dep=None):
+    """A trajectory of given coordinates and speeds, without solving anything."""
+    n = len(ts)
+    dep = np.zeros((n, len(system.dependent_speeds))) if u_dep is None else u_dep
+    x = np.zeros((n, len(system.states)))
+    inputs = {name: jnp.zeros(n) for name in system.inputs}
+    stats = {name: jnp.asarray(n) for name in ("steps", "accepted", "rejected")}
+    return jk.Trajectory(
+        **{name: jnp.asarray(array) for name, array in dict(t=ts, q=q, u=u, u_dep=dep, x=x).items()},
+        inputs=inputs,
+        outputs={},
+        status=jnp.asarray(0),
+        t_end=jnp.asarray(ts[-1]),
+        stats=stats,
+        names=(system.coordinates, system.speeds, system.dependent_speeds, system.states),
+        events=(),
+        adjoint="none",
+    )
+
+
+def declared(system):
+    """The declarations of a system's parameters by name, with `positive`, `shape`, `unit` and `within`."""
+    return {f.name: f.metadata["jaxkane"] for f in dataclasses.fields(system) if "jaxkane" in f.metadata}

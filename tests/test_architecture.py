@@ -152,13 +152,6 @@ def test_the_names_for_type_checkers_are_those_of_the_module():
         assert getattr(importlib.import_module(module), name) is getattr(jk, name)
 
 
-def test_fit_exports_at_most_46_names():
-    """Classes that are only returned stay in the modules of their functions."""
-    tree = ast.parse((SOURCE / "fit" / "__init__.py").read_text(encoding="utf-8"))
-    names = [alias.asname for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
-    assert len(names) == len(set(names)) <= 46
-
-
 def test_every_public_name_has_a_docstring():
     rooms = (jk.loads, jk.sensors, jk.fit, jk.sweep, jk.stability, jk.catalog, jk.bicycles, jk.rotations)
     for module in (jk, *rooms, jk.symbolic, jk.export):

@@ -567,7 +567,7 @@ WITH_USES: dict[str, dict[str, Any]] = {
         "simulate": SAMPLES_OF_FUNCTIONS,
         "derivatives": "integrate/test_laws_of_simulations.py::test_reverse_derivatives_equal_forward_derivatives",
         "sweep": "sweep/test_sweep.py::test_input_samples_with_different_times_and_missing_values",
-        "fit": "fit/test_transcriptions.py::test_inputs_with_shared_times_share_discontinuities",
+        "fit": "fit/test_transcriptions.py::test_gradients_by_a_delay_with_shared_and_separate_sample_times",
         "collocation": "collocation/test_invariance.py::test_inputs_and_systems_that_depend_on_time",
         "orbit": "test_samples_over_one_period_force_an_orbit",
         "filter": Refused(lambda: predicted(samples()), r"must be one number, got Samples"),

@@ -5,15 +5,15 @@ time in their declared units. Results are divided by the factors of their units 
 """
 
 import dataclasses
+import re
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import pytest
+from mechanisms import declared
 
 import jaxkane as jk
-from jaxkane._system.parameters import parameter_info
-from jaxkane._system.system import units_of
 from jaxkane.catalog import CATALOG, WhippleBicycle
 from jaxkane.stability import equilibrium, linearize, lqr, steady_turn
 
@@ -39,11 +39,12 @@ class Units(NamedTuple):
 
     def of(self, system, names) -> np.ndarray:
         """The factors (n,) of coordinates, speeds and inputs by name; Euler parameters have no unit."""
-        units = units_of(system)
-        return np.array([self.factor(units.get(k, "")) for k in names])
+        units, rate = system.units, re.compile("_(dot|rate)$")
+        found = [units.get(k) or (units.get(rate.sub("", k), "") + "/s") * bool(rate.search(k)) for k in names]
+        return np.array([self.factor(unit) if unit != "/s" else 1.0 for unit in found])
 
     def system(self, system):
-        info = parameter_info(system)
+        info = declared(system)
         new = {
             k: getattr(system, k) * np.asarray(self.factor(x.unit), getattr(system, k).dtype) for k, x in info.items()
         }
@@ -52,7 +53,7 @@ class Units(NamedTuple):
 
 def unlimited(cls):
     """The class without limits in units, such as the 20 m that no part of a bicycle exceeds."""
-    limits = {k: x for k, x in parameter_info(cls).items() if x.unit != "rad" and np.isfinite(x.within).any()}
+    limits = {k: x for k, x in declared(cls).items() if x.unit != "rad" and np.isfinite(x.within).any()}
     fields = {k: jk.parameter(positive=x.positive, unit=x.unit) for k, x in limits.items()}
     fields["g"] = jk.parameter(9.81, unit="m/s^2")
     return type(cls)(cls.__name__, (cls,), {"__annotations__": dict.fromkeys(fields, jk.Scalar), **fields})
@@ -65,7 +66,7 @@ def example(name, dtype=np.float64):
     """A system of the catalogue, its generic state and its equilibrium's guess, in one precision."""
     entry, system = CATALOG[name], CATALOG[name].example()
     if isinstance(system, WhippleBicycle):
-        system = BICYCLE(**{k: getattr(system, k) for k in parameter_info(system)})
+        system = BICYCLE(**{k: getattr(system, k) for k in declared(system)})
     system = jax.tree.map(lambda x: x.astype(dtype), system)
     return system, np.array(entry.q, dtype), np.array(entry.u, dtype)
 

@@ -8,13 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import moved
+from programs import operations
 
 import jaxkane as jk
 from jaxkane import Status
-from jaxkane._animate._figures import Sketch, figure_of
-from jaxkane._kane.kanes_method import _motion_rates
-from jaxkane._scalarjit.program import Program
-from jaxkane._system.parameters import with_parameters
 from jaxkane.bicycles import (
     Arms,
     Bicycle,
@@ -263,10 +261,10 @@ def test_invalid_batches_of_part_parameters_are_rejected():
     with pytest.raises(ValueError, match=r"rider\.stiffness \(a column of the table, and in a batch of Bicycle"):
         sweep(batch, start, ts, table={"rider.stiffness": stiffness})
     arms = with_arms()
-    longer = with_parameters(arms, {"extra[0].fore_length": 0.35, "rider.mass": 40.0, "mB": 50.0})
+    longer = arms.with_parts(**{"extra[0].fore_length": 0.35, "rider.mass": 40.0, "mB": 50.0})
     assert [float(x) for x in (longer.extra[0].fore_length, longer.rider.mass, longer.mB)] == [0.35, 40.0, 50.0]
     with pytest.raises(ValueError, match="these arms reach"):
-        with_parameters(arms, {"extra[0].fore_length": 0.01})
+        arms.with_parts(**{"extra[0].fore_length": 0.01})
 
 
 @pytest.mark.slow
@@ -337,23 +335,20 @@ def test_arms_scale_with_the_mass_and_height_of_the_person():
     assert float(arms.elbow_damping) == 2.0
 
 
+@pytest.mark.weekly
 def test_riders_and_their_parts_are_drawn():
     """The picture's lines end where the arms' joints, the tyres' sides and the trailer are."""
     tyre = Tyre(crown=0.02)
     bicycle = with_arms().with_parts(rear_tyre=tyre, front_tyre=tyre)
     bicycle = bicycle.with_parts(extra=[*bicycle.extra, trailer()])
-    motion = bicycle.motion(
-        0.0,
-        jnp.zeros(len(bicycle.coordinates)),
-        jnp.zeros(len(bicycle.speeds) + len(bicycle.dependent_speeds)),
-    )
-    sketch = Sketch(motion)
-    figure_of(bicycle)(bicycle, motion, sketch)
-    ends = np.concatenate([np.array(element.places).reshape(-1, 3) for element in sketch.elements])
+    q, u = jnp.zeros(len(bicycle.coordinates)), jnp.zeros(len(bicycle.speeds) + len(bicycle.dependent_speeds))
+    motion = bicycle.motion(0.0, q, u)
+    still = moved(bicycle, np.linspace(0.0, 0.1, 3), jnp.tile(q, (3, 1)), jnp.zeros((3, len(bicycle.speeds))))
+    ends = jk.animate(bicycle, still).scene.at(0.0)[0][0] * [1.0, -1.0, -1.0]  # N.z is down, and the page's z is up
     for name in ("left_shoulder", "right_elbow", "left_hand", "hitch", "rider"):
         place = motion[name].center if name == "rider" else motion[name]
-        assert np.linalg.norm(ends - np.array(place.position.to(motion.N)), axis=1).min() < 1e-12, name
-    assert np.abs(np.abs(ends[:, 1]) - 0.02).min() < 1e-12
+        assert np.linalg.norm(ends - np.array(place.position.to(motion.N)), axis=1).min() < 1e-6, name
+    assert np.abs(np.abs(ends[:, 1]) - 0.02).min() < 1e-6
 
 
 @pytest.mark.weekly
@@ -394,8 +389,4 @@ def test_a_bicycle_with_arms_is_one_program_of_scalars():
     """About 6500 operations, against 2000 of the bicycle alone: the loops are solved block by block."""
     bicycle = with_arms()
     q, u = jnp.full(len(bicycle.coordinates), 0.01), jnp.zeros(len(bicycle.speeds))
-    args = (bicycle, jnp.array(0.0), q, u, dict.fromkeys(bicycle.inputs, jnp.array(0.0)))
-    leaves, treedef = jax.tree.flatten(args)
-    program = Program(jax.make_jaxpr(lambda *x: _motion_rates.__wrapped__(*jax.tree.unflatten(treedef, x)))(*leaves))
-    assert program.is_fusable
-    assert len(program.program.jaxpr.eqns) <= 6600
+    assert operations("rates", bicycle, q, u) <= 6600

@@ -14,27 +14,37 @@ from jaxkane.catalog import CATALOG, WhippleBicycle, read_bicycle_file
 RTOL = 1e-11
 
 
-def with_a_passenger(kind):
-    """A particle on a rail of its own that touches nothing: its coordinate stands behind the others, its speed among
-    them, before those that are dependent or auxiliary."""
+def with_passengers(kind, count=1):
+    """Particles on rails of their own that touch nothing. Their coordinates are behind the others, their speeds before
+    those that are dependent or auxiliary."""
+    names = [f"extra{i}" for i in range(count)]
 
     class Extended(kind):
-        coordinates = (*kind.coordinates, "extra")
-        speeds = (*kind.speeds, "extra_speed")
+        coordinates = (*kind.coordinates, *names)
+        speeds = (*kind.speeds, *(f"{name}_speed" for name in names))
 
         def q_dot(self, t, q, u):
             own = kind.q_dot(self, t, q, u)
-            return (*tuple(own)[: len(kind.coordinates)], u["extra_speed"])
+            return (*tuple(own)[: len(kind.coordinates)], *(u[f"{name}_speed"] for name in names))
 
         def motion(self, t, q, u):
             motion = kind.motion(self, t, q, u)
-            P = jk.Point.at(u["extra_speed"] * motion.N.x, q["extra"] * motion.N.x)
-            return motion.extended(jk.Body(0.7, 0.0, P, name="passenger"), points={"rail": P})
+            rails = {n: jk.Point.at(u[f"{n}_speed"] * motion.N.x, q[n] * motion.N.x) for n in names}
+            return motion.extended([jk.Body(0.7, 0.0, P, name=f"passenger {n}") for n, P in rails.items()])
 
         def loads(self, t, q, u, motion, inputs):
-            return kind.loads(self, t, q, u, motion, inputs), jk.Force(2.1 * motion.N.x, motion["passenger"])
+            own = kind.loads(self, t, q, u, motion, inputs)
+            return own, [jk.Force(2.1 * motion.N.x, motion[f"passenger {n}"]) for n in names]
 
     return Extended
+
+
+def copied(kind, system):
+    return kind(**{field: getattr(system, field) for field in vars(system)})
+
+
+def flat(loads):
+    return [each for x in loads for each in flat(x)] if isinstance(loads, (tuple, list)) else [loads]
 
 
 def numbers(vectors):
@@ -47,8 +57,7 @@ def test_every_entry_can_be_extended_by_inheritance(name):
     entry, rng = CATALOG[name], np.random.default_rng(0)
     system = entry.example()
     kind = type(system)
-    values = {field: getattr(system, field) for field in vars(system)}
-    extended = with_a_passenger(kind)(**values)
+    extended = copied(with_passengers(kind), system)
     n = len(kind.speeds)
     u = [*entry.u, *rng.uniform(0.5, 1.0, len(kind.dependent_speeds) + len(kind.auxiliary_speeds))]
     inputs = {name: 0.1 * (i + 1) for i, name in enumerate(kind.inputs)}
@@ -68,30 +77,34 @@ def test_every_entry_can_be_extended_by_inheritance(name):
         np.array(s.configuration_constraints(0.3, q), float) for s, q in ((system, entry.q), (extended, beside[1]))
     ]
     np.testing.assert_allclose(new, old, atol=1e-13)
-    loads = [
-        jk._system.motion.flatten_loads(s.loads(*where, motion, inputs))
-        for s, where, motion in ((system, at, here), (extended, beside, there))
-    ]
-    active = [np.array(numbers([load.vector for load in found])) for found in loads]
-    kept = [
-        row
-        for row, load in zip(active[1], loads[1], strict=True)
-        if getattr(load, "point", None) is None or load.point is not there["passenger"].center
-    ]
-    np.testing.assert_allclose(np.array(kept).reshape(-1, 3), active[0].reshape(-1, 3), rtol=1e-13, atol=1e-13)
+    P = there["passenger extra0"].center
+    old, (new, _) = system.loads(*at, here, inputs), extended.loads(*beside, there, inputs)
+    new = [load for load in flat(new) if getattr(load, "point", None) is not P]  # not its weight
+    active = [np.array(numbers([load.vector for load in flat(loads)])).reshape(-1, 3) for loads in (new, old)]
+    np.testing.assert_allclose(*active, rtol=1e-13, atol=1e-13)
 
 
 @pytest.mark.slow
-def test_an_independent_added_body_does_not_change_the_other_accelerations():
-    """The same through the method, of an entry with dependent speeds, and one with auxiliary ones."""
-    for name in ("WhippleBicycle", "BarWithPiston"):
-        entry = CATALOG[name]
-        system = entry.example()
-        extended = with_a_passenger(type(system))(**{field: getattr(system, field) for field in vars(system)})
-        found = jk.accelerations(extended, 0.0, jnp.array([*entry.q, 5.0]), jnp.array([*entry.u, 0.25]))
-        expected = jk.accelerations(system, 0.0, jnp.array(entry.q), jnp.array(entry.u))
-        np.testing.assert_allclose(found[:-1], expected, rtol=RTOL)
-        assert float(found[-1]) == pytest.approx(3.0, rel=RTOL)
+@pytest.mark.parametrize("count", [1, pytest.param(12, marks=pytest.mark.weekly)])
+@pytest.mark.parametrize("name", ["WhippleBicycle", "BarWithPiston", "DoublePendulum"])
+def test_independent_added_bodies_do_not_change_the_other_accelerations(name, count):
+    """With dependent, auxiliary and independent speeds. With more than 12 speeds, LAPACK solves for them."""
+    entry = CATALOG[name]
+    system, q, u = entry.example(), jnp.array(entry.q), jnp.array(entry.u)
+    extended, more = copied(with_passengers(type(system), count), system), jnp.ones(count)
+
+    @jax.jit
+    def rates_and_slopes(system, q, u):
+        rates = lambda q, u: jk.accelerations(system, 0.0, q, u)[: len(entry.u)]  # noqa: E731
+        slopes = jax.jvp(rates, (q, u), (jnp.ones_like(q), jnp.ones_like(u)))
+        return *slopes, *jax.grad(lambda q, u: rates(q, u)[-1], argnums=(0, 1))(q, u)
+
+    found = rates_and_slopes(extended, jnp.append(q, 5.0 * more), jnp.append(u, 0.25 * more))
+    for new, old in zip(found, rates_and_slopes(system, q, u), strict=True):
+        np.testing.assert_allclose(new[: len(old)], old, rtol=1e-10, atol=1e-10)
+    assert float(jk.accelerations(extended, 0.0, [*entry.q, *5.0 * more], [*entry.u, *0.25 * more])[-1]) == (
+        pytest.approx(3.0, rel=RTOL)
+    )
 
 
 class Loaded(WhippleBicycle):

@@ -80,16 +80,6 @@ def test_a_second_interrupt_ends_the_program(solver):
         solve(fastest(), intervals=4, solver=Interrupted(solver, 6, times=2))
 
 
-def test_interrupt_between_two_meshes_keeps_the_solution(monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("jaxkane.collocation._solve.local_errors", interrupted)
-    plan = solve(fastest(), intervals=4)
-    assert (plan.ok, plan.reason) == (False, "interrupted")
-    assert plan.violation < 1e-6
-
-
 @dataclasses.dataclass
 class OnlyCoarse:
     """A solver that fails on the second mesh."""

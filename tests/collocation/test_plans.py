@@ -12,9 +12,6 @@ from mechanisms import RodOnPin, Sled
 
 import jaxkane as jk
 from jaxkane.collocation import Phases, Problem, continuation, solve
-from jaxkane.collocation._guess import detours
-from jaxkane.collocation._mesh import refined
-from jaxkane.collocation._solve import _guessed
 from jaxkane.fit.inverse.kinematics import kinematic_samples
 
 mpl.use("Agg")
@@ -163,16 +160,6 @@ def test_plans_as_guesses(plan, joined):
     assert len(solve(plan.problem, starts=3, intervals=10, tolerance=None).starts) == 3
 
 
-def test_random_starts_change_every_kind_of_guess(plan):
-    """Also a plan, a simulation and a dict that names the coordinate; both ends keep their values."""
-    s = np.linspace(0.0, 1.0, 5)
-    _, detour = detours(plan.problem, 2)
-    for guess in (None, plan, plan.replay(), {"x": [0.0, 0.3, 1.0]}):
-        same, other = (_guessed(plan.problem, guess, s, d).Y[:, 0] for d in (None, detour))
-        np.testing.assert_allclose(other[[0, -1]], same[[0, -1]], atol=1e-12)
-        assert np.abs(other - same).max() > 0.1
-
-
 def test_continuation():
     """The energy of a mass m is 12 m^2."""
     masses = [1.0, 2.0, 4.0]
@@ -214,15 +201,6 @@ def test_copies_of_plans(plan):
         np.testing.assert_array_equal(other["x"], plan["x"])
         assert other.cost == plan.cost
         assert other.multipliers["x"][-1] == plan.multipliers["x"][-1]
-
-
-@pytest.mark.parametrize(("expected", "n_intervals"), [(0.3, 2), (0.09, 1)])
-def test_intervals_are_merged_below_a_tenth_of_the_tolerance(expected, n_intervals):
-    """The error of a method of order 4 grows with the fifth power of the length, so that of two equal intervals is 32
-    times that of each. `expected`: the error of the merged interval over the tolerance."""
-    tolerance, order = 1e-6, 4
-    errors = np.full(2, expected * tolerance / 2 ** (order + 1))
-    assert len(refined(np.array([0.0, 0.5, 1.0]), errors, tolerance, order)) - 1 == n_intervals
 
 
 @pytest.mark.weekly

@@ -13,9 +13,7 @@ from scipy import stats
 from systems import Cart
 
 import jaxkane as jk
-from jaxkane._kane.constraint_residuals import configuration_residual
 from jaxkane.estimate import Belief, Filter, begin, nees, predict, update
-from jaxkane.estimate._square_root import moments
 
 H, Q, SIGMA = 0.1, 0.2, {"x": 0.02, "x_dot": 0.1}
 CART = Cart(mass=1.0, stiffness=4.0, damping=0.3)
@@ -234,47 +232,6 @@ def test_unscented_estimates_do_not_depend_on_the_covariance_root():
     assert one.deviation()[2] == 0.0
 
 
-def bent(v, w):
-    return jnp.stack([v[0] * v[1] + v[2] ** 2, jnp.sin(v[0]) + w[0] * v[1] + 2.0 * w[1], v[0] ** 3 - v[2]])
-
-
-@pytest.mark.weekly
-@pytest.mark.parametrize("rank", [3, 2])
-def test_moments_of_a_function_have_exact_derivatives(rank):
-    """Of the mean, the covariance, and the covariance with what follows from the same x."""
-    rng, amplitude = np.random.default_rng(2), jnp.array([0.3, 0.2])
-    m, others = jnp.asarray(rng.normal(size=3)), jnp.asarray(rng.normal(size=(2, 5)))
-    own, turn = rng.normal(size=(3, rank)), rng.normal(size=(rank, 5))
-
-    def all_of(x):
-        S = jnp.asarray(own + x[0] * np.flip(own, 0) ** 2) @ jnp.asarray(turn + x[0] * turn**2)
-        mean, A = moments(bent, m + x, S, amplitude, "unscented")
-        return mean, A @ A.T, A[:, :5] @ (others + x[0]).T
-
-    at, d = jnp.zeros(1), 1e-5
-    slopes, all_of = jax.jit(jax.jacfwd(all_of)), jax.jit(all_of)
-    for slope, high, low in zip(slopes(at), all_of(at + d), all_of(at - d), strict=True):
-        np.testing.assert_allclose(slope[..., 0], (high - low) / (2 * d), rtol=1e-6, atol=1e-7)
-
-
-@pytest.mark.slow_cases("3")
-@pytest.mark.parametrize("rank", [3, 2])
-def test_moments_of_a_function_equal_those_of_sigma_points(rank):
-    rng, amplitude = np.random.default_rng(2), jnp.array([0.3, 0.2])
-    m, S = rng.normal(size=3), rng.normal(size=(3, rank)) @ rng.normal(size=(rank, 5))
-    S[2] *= 1e-6  # another unit
-    L = symmetric(S @ S.T)
-    points = np.array([m + s * 3**0.5 * d for s in (1, -1) for d in L.T])
-    ends = np.array([bent(v, np.zeros(2)) for v in points])
-    C = np.array([(bent(m, w) - bent(m, -w)) / 2 for w in np.diag(amplitude)]).T
-    mean, A = moments(bent, jnp.asarray(m), jnp.asarray(S), amplitude, "unscented")
-    np.testing.assert_allclose(mean, ends.mean(axis=0), rtol=1e-7)
-    np.testing.assert_allclose(A @ A.T, np.cov(ends.T, bias=True) + C @ C.T, rtol=1e-6, atol=1e-9)
-    if rank == 3:  # the covariance with m + S x
-        across = (points - m).T @ (ends - ends.mean(axis=0)) / 6
-        np.testing.assert_allclose(S @ A[:, :5].T, across, rtol=1e-7, atol=1e-12)
-
-
 @pytest.mark.weekly
 @METHODS
 def test_derivatives_of_smoothed_and_late_states_are_exact(method):
@@ -446,7 +403,7 @@ def test_filter_estimates_satisfy_the_constraints():
     belief = begin(filter, start, {"roll": 0.1, "roll_rate": 0.1, "steer": 0.1, "steer_rate": 0.1})
     truth = jk.simulate(bicycle, start, np.arange(0.0, 0.11, 0.01))
     step = jax.jit(lambda belief, y: update(filter, predict(filter, belief, 0.01), y)[0])
-    residual = lambda q: configuration_residual(bicycle, jnp.zeros(()), q)  # noqa: E731
+    residual = lambda q: jnp.stack(bicycle.configuration_constraints(0.0, q))  # noqa: E731
 
     @jax.jit
     def off_and_along(q, root):
@@ -552,7 +509,7 @@ def test_beliefs_and_true_states_of_another_filter_are_rejected():
 def test_nees_does_not_depend_on_units():
     """Among metres and nanometres: five deviations of the small one are 25, and a combination without variance is 0."""
     S = jnp.array([[1.0, 0.0], [0.0, 1e-9]])
-    of = lambda S, error: float(nees(Belief(jnp.zeros(1), jnp.zeros((1, 2)), S[None]), jnp.array(error)))  # noqa: E731
+    of = lambda S, error: float(nees(Belief(jnp.zeros(1), jnp.zeros((1, 2)), S[None], jnp.zeros(())), jnp.array(error)))  # noqa: E731
     assert of(S, [0.0, 5e-9]) == pytest.approx(25.0)
     assert of(jnp.array([[1.0, 0.0], [1e-9, 0.0]]), [2.0, 2e-9]) == pytest.approx(4.0)
     assert of(jnp.zeros((2, 2)), [1.0, 1.0]) == 0.0

@@ -6,7 +6,6 @@ from systems import PUSH, SEEN, Cart, Track
 from systems import T as t
 
 import jaxkane as jk
-from jaxkane._common.files import differences
 from jaxkane.fit import (
     LeastSquares,
     Problem,
@@ -21,7 +20,6 @@ from jaxkane.fit import (
     profile,
     report,
 )
-from jaxkane.fit.solve.checkpoints import described
 
 TRIALS = [Trial(t, {"x": SEEN + 0.01 * k}, {"push": PUSH}, sigma=0.1, initial={"x_dot": 0.0}) for k in (0, 1)]
 FREE = ["gain", "drift"]
@@ -118,20 +116,6 @@ def test_a_fit_of_another_problem_is_refused(path):
             ValueError, match=rf"a.npz contains the fit of another problem, which differs in .*{message}"
         ):
             load(path, other)
-
-
-@pytest.mark.slow
-def test_a_difference_in_a_fixed_parameter_is_reported():
-    there, here = (
-        described(pose(Track(gain=gain), free=["drift"], simulation=Simulation(step=0.1))) for gain in (1.0, 2.5)
-    )
-    assert differences(there, here) == "fixed parameter gain (1.0 there, 2.5 here)"
-
-
-def test_an_option_of_only_one_problem_is_reported_as_a_difference():
-    fewer, more = {"trials": 2}, {"trials": 2, "option": {"step": 0.1}}
-    assert differences(fewer, more) == "option step (nothing there, 0.1 here)"
-    assert differences(more, fewer) == "option step (0.1 there, nothing here)"
 
 
 def test_a_file_without_a_fit_is_rejected(path, tmp_path):

@@ -335,31 +335,6 @@ class Pulled(jk.System):
         return (jk.Force((inputs["right"] - inputs["left"]) * motion.N.x, motion["cart"]),)
 
 
-@pytest.mark.parametrize(
-    ("own", "kinks", "restart"), [((), 11, False), ((Delay("left", each="trial"),), 2 * 11, True)], ids=str
-)
-def test_inputs_with_shared_times_share_discontinuities(own, kinks, restart, monkeypatch):
-    from jaxkane._integrate import integrate
-
-    seen, original = [], integrate.discontinuities_of
-    monkeypatch.setattr(
-        integrate, "discontinuities_of", lambda *a, **options: seen.append(original(*a, **options)) or seen[-1]
-    )
-    t = np.linspace(0.0, 1.0, 11)
-    trial = Trial(t, {"x": 0.1 * t**2}, {"left": np.sin(t), "right": np.cos(t)}, sigma=0.1)
-    problem = Problem.of(Pulled(), trial, ("mass", *own), simulation=Simulation(rtol=1e-6))
-    window = jax.tree.map(lambda x: x[0], problem.windows)
-    jax.eval_shape(
-        problem.model.simulate,
-        window,
-        window.start,
-        problem.start.window_starts[0],
-        problem.start.trial_unknowns[0],
-        problem.start.parameters,
-    )
-    assert [(each.times.shape[0], each.restart) for each in seen] == [(kinks, restart)]
-
-
 @pytest.mark.weekly
 def test_gradients_by_a_delay_with_shared_and_separate_sample_times():
     # x(1) = int (1 - t) f(t - s) dt for a delay s; by parts, its slope at s = 0 is -int (1 - t) f'(t) dt.

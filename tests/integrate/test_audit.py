@@ -10,7 +10,6 @@ from mechanisms import Bead
 from test_events import TOP, Particle
 
 import jaxkane as jk
-from jaxkane._integrate.audit import Pieces
 from jaxkane.catalog import CATALOG
 
 RTOL = 1e-8
@@ -102,13 +101,6 @@ def test_non_finite_samples_within_the_trajectory_raise(place):
             jk.audit(Bead(), spoilt)
 
 
-def test_quadrature_is_exact_for_polynomials_at_uneven_times():
-    t = np.sort(np.random.default_rng(3).uniform(0.0, 2.0, 30))
-    integral = Pieces(t).integral(t, 8 * t**7 - 1.0, 8)
-    np.testing.assert_allclose(integral, t**8 - t - (t[0] ** 8 - t[0]), rtol=0, atol=1e-10)
-    np.testing.assert_allclose(Pieces(t[:2]).integral(t[:2], t[:2], 8)[1], 0.5 * (t[1] ** 2 - t[0] ** 2))
-
-
 KNOTS = np.linspace(0.0, 2.0, 21)
 TORQUE = jk.Samples(KNOTS, np.random.default_rng(5).normal(size=21), zero_order_hold=True)
 
@@ -149,26 +141,6 @@ def test_an_undeclared_input_jump_does_not_fail_the_audit(times):
     audit = jk.audit(system, jk.simulate(system, start, np.linspace(0.0, 2.0, times), drive))
     assert audit.ok
     assert 10 * audit.work_error > np.abs(audit.energy_error).max() > 1e-4
-
-
-def test_piecewise_quadrature_is_exact_for_cubics():
-    """Between jumps, some at the times, some beside them: cubics of random coefficients, continued by zero."""
-    rtol, rng = 1e-11, np.random.default_rng(3)
-    t, jumps = np.linspace(0.0, 2.0, 21), np.array([0.3, 0.55, 0.8, 0.9, 1.42, 2.0])
-    cubics = rng.normal(size=(7, 4))
-    pieces = Pieces(t, jumps, 1e-14)
-    at, number = pieces.t, pieces.piece
-    values = np.array([np.polyval(cubics[i], x) for i, x in zip(number, at)])
-    rates = np.array([np.polyval(np.polyder(cubics[i]), x) for i, x in zip(number, at)])
-    ends = np.concatenate([[0.0], jumps[:-1], [2.0]])
-    exact = np.zeros_like(t)
-    for cubic, start, stop in zip(cubics, ends, ends[1:]):
-        integral = np.polyint(cubic)
-        exact += np.polyval(integral, np.clip(t, start, stop)) - np.polyval(integral, start)
-    np.testing.assert_allclose(pieces.integral(t, values, 4, rates), exact, rtol=rtol, atol=rtol)
-    seven = [np.polyval(np.polyder(c), x) for c, x in zip(cubics[number], at)]
-    known = np.bincount(number)[number] > 3
-    np.testing.assert_allclose(pieces.rate(values)[known], np.array(seven)[known], rtol=1e-8, atol=1e-8)
 
 
 class Oscillator(jk.System):

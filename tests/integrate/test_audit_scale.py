@@ -1,16 +1,12 @@
 """The audit in proportion to the right-hand side, and what it says of loads that nothing feels."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import operations
 
 import jaxkane as jk
-from jaxkane._integrate.audit import _quantities
-from jaxkane._kane import kanes_method as rates
-from jaxkane._scalarjit import components
-from jaxkane._scalarjit.program import Program
 
 TILTS = ((0.3, 0.5, 0.81), (0.7, -0.2, 0.4), (-0.4, 0.6, 0.5))
 
@@ -52,47 +48,18 @@ class TiltedChain(jk.System):
         return jk.weight(motion, -9.81 * motion.N.z)
 
 
-def operations(f, system, *more):
-    """Equations of a program as it is compiled, and what it is."""
-    n, m = len(system.coordinates), len(system.speeds)
-    args = (system, jnp.array(0.4), jnp.full(n, 0.3), jnp.full(m, 0.2), {}, *more)
-    leaves, treedef = jax.tree.flatten(args)
-    program = Program(jax.make_jaxpr(lambda *x: f.__wrapped__(*jax.tree.unflatten(treedef, x)))(*leaves))
-    return len(program.program.jaxpr.eqns), program.is_fusable
-
-
 @pytest.mark.weekly
 @pytest.mark.parametrize("held", [False, True])
 def test_the_audit_takes_no_more_operations_than_the_accelerations(held):
     """It is one plain program, so that nothing is computed twice; and no longer than a right-hand side."""
-    counts = {}
-    for n in (4, 6, 8):
-        system = TiltedChain(n=n, held=held)
-        counts[n], is_fusable = operations(_quantities, system, jnp.ones(n - held))
-        assert is_fusable
-    assert counts[6] < operations(rates._motion_rates, TiltedChain(n=6, held=held))[0]
+
+    def at(n):
+        return TiltedChain(n=n, held=held), jnp.full(n, 0.3), jnp.full(n - held, 0.2)
+
+    counts = {n: operations("audit", *at(n), jnp.ones(n - held)) for n in (4, 6, 8)}
+    assert counts[6] < operations("rates", *at(6))
     # Linear but for the weights and the columns of the constraint, which pass all frames: less than quadratic
     assert counts[8] - counts[6] < 1.6 * (counts[6] - counts[4])
-
-
-@pytest.mark.weekly
-def test_the_audit_of_scalar_and_array_programs_is_the_same(monkeypatch):
-    """The accelerations in one program or by columns and LAPACK: the same table, forces and multipliers."""
-    system = TiltedChain(n=3, held=True)
-    q, u = jnp.array([0.3, -0.2, 0.5]), jnp.array([1.0, -0.5])
-    ride = jk.simulate(system, jk.State(q, u), jnp.linspace(0.0, 0.05, 6))
-    found = []
-    for most in (12, 0):
-        monkeypatch.setattr(components, "_UNROLL_UP_TO", most)
-        jax.clear_caches()
-        audit = jk.audit(system, ride)
-        at = (system, 0.0, q, u)
-        found.append(
-            (audit, jk.constraint_forces(*at), jk.constraint_multipliers(*at), jk.dependent_accelerations(*at))
-        )
-    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-7)  # noqa: E731
-    jax.tree.map(close, *found)
-    assert found[0][0].ok
 
 
 class Rod(jk.System):

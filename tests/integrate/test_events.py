@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from collections.abc import Callable
 
 import diffrax
 import equinox as eqx
@@ -16,7 +17,6 @@ from scipy.special import ellipk
 from slopes import differences, slopes
 
 import jaxkane as jk
-from jaxkane._integrate.events import first_crossing
 
 TS = jnp.linspace(0.0, 2.0, 11)
 
@@ -365,58 +365,42 @@ def test_an_event_of_a_stabilized_simulation():
     np.testing.assert_allclose(ride.end.q, [np.sqrt(0.91), 0.3], atol=1e-6)
 
 
-def test_an_event_without_speeds_does_not_evaluate_accelerations():
-    """A ride without events does as much as ever; one with them looks at coordinates and their rates alone."""
-    from jaxkane._integrate.events import events_of
+class Cubic(jk.System):
+    """A particle with the speed 1 whose event is a cubic polynomial of its place."""
 
-    start = jk.State(jnp.ones(1), jnp.ones(1))
-    assert not events_of(Particle(), TS[0], start).read_rates
-    assert events_of(Particle(ends="roof"), TS[0], start).read_rates
+    p: jax.Array = jk.parameter(shape=(4,))
+    event: Callable = eqx.field(static=True)
+    coordinates, speeds = ("x",), ("v",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x))])
+
+    def events(self, t, q, u):
+        a, b, c, d = (self.p[i] for i in range(4))
+        return {"zero": self.event(((a * q["x"] + b) * q["x"] + c) * q["x"] + d)}
 
 
+@pytest.mark.weekly_cases("falling", "both")
 @pytest.mark.parametrize(
-    ("sign", "way", "first"), [(1, 1, 0.2), (1, -1, 0.5), (1, 0, 0.2), (-1, -1, 0.2), (-1, 1, 0.5)]
+    ("event", "way"), [(jk.rising, 1), (jk.falling, -1), (lambda x: x, 0)], ids=["rising", "falling", "both"]
 )
-def test_the_first_of_two_crossings_in_the_direction_of_a_cubic(sign, way, first):
-    """The roots 0.2, 0.5 and 0.8 are crossed in alternating directions."""
-    atol = 1e-3
-    p = sign * np.poly([0.2, 0.5, 0.8])
-    ends = p[3], p[2], p.sum(), 3 * p[0] + 2 * p[1] + p[2], float(way)
-    np.testing.assert_allclose(first_crossing(*(jnp.array([x]) for x in ends)), first, atol=atol)
-
-
-@pytest.mark.slow
-def test_the_first_crossing_of_cubics():
-    """Against the roots of random cubics, among them those that start on zero, and those that come back at once."""
+def test_the_first_crossing_of_cubics_within_one_step(event, way):
+    """Against the roots of random cubics. Some begin at zero, and some cross zero twice in succession."""
     rng = np.random.default_rng(0)
-    p, direction = rng.normal(size=(300, 4)), rng.integers(-1, 2, size=300)
+    p = rng.normal(size=(100, 4))
     p[::7, 3] = 0.0
-    p[:100:2] = [np.poly([x, x + 0.08, y]) for x, y in rng.uniform([0.1, 1.1], [0.9, 3.0], (50, 2))]
-    ends = (p[:, 3], p[:, 2], p.sum(1), 3 * p[:, 0] + 2 * p[:, 1] + p[:, 2], direction.astype(float))
-    of_one = lambda *x: first_crossing(*(y[None] for y in x))[0]  # noqa: E731
-    found = np.asarray(jax.jit(jax.vmap(of_one))(*map(jnp.asarray, ends)))  # each of them is written out
-    for coefficients, way, x in zip(p, direction, found):
+    p[:40:2] = [np.poly([x, x + 0.08, y]) for x, y in rng.uniform([0.1, 1.1], [0.9, 3.0], (20, 2))]
+    p[1:3] = np.poly([0.2, 0.5, 0.8]), -np.poly([0.2, 0.5, 0.8])
+    ends = jax.jit(jax.vmap(lambda p: jk.simulate(Cubic(p, event), jk.State([0.0], [1.0]), [0.0, 1.0], step=1.0).t_end))
+    for coefficients, t_end in zip(p, np.asarray(ends(p)), strict=True):
         roots = np.roots(coefficients)
         roots = np.sort(roots[np.abs(roots.imag) < 1e-9].real)
         slopes = np.polyval(np.polyder(coefficients), roots)
-        crossings = [r for r, s in zip(roots, slopes) if 1e-9 < r <= 1 and way * s >= 0]
+        crossings = [r for r, s in zip(roots, slopes, strict=True) if 1e-9 < r <= 1 and way * s >= 0]
         if way and coefficients[3] == 0 and way * coefficients[2] > 0:
             crossings = [0.0]
-        first = crossings[0] if crossings else np.inf
-        np.testing.assert_allclose(x, first, atol=0.02)
-        assert (x == 0) == (first == 0)  # a motion ends where it starts only if it starts on its event
-
-
-@pytest.mark.slow
-def test_only_functions_that_are_zero_at_the_start_cross_zero_there():
-    """Values and slopes of any size make double roots, beside which rounding errors send Newton's method anywhere."""
-    rng = np.random.default_rng(0)
-    ends = rng.normal(size=(4, 20_000)) * 10.0 ** rng.uniform(-120, 120, size=(4, 20_000))
-    direction = rng.integers(-1, 2, size=20_000).astype(float)
-    of_one = lambda *x: first_crossing(*(y[None] for y in x))[0]  # noqa: E731
-    x = np.asarray(jax.jit(jax.vmap(of_one))(*map(jnp.asarray, (*ends, direction))))
-    assert np.all((x > 0) & ((x <= 1) | (x == np.inf)))
-    assert np.any(x <= 1)
+        np.testing.assert_allclose(t_end, crossings[0] if crossings else 1.0, atol=1e-7)
 
 
 @pytest.mark.weekly

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._integrate.discontinuities import discontinuities_of
 
 ts = np.linspace(0.0, 1.0, 6)
 values = np.array([1.0, -2.0, 0.5, 3.0, -1.0, 4.0])
@@ -118,14 +117,13 @@ class Earlier(eqx.Module):
         return self.samples(t - self.delay)
 
 
+@pytest.mark.slow_cases(all_but=["asked earlier"])
 @pytest.mark.parametrize("form", FORMS)
 def test_discontinuities_of_samples_called_by_a_function_are_found(form):
-    state = jk.State(jnp.zeros(1), jnp.zeros(1))
-    kinks = discontinuities_of(Cart(), push_of(form, 0.03, True), {}, jnp.array(0.1), state, fixed=False)
-    # Functions are called with the time of the clock, which starts at 0.1 s; the input itself has relative times.
-    found = kinks.times + (0.0 if form == "direct" else 0.1)
-    np.testing.assert_allclose(np.unique(np.round(found, 12)), ts + 0.03, rtol=1e-13)
-    assert kinks.jumps
+    """Steps between jumps are exact, and none is rejected."""
+    ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], push_of(form, 0.03, True))
+    np.testing.assert_allclose(ride["place"][-1], place(1.0, 0.03), rtol=1e-12)
+    assert ride.stats["rejected"] == 0
 
 
 def by_delay(end):

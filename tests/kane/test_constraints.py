@@ -1,7 +1,5 @@
 """Drift of configuration constraints, how it is held, and constraints that cannot be solved."""
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +8,6 @@ from sympy_systems import FourBarLinkage
 
 import jaxkane as jk
 from jaxkane import best_dependent_speeds
-from jaxkane._kane.constraint_residuals import projected, relative_condition
 
 HELD = 1e-9
 
@@ -30,14 +27,6 @@ def test_projection_prevents_drift_of_a_four_bar_linkage_over_a_minute():
     assert free.drift > 10 * HELD
     assert projected.drift < HELD * 1e-3
     assert projected.energy_balance < 1e-5
-
-
-@pytest.mark.slow
-def test_projection_finds_the_nearest_consistent_coordinates():
-    """Of Euler parameters those of the same direction."""
-    entry = jk.catalog.CATALOG["SpinningTop"]
-    q = jnp.array(entry.q)
-    np.testing.assert_allclose(projected(entry.example(), 0.0, 1.01 * q), q, rtol=0, atol=1e-14)
 
 
 def top(**options):
@@ -89,28 +78,26 @@ def test_the_best_dependent_speeds_of_the_bicycle():
     assert len(conditions) == 10  # the best, and three for each of its three speeds
 
 
-class Many(jk.System):
-    """Eighteen particles on a line, with five residuals."""
-
-    C: jk.Scalar = jk.parameter(np.zeros((5, 18)))
-    coordinates = tuple(f"x{i}" for i in range(18))
-    dependent_speeds, speeds = (tuple(f"u{i}" for i in places) for places in (range(13, 18), range(13)))
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        points = [O.moving(q[i] * N.x, u[i] * N.x) for i in range(18)]
-        residuals = [sum(self.C[i, j] * u[j] for j in range(18)) for i in range(5)]
-        return jk.Motion([jk.Body(1.0, 0.0, P, name=f"b{i}") for i, P in enumerate(points)], residuals)
-
-
 def test_the_best_of_many_choices_of_dependent_speeds_is_found():
-    rng = np.random.default_rng(5)
-    for _ in range(3):
-        C = rng.normal(size=(5, 18)) * np.where(np.arange(18) > 5, 1e-4, 1.0)  # 8568 choices; the last are bad
-        chosen = best_dependent_speeds(Many(C), 0.0, np.zeros(18))
-        least = min(relative_condition(C, c) for c in itertools.combinations(range(6), 5))
-        assert chosen.choices[0][1] <= 1.2 * least
-        assert chosen.condition == pytest.approx(relative_condition(C, range(13, 18)))
+    C = np.random.default_rng(5).normal(size=(5, 18)) * np.where(np.arange(18) < 12, 1e-4, 1.0)
+
+    class Many(jk.System):
+        """Particles on rails with 8568 choices, the first of which are bad."""
+
+        coordinates, names = tuple(f"q{i}" for i in range(18)), tuple(f"u{i}" for i in range(18))
+        dependent_speeds, speeds = names[:5], names[5:]
+
+        def q_dot(self, t, q, u):
+            return [u[name] for name in self.names]
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            bodies = [jk.Body(1.0, 0.0, O.moving(q[i] * N.x, u[f"u{i}"] * N.x)) for i in range(18)]
+            return jk.Motion(bodies, [sum(c * u[f"u{i}"] for i, c in enumerate(row)) for row in C])
+
+    chosen = best_dependent_speeds(Many(), 0.0, jnp.zeros(18))
+    assert {int(name[1:]) for name in chosen.best} < set(range(12, 18))
+    assert chosen.condition > 1e3 * chosen.choices[0][1]
 
 
 class Twice(jk.System):
@@ -222,8 +209,6 @@ def test_the_condition_of_a_single_residual_includes_the_other_speeds():
     assert wedge.best == ("vy",)
     assert "for vy it would be 1" in str(wedge)
     assert "well chosen" in str(best_dependent_speeds(Wedge(small=2.0), 0.0, q))
-    scaled = relative_condition(1e6 * np.array([[[1e-9, 1.0]], [[0.0, 1.0]], [[3.0, 4.0]]]), [0])
-    np.testing.assert_allclose(scaled, [1e9, np.inf, 5 / 3], rtol=1e-9)  # the unit of a residual does not matter
 
 
 class Repeated(jk.System):
@@ -249,24 +234,6 @@ class Repeated(jk.System):
         return [h, 2.0 * h, 0.0 * q["z"]]
 
 
-@pytest.mark.slow
-def test_projection_with_redundant_or_zero_residuals_is_differentiable():
-    q = jnp.array([0.6001, 0.8001, 0.3])
-
-    def nearest(q, radius):
-        return projected(Repeated(radius), 0.0, q, steps=2)
-
-    def right(q, radius):
-        return jnp.concatenate([radius * q[:2] / jnp.linalg.norm(q[:2]), q[2:]])
-
-    def with_derivatives(f):
-        modes = f, jax.jacfwd(f, (0, 1)), jax.jacrev(f, (0, 1))
-        return jax.jit(lambda q, radius: [mode(q, radius) for mode in modes])(q, 1.0)
-
-    found, expected = map(with_derivatives, (nearest, right))
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=1e-9), found, expected)
-
-
 @pytest.mark.weekly
 def test_stabilization_and_projection_work_with_redundant_residuals():
     state = jk.State(jnp.array([0.6, -0.8, 0.0]), jnp.array([1.0, 0.5]))
@@ -275,3 +242,10 @@ def test_stabilization_and_projection_work_with_redundant_residuals():
         ride = jk.simulate(Repeated(), state, ts, step=0.01, **options)
         assert ride.ok
         np.testing.assert_allclose(jnp.sum(ride.q[:, :2] ** 2, axis=1), 1.0, atol=1e-6)
+
+    def radius(r):
+        start = jk.State(jnp.stack([0.6 * r, -0.8 * r, jnp.zeros_like(r)]), state.u)
+        ride = jk.simulate(Repeated(r), start, ts, step=0.01, project=True, adjoint="forward")
+        return jnp.linalg.norm(ride.q[-1, :2])
+
+    assert jax.jacfwd(radius)(1.0) == pytest.approx(1.0, abs=1e-6)

@@ -16,10 +16,6 @@ import pytest
 from systems import POSED, TRIAL, Track
 
 import jaxkane as jk
-from jaxkane._integrate.jumps import JumpTable
-from jaxkane._system.parameters import parameter_info
-from jaxkane._system.system import unit_of, units_of
-from jaxkane.plot._stability import stable_ranges
 
 
 @pytest.fixture(autouse=True, params=["default", "dark_background"])
@@ -68,9 +64,11 @@ def trajectory(status=0, t_end=2.0, batch=()):
 
 
 def test_units_of_rates_follow_from_declared_units():
-    declared = {"roll": "rad", "x": "m", "push": "N"}
-    told = declared | {"roll_rate": "rad/s", "x_dot": "m/s", "yaw": "", "yaw_rate": "", "y_dot": "", "rate": ""}
-    assert {name: unit_of(name, declared) for name in told} == told
+    units = {"roll_rate": "rad/s", "x_dot": "m/s", "heading_rate": "", "y_dot": "", "rate": ""}
+    ride = trajectory()
+    ride = dataclasses.replace(ride, names=(ride.names[0], tuple(units), (), ()), u=jnp.ones((41, 5)))
+    labels = [ax.get_ylabel() for ax in jk.plot.trajectories(ride, list(units))]
+    assert [label.partition("[")[2].rstrip("]") for label in labels] == list(units.values())
 
 
 @pytest.mark.parametrize("name", jk.catalog.CATALOG)
@@ -78,9 +76,9 @@ def test_the_catalogue_declares_its_units(name):
     """All but Euler parameters, which have none."""
     system = jk.catalog.CATALOG[name].example()
     names = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.auxiliary_speeds, *system.inputs)
-    declared = units_of(system)
-    assert [n for n in names if not unit_of(n, declared)] == [n for n in names if re.fullmatch(r"e\d", n)]
-    assert all(info.unit for info in parameter_info(system).values())
+    declared = [n for n in names if {n, re.sub("_(dot|rate)$", "", n)} & system.units.keys()]
+    assert [n for n in names if n not in declared] == [n for n in names if re.fullmatch(r"e\d", n)]
+    assert len(re.findall(r"=[-\d.e]+ \S", repr(system).replace("\n", " "))) == len(vars(system))  # with a unit each
 
 
 def test_plots_of_trajectories_show_names_units_and_the_end(style):
@@ -105,8 +103,8 @@ def test_a_line_has_a_gap_at_each_jump():
     at = np.array([[0.52, 1.0, np.nan], [1.27, np.nan, np.nan]])
     before, after = (jk.State(sign * np.stack([at, at], axis=-1), (sign * at)[..., None]) for sign in (1.0, -1.0))
     inputs = tuple({"steer_torque": sign * at} for sign in (2.0, 3.0))
-    events, count = np.where(np.isfinite(at), 0, -1), np.array([2, 1])
-    jumps = JumpTable(at, events, before, after, at, at[..., None], inputs, count, ("bump",))
+    count = np.array([2, 1])
+    jumps = types.SimpleNamespace(t=at, before=before, after=after, inputs=inputs, count=count)
     rides = dataclasses.replace(
         trajectory(status=np.array([0, 0]), t_end=np.array([2.0, 2.0]), batch=(2,)), jumps=jumps
     )
@@ -182,13 +180,18 @@ def canonical(v):
     return np.linalg.eigvals(np.array(A))
 
 
+def shaded(ax):
+    """The stable ranges."""
+    return [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in ax.patches]
+
+
 def test_eigenvalues_and_the_stable_range(style):
     """1e-3 m/s: weave and capsize speed of Meijaard et al. (2007), between values 0.02 m/s apart."""
     v = np.linspace(0.0, 10.0, 501)
     values = canonical(v)
-    ((start, stop),) = stable_ranges(v, values)
-    assert (start, stop) == pytest.approx((4.29238253634111, 6.02426201538837), abs=1e-3)
     ax = jk.plot.eigenvalues(v, values)
+    ((start, stop),) = shaded(ax)
+    assert (start, stop) == pytest.approx((4.29238253634111, 6.02426201538837), abs=1e-3)
     assert is_legible(ax, style)
     assert {text.get_text() for text in ax.texts} == {"4.29", "6.02"}
     assert ax.get_xlabel() == "parameter"
@@ -211,10 +214,12 @@ def test_the_axis_label_is_the_name_of_the_varied_quantity():
 
 
 def test_stable_ranges_end_at_the_last_finite_value():
-    x = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
-    assert stable_ranges(x, np.array([-1.0, -1.0, 1.0, -1.0, -2.0])[:, None] + 0j) == [(0.0, 1.5), (2.5, 4.0)]
-    assert stable_ranges(x, np.array([-1.0, np.nan, -1.0, -1.0, 0.0])[:, None] + 0j) == [(0.0, 0.0), (2.0, 3.0)]
-    assert stable_ranges(x, np.ones((5, 1)) + 0j) == []
+    for values, ranges in (
+        ([-1.0, -1.0, 1.0, -1.0, -2.0], [(0.0, 1.5), (2.5, 4.0)]),
+        ([-1.0, np.nan, -1.0, -1.0, 0.0], [(0.0, 0.0), (2.0, 3.0)]),
+        ([1.0] * 5, []),
+    ):
+        assert shaded(jk.plot.eigenvalues(np.arange(5.0), np.array(values)[:, None] + 0j)) == ranges
 
 
 @pytest.mark.weekly

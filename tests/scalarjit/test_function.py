@@ -556,3 +556,39 @@ def test_value_and_derivative_are_one_kernel(native):
     along = lambda v: jax.vmap(lambda dv: jax.jvp(f, (v,), (dv,)), out_axes=(None, 0))(jnp.eye(2))  # noqa: E731
     program = jax.jit(along).lower(jnp.array([0.3, 0.7])).as_text()
     assert program.count("stablehlo.custom_call @jaxkane") == 1
+
+
+@ScalarFunction
+def _of_the_first(x, y):
+    return jnp.sin(x) + 1.0
+
+
+@pytest.mark.slow
+def test_unused_arguments_of_a_program_are_not_computed(native):
+    def f(x):
+        return _of_the_first(x, jnp.exp(x))
+
+    lowered = jax.jit(f).lower(jnp.array(0.5))
+    assert "exponential" not in lowered.compile().as_text()
+    assert float(jax.jit(f)(jnp.array(0.5))) == pytest.approx(np.sin(0.5) + 1.0, rel=1e-15)
+    batch = jax.jit(jax.vmap(lambda x, y: _of_the_first(x, y), in_axes=(None, 0)))(jnp.array(0.5), jnp.arange(3.0))
+    np.testing.assert_allclose(batch, np.sin(0.5) + 1.0, rtol=1e-15)
+    slope = jax.jit(jax.grad(lambda x, y: _of_the_first(x, y), argnums=(0, 1)))(0.5, 2.0)
+    np.testing.assert_allclose(slope, [np.cos(0.5), 0.0], rtol=1e-15)
+
+
+@ScalarFunction
+def _doubled_if_positive(x):
+    positive = x > 0
+    return jnp.where(positive, 2.0 * x, x), positive
+
+
+@pytest.mark.slow
+def test_a_program_with_boolean_results_is_differentiable(kernels):
+    value = lambda x: _doubled_if_positive(x)[0]  # noqa: E731
+    for x, slope in ((0.7, 2.0), (-0.7, 1.0)):
+        assert jax.jit(jax.grad(value))(x) == slope
+        (_, told), (x_dot, _) = jax.jit(lambda x: jax.jvp(_doubled_if_positive, (x,), (1.0,)))(x)
+        assert x_dot == slope
+        assert told == (x > 0)
+    np.testing.assert_array_equal(jax.jit(jax.vmap(jax.grad(value)))(jnp.array([-1.0, 1.0])), [1.0, 2.0])

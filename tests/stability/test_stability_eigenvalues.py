@@ -16,7 +16,7 @@ import jaxkane as jk
 from jaxkane import Scalar, parameter
 from jaxkane.bicycles import sharp_motorcycle
 from jaxkane.stability import critical_speeds, eigenvalues, linearize, straight_ahead
-from jaxkane.stability._modes import _assigned, _numbers, _track_and_name, conjugate_pairs, track
+from jaxkane.stability._modes import _track_and_name, conjugate_pairs, track
 
 BIKE = jk.catalog.WhippleBicycle.benchmark()
 PUBLISHED = json.loads((Path(__file__).parents[1] / "data" / "meijaard2007.json").read_text())
@@ -373,29 +373,6 @@ def test_an_ambiguous_mode_name_is_omitted_with_a_warning():
     with pytest.warns(UserWarning, match="the modes weave, .*capsize.* cannot be identified and are numbered"):
         found = eigenvalues(BIKE, speeds)
     assert found.modes[0] == "mode 1"
-
-
-def test_an_unnamed_conjugate_pair_is_one_mode():
-    """Two pairs at all values, a pair that becomes real, and two real modes that are always real."""
-    pair, other = np.array([-1 + 2j, -1 - 2j]), np.array([-3 + 0.5j, -3 - 0.5j])
-    splits = np.array([[-4 + 1j, -4 - 1j], [-4.0, -5.0], [-3.0, -6.0]])
-    values = np.stack([np.concatenate([pair, other[::-1], row, [-7.0, -8.0]]) for row in splits])
-    assert _numbers(values).tolist() == [0, 0, 3, 3, 4, 5, 6, 7]
-    assert _numbers(values[:1]).tolist() == [0, 0, 3, 3, 4, 4, 6, 7]
-    assert _numbers(values[:0]).tolist() == list(range(8))
-
-
-def test_a_conjugate_pair_is_continued_by_a_conjugate_pair():
-    """Where the least sum of changes would continue a pair by a real eigenvalue and by one of another pair."""
-    last = np.array([-3.9 + 5.3j, -3.9 - 5.3j, -17 + 34j, -17 - 34j])
-    values = np.array([-4.5 + 16j, -4.5 - 16j, -21.0, -57.0])
-    change = np.array([[0.2, 9, 0.3, 9], [9, 0.1, 0.3, 9], [0.3, 9, 9, 0.5], [9, 0.9, 0.4, 0.5]])
-    change[0, 2], change[1, 2] = 0.05, 0.05
-    assert np.argmin(change[0]) == 2
-    order = _assigned(change, last, values)
-    assert order[:2].tolist() == [0, 1]
-    assert sorted(order[2:].tolist()) == [2, 3]
-    assert _assigned(np.ones((4, 4)) - np.eye(4), last, values).tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.weekly

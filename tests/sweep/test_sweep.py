@@ -7,7 +7,6 @@ from mechanisms import Bead, Slider
 
 import jaxkane as jk
 from jaxkane.catalog import DoublePendulum
-from jaxkane.sweep._chunks import Task
 
 TS = np.linspace(0.0, 1.0, 6)
 
@@ -45,22 +44,13 @@ def test_members_equal_separate_simulations(rides):
 
 
 @pytest.mark.weekly
-def test_chunks_on_a_gpu_are_larger_and_one_batch(monkeypatch):
-    sizes, solve = [], Task.solve
-
-    def counted(task, members, size):
-        sizes.append(size)
-        return solve(task, members, size)
-
-    monkeypatch.setattr(Task, "solve", counted)
-    # The library reads nothing else about the device, so this test compares both on any device.
-    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
-    here = jk.sweep.sweep(Ring(), starts(300), TS)
-    assert sizes == [256, 256]
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    there = jk.sweep.sweep(Ring(), starts(300), TS)
-    assert sizes[2:] == [320]  # ten groups
-    np.testing.assert_allclose(there.q, here.q, rtol=0, atol=1e-12)
+def test_chunks_on_a_gpu_are_larger_and_one_batch(monkeypatch, tmp_path):
+    found = {}
+    for device in ("cpu", "gpu"):  # the library reads nothing else about the device
+        monkeypatch.setattr(jax, "default_backend", lambda device=device: device)
+        found[device] = jk.sweep.sweep(Ring(), starts(300), TS, folder=tmp_path / device)
+    assert [len([*(tmp_path / device).glob("*.npz")]) for device in found] == [2, 1]
+    np.testing.assert_allclose(found["gpu"].q, found["cpu"].q, rtol=0, atol=1e-12)
 
 
 @pytest.mark.weekly

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tqdm
 
 import jaxkane as jk
 from jaxkane.catalog import DoublePendulum
@@ -78,6 +79,18 @@ def rides(folder):
     return run(folder)
 
 
+def fail_after_two_chunks(patch, error):
+    """The progress bar is updated after each chunk."""
+    calls = []
+
+    def update(bar, n=1):
+        calls.append(n)
+        if len(calls) == 2:
+            raise error
+
+    patch.setattr(tqdm.tqdm, "update", update)
+
+
 def same(a, b):
     for name in ("q", "u", "status", "t_end"):
         x, y = np.asarray(getattr(a, name)), np.asarray(getattr(b, name))
@@ -115,18 +128,9 @@ def test_an_unreadable_chunk_is_recomputed(rides, tmp_path):
 @pytest.mark.slow_cases("folder")
 @pytest.mark.parametrize("kept", [True, False], ids=["folder", "memory"])
 def test_unfinished_members_are_interrupted_and_not_saved(rides, tmp_path, monkeypatch, kept):
-    import jaxkane.sweep._chunks as solving
-
-    calls, original = [], solving._solve
-
-    def interrupted(*args):
-        calls.append(1)
-        if len(calls) > 2:
-            raise KeyboardInterrupt
-        return original(*args)
-
-    monkeypatch.setattr(solving, "_solve", interrupted)
-    part = run(tmp_path if kept else None)
+    with monkeypatch.context() as patch:
+        fail_after_two_chunks(patch, KeyboardInterrupt)
+        part = run(tmp_path if kept else None)
     assert part.counts == {"interrupted": 600 - 64, "completed": 64}
     done, whole = (x.q.reshape(600, 4, 2) for x in (part, rides))
     np.testing.assert_array_equal(done[:64], whole[:64])
@@ -134,7 +138,6 @@ def test_unfinished_members_are_interrupted_and_not_saved(rides, tmp_path, monke
     if not kept:
         return
     assert len(chunks(tmp_path)) == 2
-    monkeypatch.setattr(solving, "_solve", original)
     same(run(tmp_path), rides)
 
 

@@ -12,7 +12,6 @@ from mechanisms import RodOnPin
 
 import jaxkane as jk
 from jaxkane.catalog import DoublePendulum, WhippleBicycle
-from jaxkane.sweep._members import Row, as_table, members_of, start_of
 
 PENDULUM = DoublePendulum(mass=1.0, length=1.0)
 REST = jk.State(np.zeros(2), np.zeros(2))
@@ -92,12 +91,11 @@ def test_a_table_with_labels_and_an_initial_state_function():
     np.testing.assert_array_equal(jk.sweep.sweep(PENDULUM, start, TS, table=pandas.DataFrame(table)).q, swept.q)
 
 
+@pytest.mark.slow
 def test_dependent_coordinates_are_assembled_for_each_parameter_value():
-    start, lengths = jk.State([0.3, 0.95], [0.0]), [1.0, 1.2]
-    members, shared, _ = members_of(RodOnPin(1.0), start, None, jk.sweep.grid(length=lengths), TS, TS.dtype)
-    for i, length in enumerate(lengths):
-        y, x = start_of(jax.tree.map(lambda column, i=i: column[i], members), shared, 0.0).q
-        np.testing.assert_allclose([y, x], [0.3, (length**2 - 0.3**2) ** 0.5], rtol=1e-12)
+    start, lengths = jk.State([0.3, 0.95], [0.0]), np.array([1.0, 1.2])
+    rides = jk.sweep.sweep(RodOnPin(1.0), start, [0.0, 0.05], table={"length": lengths}, **STEPS)
+    np.testing.assert_allclose(rides.q[:, 0], np.stack([[0.3, 0.3], np.sqrt(lengths**2 - 0.3**2)], 1), rtol=1e-12)
 
 
 @pytest.mark.weekly
@@ -180,15 +178,13 @@ class Anchored(jk.System):
 ANCHORED = jk.State(np.zeros(1), np.zeros(1))
 
 
+@pytest.mark.slow
 def test_one_array_as_a_batch_and_as_a_shared_vector():
     both = jnp.array([1.0, 2.0, 4.0])
     system = Anchored(mass=both, anchor=both)
     assert system.mass is system.anchor
-    members, shared, n = members_of(system, ANCHORED, None, None, jnp.asarray(TS), TS.dtype)
-    assert n == 3
-    assert members[0].anchor is None
-    np.testing.assert_array_equal(members[0].mass, both)
-    np.testing.assert_array_equal(shared[0].anchor, both)
+    rides = jk.sweep.sweep(system, ANCHORED, [0.0, 0.05], step=0.05, solver=diffrax.Euler())
+    np.testing.assert_allclose(rides["v"][:, -1], 0.05 * 17.0 / both, rtol=1e-12)
 
 
 def test_an_ambiguous_column_is_rejected():
@@ -208,18 +204,17 @@ def test_an_ambiguous_column_is_rejected():
         lambda row: next(iter(row.values())),
     ],
 )
-def test_a_row_supports_the_mapping_methods(read):
-    row = Row({"push": 1.0})
-    assert "push" in row
-    assert not row.read
-    assert read(row) == 1.0
-    assert row.read == {"push"}
+def test_a_row_is_a_mapping(read):
+    """A column that the function does not read would be refused."""
 
+    def start(system, row):
+        assert "push" in row
+        return jk.State(jnp.stack([read(row), row.get("other", 0.0)]), jnp.zeros(2))
 
-def test_an_unpacked_row_is_marked_as_read():
-    start = lambda system, row: jk.State(jnp.stack([dict(**row)["push"], row.get("other", 0.0)]), jnp.zeros(2))  # noqa: E731
-    table = jk.sweep._members.as_table({"push": [0.1, 0.2]})
-    assert members_of(PENDULUM, start, None, table, jnp.asarray(TS), TS.dtype)[2] == 2
+    none = jk.sweep.sweep(PENDULUM, start, TS, table={"push": []}, **STEPS)
+    assert none.q.shape == (0, 6, 2)
+    with pytest.raises(ValueError, match="push has no effect"):
+        jk.sweep.sweep(PENDULUM, lambda system, row: REST, TS, table={"push": []}, **STEPS)
 
 
 def test_grids_that_are_refused():
@@ -249,6 +244,9 @@ def test_a_column_read_by_a_function_is_not_assigned_by_name():
 
 @pytest.mark.parametrize("values", [[True, False], np.array([True, False]), [True, 2.0]])
 def test_boolean_columns_are_rejected(values):
-    for make in (lambda: jk.sweep.grid(mass=values), lambda: as_table({"mass": values})):
+    for make in (
+        lambda: jk.sweep.grid(mass=values),
+        lambda: jk.sweep.sweep(PENDULUM, REST, TS, table={"mass": values}),
+    ):
         with pytest.raises(ValueError, match=r"'mass' must be a row of numbers.* Write booleans as numbers"):
             make()

@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import operations
 
 import jaxkane as jk
-from jaxkane._kane.kanes_method import _motion_rates
-from jaxkane._scalarjit.jaxpr import is_fusable
 from jaxkane.fit import Free, LeastSquares, Trial, fit
 
 ts = np.linspace(0.0, 3.0, 61)
@@ -70,9 +69,7 @@ def test_a_system_with_a_learned_law_is_one_program_of_scalars(pendulum):
         warnings.simplefilter("error")
         found = jk.accelerations(pendulum, 0.0, [0.3], [2.0])
     assert float(found[0]) == pytest.approx(by_hand(pendulum, 0.3, 2.0), rel=1e-13)
-    arrays = (jnp.zeros(()), jnp.array([0.3]), jnp.array([2.0]), {})
-    program = jax.make_jaxpr(lambda p, *args: _motion_rates.__wrapped__(p, *args))(pendulum, *arrays)
-    assert is_fusable(program.jaxpr)
+    assert operations("rates", pendulum, [0.3], [2.0])
 
 
 @pytest.mark.weekly

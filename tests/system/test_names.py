@@ -7,7 +7,6 @@ import pytest
 from mechanisms import OnACircle
 
 import jaxkane as jk
-from jaxkane._common.lookup import hint
 
 PENDULUM = jk.catalog.DoublePendulum()
 TS = jnp.array([0.0, 0.1])
@@ -19,12 +18,13 @@ def ride():
 
 
 def test_a_hint_is_short():
-    many = [f"angle{i}" for i in range(49)]
-    assert hint("wobble", many).endswith("... (49 in all).")
-    assert len(hint("wobble", many)) < 150
-    assert hint("angel7", many) == "did you mean 'angle7' or 'angle47'?"
-    assert hint(["stear", "nothing"], ["steer", "roll"]) == "did you mean 'steer' for 'stear'?"
-    assert hint("x", []) == "there are none."
+    names = {"coordinates": tuple(f"angle{i}" for i in range(49)), "speeds": tuple(f"rate{i}" for i in range(49))}
+    many = type("Many", (type(PENDULUM),), names)()
+    with pytest.raises(ValueError, match=r"\.\.\. \(49 in all\)") as raised:
+        jk.accelerations(many, 0.0, {"wobble": 0.1}, {})
+    assert len(str(raised.value)) < 250
+    with pytest.raises(ValueError, match="did you mean 'angle7' or 'angle47'"):
+        jk.accelerations(many, 0.0, {"angel7": 0.1}, {})
 
 
 @pytest.mark.slow

@@ -182,7 +182,7 @@ def _solved(
     # forward mode parameters are not packed, because members of a batch may share some of them.
     stepped = system if settings.is_forward else Packed.of(system, start.dtype)
     spare = fixed and last_stage_is_spare(settings.solver)
-    only_samples = isinstance(signals, dict) and len(samples_of(signals)) == len(signals)
+    only_samples = isinstance(signals, dict) and all(map(is_samples, signals.values()))
     has_pieces = found is not None and not (only_samples and discontinuities is None and not readers)
     if found is not None:
         # No step begins at the end of the simulation.

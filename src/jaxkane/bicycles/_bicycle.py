@@ -19,22 +19,21 @@ from .._common.lookup import not_there, refuse_unknown
 from .._kane.arguments import as_row, is_concrete
 from .._kane.right_hand_side import named_row
 from .._scalarjit.components import Component, add, component, total
-from .._system.kinematics import Frame, Point, Vector
-from .._system.motion import DuplicateName
+from .._system.kinematics import Frame, Point, Vector, inertial
+from .._system.motion import Body, DuplicateName
 from .._system.parameters import parameters_in, with_parameters
 from .._system.system import NamedVector
 from ..catalog.bicycle import WhippleBicycle
+from ._equipment import HeadTwist
 from ._files import as_meijaard, read_yaml
 from ._ground import Ground, Slope
-from ._kinematics import FRONT, REAR, bicycle_motion, clearance, contact_rates, off_road, wheels
-from ._part import NAMES, BicycleMotion, Part, called
-from ._rider import rider_of
-from ._steering import HeadTwist
+from ._part import NAMES, BicycleMotion, Contact, Part, called
 from ._tyre import Tyre
 
 OFF_ROAD = 1e-3
 """[m]: a simulation on a `Road` ends if the distance of a contact from the road exceeds this value."""
 
+REAR, FRONT = "rear", "front"
 _ORDER = "rider, control, steering, drive, extra"
 _SECOND_OF_A_KIND = "Values are read by name. For a second part of this kind, write your own Part with other names."
 _ASIDE = ("_lateral_slip", "_lateral_deflection")
@@ -97,12 +96,19 @@ class Bicycle(WhippleBicycle):
             for part in _as_tuple(getattr(self, field)):
                 if not isinstance(part, Part):
                     raise TypeError(f"{name}: `{field}` must be a Part of jaxkane.bicycles, got {called(part)}.")
-        _refuse_equal_names(self)
+        owners: dict[tuple[str, str], str] = {}  # values are read by name
+        for _, place, part in self._placed_parts():
+            for named in ((kind, each) for kind in NAMES for each in getattr(part, kind)):
+                if owners.setdefault(named, place) != place:
+                    raise ValueError(
+                        f"{name}: the name {named[1]!r} appears twice in `{named[0]}`: in {owners[named]} and in "
+                        f"{place}. {_SECOND_OF_A_KIND}"
+                    )
         known = (*self.coordinates, *self.speeds, *self.dependent_speeds, *self.states)
         for part in self.parts:
             part.check(self)
             refuse_unknown(part.lateral(), known, f"{_method(part, 'lateral')}: {name} has no")
-        for end, tyre, radius in ((REAR, self.rear_tyre, self.rR), (FRONT, self.front_tyre, self.rF)):
+        for end, tyre, radius in self._tyres():
             crown = tyre.crown
             if crown is None or not is_concrete(crown, radius) or crown.ndim or radius.ndim:
                 continue  # members of a batch are not checked
@@ -143,16 +149,27 @@ class Bicycle(WhippleBicycle):
             return super().from_file(path)
         kind, values = read_yaml(path)
         try:
-            parameters, rider = as_meijaard(kind, values)
-            return cls.from_parameters(parameters | ({} if rider is None else {"rider": rider_of(rider)}))
+            return cls.from_parameters(as_meijaard(kind, values))
         except ValueError as error:
             raise ValueError(f"{os.fspath(path)}: {error}") from None
 
     @property
     def parts(self) -> tuple[Part, ...]:
         """All parts, in the order in which their methods are called. Tyres are not included."""
-        values = (getattr(self, field.name) for field in dataclasses.fields(self))
-        return tuple(part for value in values for part in _as_tuple(value) if isinstance(part, Part))
+        return tuple(part for _, _, part in self._placed_parts())
+
+    def _placed_parts(self) -> Iterator[tuple[str, str, Part]]:
+        """Each part with the name of its field and its place, e.g. "extra[0], a Trailer"."""
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            for i, part in enumerate(_as_tuple(value)):
+                if isinstance(part, Part):
+                    index = f"[{i}]" if isinstance(value, (tuple, list)) else ""
+                    yield field.name, f"{field.name}{index}, {called(part)}", part
+
+    def _tyres(self) -> tuple[tuple[str, Tyre, Component], ...]:
+        """Each tyre with the name of its end and the radius of its wheel."""
+        return (REAR, self.rear_tyre, self.rR), (FRONT, self.front_tyre, self.rF)
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -206,7 +223,7 @@ class Bicycle(WhippleBicycle):
             for part in self.parts
             for name in part.coordinates
         )
-        return resists or moves or any(tyre.rolling_resistance is not None for _, tyre in _tyres(self))
+        return resists or moves or any(tyre.rolling_resistance is not None for _, tyre, _ in self._tyres())
 
     @property
     def mode_groups(self) -> dict[str, tuple[str, ...]]:
@@ -218,17 +235,16 @@ class Bicycle(WhippleBicycle):
         for end in (REAR, FRONT):
             names = (f"{end}_lateral_slip", f"{end}_lateral_deflection")
             groups[f"{end} tyre"] = tuple(name for name in names if name in lateral)
-        for field in dataclasses.fields(self):
-            parts = [part for part in _as_tuple(getattr(self, field.name)) if isinstance(part, Part)]
-            groups[field.name] = tuple(name for part in parts for name in part.lateral())
-        elastic = [groups.pop("head"), *([groups.pop("front tyre")] if len(groups["front tyre"]) == 2 else [])]
+        for field, _, part in self._placed_parts():
+            groups[field] = (*groups.get(field, ()), *part.lateral())
+        elastic = [groups.pop("head", ()), *([groups.pop("front tyre")] if len(groups["front tyre"]) == 2 else [])]
         groups |= dict(zip(("wobble", "front end"), [names for names in elastic if names], strict=False))
         return {name: names for name, names in groups.items() if names}
 
     def q_dot(self, t, q, u):
         turning = [u[f"{name}_rate"] for name in ("roll", "rear_wheel", "steer", "yaw", "pitch", "front_wheel")]
         road: Any = self.road
-        rates = road.rates(q["x"], q["y"], q["yaw"], *contact_rates(self, q, u))
+        rates = road.rates(q["x"], q["y"], q["yaw"], *self._contact_rates(q, u))
         moving = list(rates)
         if road.curved:
             moving += [*(u[name] for name in _front_speeds(self)), road.climbing(q["x"], q["y"], rates)]
@@ -245,10 +261,133 @@ class Bicycle(WhippleBicycle):
         return x, -self.rR - x * sin / cos
 
     def motion(self, t, q, u):
-        motion = bicycle_motion(self, q, u)
-        for part in self.parts:
-            motion = _motion_with(self, part, motion, t, q, u)
+        motion = self._motion_without_parts(q, u)
+        for _, place, part in self._placed_parts():
+            try:
+                extended = part.motion(self, motion, t, q, u)
+            except DuplicateName as error:
+                raise ValueError(f"{type(self).__name__}: {place}: {error} {_SECOND_OF_A_KIND}") from None
+            if not isinstance(extended, BicycleMotion):
+                raise TypeError(
+                    f"{_method(part, 'motion')} must return `motion.extended(...)`, got {_returned(extended)}"
+                )
+            motion = extended
         return motion
+
+    def _motion_without_parts(self, q: NamedVector, u: NamedVector) -> BicycleMotion:
+        N, O = inertial()
+        forward, contact_aside = self._contact_rates(q, u)
+        T = self.road.tangent(
+            N, q["x"], q["y"], lambda: self.road.rates(q["x"], q["y"], q["yaw"], forward, contact_aside)
+        )
+        Y = T.rotate(3, q["yaw"], u["yaw_rate"], "Y")
+        R = Y.rotate(1, q["roll"], u["roll_rate"], "R")
+        B = R.rotate(2, q["pitch"], u["pitch_rate"], "B")  # rear frame
+        tilted = B.rotate(2, self.lam, 0.0, "tilt")
+
+        xS, zS = self.steer_point
+        omega_A = B.angular_velocity + u["rear_wheel_rate"] * B.y
+        along, across = self._slip(REAR, u)
+        place = q["x"] * N.x + q["y"] * N.y
+        if self.road.curved:
+            place = place - q["rear_height"] * N.z
+        r_P_A = -self.rear_tyre.reach(R.z, T.z, self.rR)
+        P = Point(Y.vector(along, across, 0.0), O, place)  # point of the tyre
+        G_A = Point(P.velocity + omega_A.cross(r_P_A), P, r_P_A)
+        G_B = G_A.fixed(self.xB * B.x + (self.zB + self.rR) * B.z)
+        S = G_A.fixed(xS * B.x + (zS + self.rR) * B.z)
+        if self.head is not None:
+            tilted, S = self.head.turned(tilted, S, q, u)
+        C = tilted.rotate(3, q["steer"], u["steer_rate"], "C")  # fork, 3 along the steer axis
+        H = C.rotate(2, -self.lam, 0.0, "H")  # fork, aligned with B at zero steer
+
+        def from_S(x, z):  # measured from P of the upright bicycle, as a vector fixed in the fork
+            return ((x - xS) * H.x + (z - zS) * H.z).express(C)
+
+        G_C = S.fixed(from_S(self.xH, self.zH))
+        G_D = S.fixed(from_S(self.w, -self.rF))
+        omega_D = C.angular_velocity + u["front_wheel_rate"] * C.y
+        normal = self.road.normal(N, *self._front_place(q))
+        n1, _, n3 = normal.components_in(C)
+        down = C.vector(n1, 0.0, n3).normalize()  # in the plane of the front wheel
+        r_D_Q = self.front_tyre.reach(down, normal, self.rF)
+        Q = Point(G_D.velocity + omega_D.cross(r_D_Q), G_D, r_D_Q)
+
+        bodies = self.bodies((G_A, G_B, G_C, G_D), (R, B, H, C), omega_A, omega_D)
+        frames = {"Y": Y, "B": B, "C": C, "H": H}
+        motion = BicycleMotion(bodies, points={"P": P, "Q": Q, "S": S}, frames=frames)
+        motion.rear = Contact(P, Y.x, Y.y, T.z, R.z, q["roll"], forward, (along, across))
+        motion.front, residuals = self._front_contact(Q, C, down, normal, q, u)
+        return motion.extended((), residuals)
+
+    def _front_place(self, q: NamedVector) -> tuple[Component, Component]:
+        return (q["front_x"], q["front_y"]) if self.road.curved else (0.0, 0.0)
+
+    def _slip(self, end: str, u: NamedVector) -> tuple[Component, Component]:
+        """Velocities of a tyre's contact, along the heading and across it [m/s]; exactly zero in rolling."""
+        tyre = self.rear_tyre if end == REAR else self.front_tyre
+        along = 0.0 if tyre.longitudinal is None else u[f"{end}_longitudinal_slip"]
+        return along, 0.0 if tyre.lateral is None else u[f"{end}_lateral_slip"]
+
+    def _contact_rates(self, q: NamedVector, u: NamedVector) -> tuple[Component, Component]:
+        """Velocities of the position of the rear contact on the ground, forward and to the right [m/s].
+
+        For a torus with the crown radius c that rolls without slip: -(spin) (r - c + c cos(roll)) and c * roll_rate.
+        """
+        tyre, (along, across) = self.rear_tyre, self._slip(REAR, u)
+        spin = u["rear_wheel_rate"] + u["pitch_rate"]
+        forward = tyre.rolling_speed(spin, jnp.cos(q["roll"]), self.rR, along)
+        return forward, across if tyre.crown is None else add(across, tyre.crown * u["roll_rate"])
+
+    def _front_contact(
+        self, Q: Point, C: Frame, down: Vector, normal: Vector, q: NamedVector, u: NamedVector
+    ) -> tuple[Contact, list[Any]]:
+        """The front contact and its velocity residuals [m/s].
+
+        The heading is the intersection of the wheel's plane and the ground. The normal n changes, and the fork has the
+        angular velocity omega. The wheel's spin relative to its contact is then front_wheel_rate + (omega . across -
+        heading . n_dot) / cos(camber). The rate of the camber is omega . heading + (axle . n_dot) / cos(camber).
+        """
+        tyre, slip = self.front_tyre, self._slip(FRONT, u)
+        road: Any = self.road
+        heading = C.y.cross(normal).normalize()
+        across = normal.cross(heading)
+        sin_camber, cos_camber = C.y.dot(normal), down.dot(normal)
+        spin = u["front_wheel_rate"] + C.angular_velocity.dot(across) / cos_camber
+        if road.curved:
+            at = (q["front_x"], q["front_y"]), (u["front_x_rate"], u["front_y_rate"])
+            turning = road.normal_rate(C.root, *at[0], at[1])
+            spin = spin - turning.dot(heading) / cos_camber
+        speed = tyre.rolling_speed(spin, cos_camber, self.rF, slip[0])
+        contact = Contact(Q, heading, across, normal, down, jnp.arctan2(sin_camber, cos_camber), speed, slip)
+        residuals = tyre.residuals(contact)
+        if road.curved:
+            aside, moved = slip[1], road.velocity(C.root, *at[0], at[1])
+            if tyre.crown is not None:
+                aside = aside + tyre.crown * (C.angular_velocity.dot(heading) + turning.dot(C.y) / cos_camber)
+            residuals += [moved.dot(heading) - speed, moved.dot(across) - aside]
+        return contact, residuals
+
+    def _wheels(self, motion: Any) -> Iterator[tuple[str, Tyre, Contact, Body, Component]]:
+        for (end, tyre, radius), contact in zip(self._tyres(), (motion.rear, motion.front), strict=True):
+            yield end, tyre, contact, motion[f"{end} wheel"], radius
+
+    def _off_road(self, motion: Any, q: NamedVector) -> list[Component]:
+        """The distances of the contacts from the ground [m]."""
+        Q, N = motion["Q"].position, motion.N
+        road: Any = self.road
+        if not road.curved:
+            return [Q.dot(N.z)]
+        front = Q - road.place(N, *self._front_place(q))
+        return [*(front.dot(axis) for axis in (N.x, N.y, N.z)), q["rear_height"] - road.at(q["x"], q["y"])]
+
+    def _clearance(self, motion: Any) -> Component:
+        """The smaller clearance of both wheels, see `Road.clearance`."""
+        road: Any = self.road
+        wheels = self._wheels(motion)
+        return jnp.minimum(
+            *(road.clearance(motion.N, at, wheel.center, r, tyre.crown) for _, tyre, at, wheel, r in wheels)
+        )
 
     def on_frame(self, motion: Any, x: Component, y: Component, z: Component) -> Point:
         """A point that is fixed in the frame B.
@@ -280,7 +419,7 @@ class Bicycle(WhippleBicycle):
     def tyre_forces(self, motion: Any, values: Mapping[str, Component]) -> dict[str, Component]:
         """Forces of the ground on the slipping tyres [N], e.g. "front_lateral_force". `values` as in `loads`."""
         carried, forces = _loads_with_transfer(self, motion, values), {}
-        for end, tyre, contact, _, _ in wheels(self, motion):
+        for end, tyre, contact, _, _ in self._wheels(motion):
             of_tyre = tyre.forces(contact, carried[end], _deflections_of(end, tyre, values))
             forces |= {f"{end}_{name}_force": force for name, force in of_tyre.items()}
         return forces
@@ -290,7 +429,7 @@ class Bicycle(WhippleBicycle):
         return " and ".join(
             f"the {end} tyre carries {float(carried[end]):.4g} N, more than the largest_load of its "
             f"{type(law).__name__}, {law.largest_load:g} N,"
-            for end, tyre in _tyres(self)
+            for end, tyre, _ in self._tyres()
             for _, law in tyre.laws
             if float(carried[end]) > law.largest_load
         )
@@ -298,7 +437,7 @@ class Bicycle(WhippleBicycle):
     def loads(self, t, q, u, motion, inputs):
         values = _commanded(self, t, q, u, motion, inputs)
         loads: list[Any] = [super().loads(t, q, u, motion, values)]
-        slipping = [each for each in wheels(self, motion) if each[1].laws or each[1].rolling_resistance is not None]
+        slipping = [each for each in self._wheels(motion) if each[1].laws or each[1].rolling_resistance is not None]
         carried = _loads_with_transfer(self, motion, values) if slipping else {}
         for end, tyre, contact, wheel, radius in slipping:
             deflections = _deflections_of(end, tyre, values)
@@ -309,10 +448,10 @@ class Bicycle(WhippleBicycle):
     def state_rates(self, t, q, u, x, motion: Any, now):
         now = now.with_values(_commanded(self, t, q, u, motion, now))
         rates = []
-        for end, tyre, contact, _, _ in wheels(self, motion):
+        for end, tyre, contact, _, _ in self._wheels(motion):
             rates += tyre.deflection_rates(contact, _deflections_of(end, tyre, x))
         carried = _loads_with_transfer(self, motion, now) if _load_transfers(self) else {}
-        for (end, tyre), point, contact in zip(_tyres(self), "PQ", (motion.rear, motion.front), strict=True):
+        for (end, tyre, contact, _, _), point in zip(self._wheels(motion), "PQ", strict=True):
             if tyre.load_lag is not None:
                 load = -now.force(point).dot(contact.normal)
                 rates.append((load - carried[end]) / (_mass(motion) * self.g * tyre.load_lag))
@@ -337,11 +476,11 @@ class Bicycle(WhippleBicycle):
 
     def configuration_constraints(self, t, q):
         motion = _motion_at_rest(self, t, q)
-        residuals = off_road(self, motion, q)
+        residuals = self._off_road(motion, q)
         if self.road.curved:
             # only near a solution: intermediate iterates of a solver must stay finite
             on_road = sum(x * x for x in residuals) < (1e-3 * OFF_ROAD) ** 2
-            refused = on_road & (clearance(self, motion) <= 0.0)
+            refused = on_road & (self._clearance(motion) <= 0.0)
             residuals = [jnp.where(refused, jnp.nan, x) for x in residuals]
         return [*residuals, *(x for part in self.parts for x in part.configuration_constraints(self, t, q, motion))]
 
@@ -351,29 +490,25 @@ class Bicycle(WhippleBicycle):
             return events
         motion = _motion_at_rest(self, t, q)
         # If an edge is narrower than a step of the solver, it is detected by the distance from the road after the step.
-        on_road = 1.0 - sum(x * x for x in off_road(self, motion, q)) / OFF_ROAD**2
-        return {**events, "wheel_touches_twice": clearance(self, motion), "wheel_off_the_road": on_road}
+        on_road = 1.0 - sum(x * x for x in self._off_road(motion, q)) / OFF_ROAD**2
+        return {**events, "wheel_touches_twice": self._clearance(motion), "wheel_off_the_road": on_road}
 
 
 def _of_parts(bicycle: Bicycle, kind: str) -> tuple[str, ...]:
     return tuple(name for part in bicycle.parts for name in getattr(part, kind))
 
 
-def _tyres(bicycle: Bicycle) -> Iterator[tuple[str, Tyre]]:
-    yield from ((REAR, bicycle.rear_tyre), (FRONT, bicycle.front_tyre))
-
-
 def _slip_speeds(bicycle: Bicycle) -> tuple[str, ...]:
-    return tuple(f"{end}_{name}_slip" for end, tyre in _tyres(bicycle) for name, _ in tyre.laws)
+    return tuple(f"{end}_{name}_slip" for end, tyre, _ in bicycle._tyres() for name, _ in tyre.laws)
 
 
 def _deflections(bicycle: Bicycle) -> tuple[str, ...]:
-    return tuple(f"{end}_{name}_deflection" for end, tyre in _tyres(bicycle) for name in tyre.deflects)
+    return tuple(f"{end}_{name}_deflection" for end, tyre, _ in bicycle._tyres() for name in tyre.deflects)
 
 
 def _load_transfers(bicycle: Bicycle) -> tuple[str, ...]:
     """States by which the tyres' loads follow the ground's normal forces."""
-    return tuple(f"{end}_load_transfer" for end, tyre in _tyres(bicycle) if tyre.load_lag is not None)
+    return tuple(f"{end}_load_transfer" for end, tyre, _ in bicycle._tyres() if tyre.load_lag is not None)
 
 
 def _road_coordinates(bicycle: Bicycle) -> tuple[str, ...]:
@@ -382,46 +517,6 @@ def _road_coordinates(bicycle: Bicycle) -> tuple[str, ...]:
 
 def _front_speeds(bicycle: Bicycle) -> tuple[str, ...]:
     return ("front_x_rate", "front_y_rate") if bicycle.road.curved else ()
-
-
-def _places(bicycle: Bicycle) -> list[str]:
-    """The name and kind of each part, e.g. "extra[0], a Trailer". One part may be used twice."""
-    places = []
-    for field in dataclasses.fields(bicycle):
-        value = getattr(bicycle, field.name)
-        for i, part in enumerate(_as_tuple(value)):
-            place = f"{field.name}[{i}]" if isinstance(value, (tuple, list)) else field.name
-            places += [f"{place}, {called(part)}"] * isinstance(part, Part)
-    return places
-
-
-def _refuse_equal_names(bicycle: Bicycle) -> None:
-    """Refuse two parts of one kind: their names are equal, so their values could not be distinguished."""
-    owners: dict[str, int] = {}
-    places = _places(bicycle)
-    for i, part in enumerate(bicycle.parts):
-        for kind in NAMES:
-            for name in getattr(part, kind):
-                if owners.setdefault(name, i) != i:
-                    raise ValueError(
-                        f"{type(bicycle).__name__}: the name {name!r} appears twice in `{kind}`: in "
-                        f"{places[owners[name]]} and in {places[i]}. {_SECOND_OF_A_KIND}"
-                    )
-
-
-def _motion_with(
-    bicycle: Bicycle, part: Part, motion: BicycleMotion, t: Component, q: NamedVector, u: NamedVector
-) -> BicycleMotion:
-    try:
-        extended = part.motion(bicycle, motion, t, q, u)
-    except DuplicateName as error:
-        places = zip(bicycle.parts, _places(bicycle), strict=True)
-        place = next((place for each, place in places if each is part), called(part))
-        raise ValueError(f"{type(bicycle).__name__}: {place}: {error} {_SECOND_OF_A_KIND}") from None
-    if not isinstance(extended, type(motion)):
-        hint = " Does it end without a `return`?" if extended is None else ""
-        raise TypeError(f"{_method(part, 'motion')} must return `motion.extended(...)`, got {extended!r}.{hint}")
-    return extended
 
 
 def _loads_with_transfer(bicycle: Bicycle, motion: Any, values: Mapping[str, Component]) -> dict[str, Component]:
@@ -491,9 +586,12 @@ def _method(part: Part, method: str) -> str:
 
 def _checked_dict(returned: Any, label: str) -> Mapping[str, Any]:
     if not isinstance(returned, Mapping):
-        hint = " Does it end without a `return`?" if returned is None else ""
-        raise TypeError(f"{label} must return a dict of numbers by name, got {returned!r}.{hint}")
+        raise TypeError(f"{label} must return a dict of numbers by name, got {_returned(returned)}")
     return returned
+
+
+def _returned(value: Any) -> str:
+    return f"{value!r}." + " Does it end without a `return`?" * (value is None)
 
 
 def _deflections_of(end: str, tyre: Tyre, values: Any) -> dict[str, Component]:

@@ -15,13 +15,12 @@ from .._common.lookup import as_names, refuse_unknown
 from .._kane.arguments import is_concrete
 from .._scalarjit.components import Component, Scalar, mul, sub
 from .._system.parameters import Learned, learned, parameter, to_float
-from .._system.prints import module_text
 from .._system.system import NamedVector
 from ..catalog.bicycle import TILT
 from ..loads import smooth_abs
 from ..stability import linearize, lqr, straight_ahead
 from ._bicycle import Bicycle
-from ._part import BicycleMotion, Part, check_parameters
+from ._part import BicycleMotion, ParametricModule, Part
 
 STEER = "steer_torque"
 
@@ -110,7 +109,8 @@ class ScheduledGains(Part):
         command = mul(_at(passed, self.follow), values["desired_roll"])
         for i, name in enumerate(self.measured):
             gain = _at(passed, self.gains[:, i])
-            command = sub(command, mul(gain, _state(name, bicycle, q, u, values)))
+            state = next((x[name] for x in (q, u) if name in x), None)
+            command = sub(command, mul(gain, values[name] if state is None else state))
         return {self.command: command}
 
     def _passed(self, v: Component) -> list[Component]:
@@ -129,12 +129,6 @@ def _at(passed: list[Component], values: Any) -> Component:
     for i, share in enumerate(passed):
         value = value + share * (values[i + 1] - values[i])
     return value
-
-
-def _state(name: str, bicycle: Bicycle, q: NamedVector, u: NamedVector, values: Any) -> Component:
-    if name in bicycle.coordinates:
-        return q[name]
-    return u[name] if name in (*bicycle.speeds, *bicycle.dependent_speeds) else values[name]
 
 
 def follow_gain(bicycle: Bicycle, speed: float) -> float:
@@ -202,7 +196,7 @@ def scheduled_lqr(
     return ScheduledGains(speeds, names, np.array(gains), np.array(follow), command)
 
 
-class LaneChange(eqx.Module):
+class LaneChange(ParametricModule):
     """A path y(x) [m] from one lane to another, with continuous curvature.
 
         y = width * s^3 (10 - 15 s + 6 s^2),   s = (x - start) / length from 0 to 1
@@ -218,11 +212,6 @@ class LaneChange(eqx.Module):
     start: Scalar = parameter(10.0, unit="m")
     length: Scalar = parameter(20.0, positive=True, unit="m")
     back: Scalar | None = parameter(None, unit="m")
-
-    __repr__ = module_text
-
-    def __check_init__(self) -> None:
-        check_parameters(self)
 
     def __call__(self, x: Component) -> Component:
         aside = self._passed(x - self.start)

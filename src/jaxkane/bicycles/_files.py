@@ -13,13 +13,14 @@ of names ("parameterizations") can be read:
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 from collections.abc import Mapping
+from typing import Any
 
-from .._common.lookup import decimal_number, hint
-from ..catalog._entry import text_of
+from .._common.lookup import hint
+from ..catalog.bicycle import checked_entries, text_of
+from ._rider import LeaningRider, RigidRider
 
 _HEADER = ("parameterization", "parameters", "rider", "description", "values")
 
@@ -45,59 +46,47 @@ def read_yaml(path: str | os.PathLike[str]) -> tuple[str, ParameterValues]:
         root = yaml.compose(text_of(path), Loader=yaml.SafeLoader)
     except yaml.YAMLError as error:
         raise ValueError(f"{name} is not a YAML file: {error}.") from None
-    header: dict[str, str] = {}
-    values: ParameterValues = {}
-    lines: dict[str, int] = {}
-    faults: list[str] = []
     pairs = list(root.value) if isinstance(root, yaml.MappingNode) else []
     if not pairs:
         raise ValueError(f"{name} must contain lines of the form NAME: number.")
+    header: dict[str, str] = {}
+    entries = []
     for key, node in pairs:  # the list grows by the entries of `values`
-        if key.value in _HEADER:
-            if key.value == "values" and isinstance(node, yaml.MappingNode):
-                pairs += node.value
-            header[key.value] = node.value
+        if key.value not in _HEADER:
+            text = f"{key.value}: {node.value!r}"
+            entries.append((key.start_mark.line + 1, text, key.value, (node.value,)))
             continue
-        line, value = key.start_mark.line + 1, math.nan
-        with contextlib.suppress(ValueError, TypeError):
-            value = decimal_number(node.value)
-        if not math.isfinite(value):
-            faults.append(f"line {line}: {key.value}: {node.value!r} is not of the form NAME: number")
-        elif key.value in lines:
-            faults.append(f"line {line}: {key.value} was given before, on line {lines[key.value]}")
-        else:
-            lines[key.value], values[key.value] = line, value
-    if faults:
-        raise ValueError(f"{name}: " + "; ".join(faults) + ".")
-    return _parameterization(name, header.get("parameterization", ""), values), values
-
-
-def _parameterization(path: str, name: str, values: ParameterValues) -> str:
-    kind = _CALLED.get(name, name) or next((kind for kind, own in _SETS.items() if own in values), "")
+        header[key.value] = node.value
+        if key.value == "values" and isinstance(node, yaml.MappingNode):
+            pairs += node.value
+    values = {key: value for key, (value,) in checked_entries(path, entries, "NAME: number").items()}
+    called = header.get("parameterization", "")
+    kind = _CALLED.get(called, called) or next((kind for kind, own in _SETS.items() if own in values), "")
     if kind not in _SETS:
-        fault = f"the parameterization {name!r} is not known" if name else "the file has no known parameterization"
-        raise ValueError(f"{path}: {fault}; {hint([name], list(_SETS), 'the parameterizations are')}")
-    return kind
+        fault = f"the parameterization {called!r} is not known" if called else "the file has no known parameterization"
+        raise ValueError(f"{name}: {fault}; {hint([called], list(_SETS), 'the parameterizations are')}")
+    return kind, values
 
 
-def as_meijaard(kind: str, values: Mapping[str, float]) -> tuple[ParameterValues, ParameterValues | None]:
-    """Convert a set of parameters to Meijaard's.
+def as_meijaard(kind: str, values: Mapping[str, float]) -> dict[str, Any]:
+    """Convert a set of parameters to those of a `Bicycle`.
 
     **Arguments:**
 
     - `kind`: the name of the set.
     - `values`: numbers by name. The speed `v` is ignored.
 
-    **Returns:** Meijaard's parameters, and those of a separate rider or None. The rider's names are those of
-    `RigidRider`, or of `LeaningRider` if the set contains a hinge.
+    **Returns:** Meijaard's parameters, and "rider" if the set contains one.
 
     **Raises:** `ValueError` with the missing and the unknown names.
     """
     parameters = _Parameters(kind, values)
     parameters.pop("v", 0.0)
-    converted = _CONVERSIONS[kind](parameters)
+    converted, rider = _CONVERSIONS[kind](parameters)
     parameters.refuse_rest()
-    return converted
+    if rider is None:
+        return converted
+    return {**converted, "rider": (LeaningRider if "hinge_z" in rider else RigidRider)(**rider)}
 
 
 class _Parameters(dict[str, float]):

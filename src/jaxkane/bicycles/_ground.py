@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,25 +17,19 @@ import numpy as np
 from .._scalarjit.components import Component, Scalar, add, dot, mul, sub
 from .._system.kinematics import Frame, Point, Vector
 from .._system.parameters import learned, parameter
-from .._system.prints import module_text
 from ..catalog.bicycle import TILT
-from ._part import Contact, check_parameters
+from ._part import Contact, ParametricModule
 
 Pair = tuple[Component, Component]
 TURN = 2.0 * math.pi
 _LOOK = np.outer([-1.0, 1.0], np.linspace(0.05, 1.5, 30)).ravel()  # [rad] from the contact along the tread
 
 
-class Ground(eqx.Module):
+class Ground(ParametricModule):
     """Level ground; the base class of all others."""
 
     curved = False
     """Whether the normal depends on the position (a `Road`). The position of the front contact is then a coordinate."""
-
-    __repr__ = module_text
-
-    def __check_init__(self) -> None:
-        check_parameters(self)
 
     def gravity(self, g: Component, N: Frame) -> Vector:
         """The acceleration of gravity [m/s^2]."""

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
-
-import numpy as np
 
 from ._bicycle import Bicycle
 from ._files import as_meijaard
-from ._rider import rider_of
-from ._tyre import Tyre
-from ._tyre_laws import LateralSlip
+from ._rider import without
+from ._tyre import LateralSlip, Tyre
 
 # BicycleParameters 1.5.2, `parameter_dicts.mooreriderlean2012_browser_jason`, with the names of Moore (2012), *Human
 # control of a bicycle*: the measured Batavus Browser, with the legs of a rider in its rear frame C. The upper body G is
@@ -37,9 +33,8 @@ def browser_jason(stiffness: float = 0.0, damping: float = 0.0) -> Bicycle:
 
     - `stiffness` [N m/rad], `damping` [N m s/rad]: of the rider's hinge; both are zero in the source.
     """
-    parameters, rider = as_meijaard("MooreRiderLean2012", {**_BROWSER_JASON, "k9": stiffness, "c9": damping})
-    assert rider is not None  # this set of names contains a rider
-    return Bicycle.from_parameters({**parameters, "rider": rider_of(rider)})
+    values = {**_BROWSER_JASON, "k9": stiffness, "c9": damping}
+    return Bicycle.from_parameters(as_meijaard("MooreRiderLean2012", values))
 
 
 def toroidal(rear_crown: float = 0.02, front_crown: float = 0.02) -> Bicycle:
@@ -78,27 +73,23 @@ def sharp_motorcycle() -> Bicycle:
     cos, sin = math.cos(_EPSILON), math.sin(_EPSILON)
     wheelbase = _B + (_A - _TRAIL) / cos
     # x forward, z down, from the rear contact; the axes of the front frame's inertias are rotated by epsilon
-    rear = _Mass(_REAR_MASS, _B, -_H, _symmetric(_REAR_ROLL, 21.0, _REAR_YAW, -_REAR_PRODUCT))
+    rear = _REAR_MASS, _B, -_H, _REAR_ROLL, 21.0, _REAR_YAW, -_REAR_PRODUCT
     front_x = _B + (_A + _E) * cos - _F * sin
     front_z = -(_A + _E) * sin - _F * cos
-    front_inertia = _symmetric(
-        _FRONT_ACROSS * cos**2 + _FRONT_ALONG * sin**2,
-        0.65,
-        _FRONT_ACROSS * sin**2 + _FRONT_ALONG * cos**2,
-        (_FRONT_ALONG - _FRONT_ACROSS) * sin * cos,
-    )
-    front = _Mass(_FRONT_MASS, front_x, front_z, front_inertia)
-    rear_wheel = _Mass(1.0, 0.0, -1.0, np.diag([0.4, 0.0, 0.4]))
-    front_wheel = _Mass(0.5, wheelbase, -1.0, np.diag([0.5 * _FRONT_POLAR, 0.0, 0.5 * _FRONT_POLAR]))
+    front_roll = _FRONT_ACROSS * cos**2 + _FRONT_ALONG * sin**2
+    front_yaw = _FRONT_ACROSS * sin**2 + _FRONT_ALONG * cos**2
+    front = _FRONT_MASS, front_x, front_z, front_roll, 0.65, front_yaw, (_FRONT_ALONG - _FRONT_ACROSS) * sin * cos
+    rear_wheel = 1.0, 0.0, -1.0, 0.4, 0.0, 0.4, 0.0
+    front_wheel = 0.5, wheelbase, -1.0, 0.5 * _FRONT_POLAR, 0.0, 0.5 * _FRONT_POLAR, 0.0
     parameters = {"w": wheelbase * FOOT, "c": _TRAIL / cos * FOOT, "lam": _EPSILON, "g": 32.2 * FOOT}
     parameters |= {"rR": FOOT, "rF": FOOT, "steer_damping": 5.0 * POUND * FOOT}
     for end, wheel, polar in (("R", rear_wheel, _REAR_POLAR), ("F", front_wheel, _FRONT_POLAR)):
-        parameters[f"m{end}"] = wheel.mass * SLUG
-        parameters |= {f"I{end}xx": wheel.inertia[0, 0] * _INERTIA, f"I{end}yy": polar * _INERTIA}
-    for end, frame in (("B", rear.without(rear_wheel)), ("H", front.without(front_wheel))):
-        parameters |= {f"m{end}": frame.mass * SLUG, f"x{end}": frame.x * FOOT, f"z{end}": frame.z * FOOT}
-        for axes, (i, j) in {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xz": (0, 2)}.items():
-            parameters[f"I{end}{axes}"] = frame.inertia[i, j] * _INERTIA
+        parameters |= {f"m{end}": wheel[0] * SLUG, f"I{end}xx": wheel[3] * _INERTIA, f"I{end}yy": polar * _INERTIA}
+    units = SLUG, FOOT, FOOT, *[_INERTIA] * 4
+    for end, body, wheel in (("B", rear, rear_wheel), ("H", front, front_wheel)):
+        names = f"m{end}", f"x{end}", f"z{end}", f"I{end}xx", f"I{end}yy", f"I{end}zz", f"I{end}xz"
+        values = without(body, wheel)
+        parameters |= {name: value * unit for name, value, unit in zip(names, values, units, strict=True)}
     return Bicycle(**parameters).with_parts(rear_tyre=_tyre(3559.0, 298.0), front_tyre=_tyre(2512.0, 211.0))
 
 
@@ -106,29 +97,3 @@ def _tyre(cornering: float, camber: float) -> Tyre:
     """A tyre from stiffnesses in lb/rad."""
     stiffness = {"cornering_stiffness": cornering * POUND, "camber_stiffness": camber * POUND}
     return Tyre(lateral=LateralSlip(**stiffness, relaxation_length=0.8 * FOOT))
-
-
-class _Mass(NamedTuple):
-    """A body in the plane of symmetry: its mass, the position x, z of its mass centre, and its inertia (3, 3) about
-    it."""
-
-    mass: float
-    x: float
-    z: float
-    inertia: np.ndarray
-
-    def about(self, x: float, z: float) -> np.ndarray:
-        """The inertia about another point (parallel axis theorem)."""
-        r = np.array([self.x - x, 0.0, self.z - z])
-        return self.inertia + self.mass * (r @ r * np.eye(3) - np.outer(r, r))
-
-    def without(self, part: _Mass) -> _Mass:
-        """The remaining body if a part is removed."""
-        mass = self.mass - part.mass
-        x, z = ((self.mass * a - part.mass * b) / mass for a, b in ((self.x, part.x), (self.z, part.z)))
-        rest = self.about(x, z) - part.about(x, z)
-        return _Mass(mass, x, z, rest)
-
-
-def _symmetric(xx: float, yy: float, zz: float, xz: float) -> np.ndarray:
-    return np.array([[xx, 0.0, xz], [0.0, yy, 0.0], [xz, 0.0, zz]])

@@ -21,15 +21,18 @@ BicycleLike: TypeAlias = Any
 NAMES = ("coordinates", "speeds", "dependent_speeds", "dependent_coordinates", "inputs", "states")
 
 
-def check_parameters(part: Any) -> None:
-    """Refuse impossible parameters. None is allowed where it is the default."""
-    factories = {field.name: field.default_factory for field in dataclasses.fields(part)}
-    infos = parameter_info(part)
-    for name in sorted(infos, key=lambda name: getattr(part, name) is not None):  # report missing parameters first
-        default, info = factories[name], infos[name]
-        if getattr(part, name) is None and default is not dataclasses.MISSING and default() is None:
-            continue
-        check_parameter(f"{type(part).__name__}.{name}", getattr(part, name), info)
+class ParametricModule(eqx.Module):
+    """A module that refuses impossible parameters. None is allowed where it is the default."""
+
+    __repr__ = module_text
+
+    def __check_init__(self) -> None:
+        defaults = {field.name: field.default_factory for field in dataclasses.fields(self)}
+        infos = parameter_info(self)
+        for name in sorted(infos, key=lambda name: getattr(self, name) is not None):  # report missing parameters first
+            value, default = getattr(self, name), defaults[name]
+            if value is not None or default is dataclasses.MISSING or default() is not None:
+                check_parameter(f"{type(self).__name__}.{name}", value, infos[name])
 
 
 def called(value: Any) -> str:
@@ -68,7 +71,7 @@ class BicycleMotion(Motion):
     front: Contact
 
 
-class Part(eqx.Module):
+class Part(ParametricModule):
     """A part of a `Bicycle`: its arrays are parameters, its methods add to the bicycle's model.
 
         class Basket(Part):
@@ -95,10 +98,7 @@ class Part(eqx.Module):
     units: ClassVar[Mapping[str, str]] = {}
     resists: ClassVar[bool] = False
 
-    __repr__ = module_text
-
     def __check_init__(self) -> None:
-        check_parameters(self)
         for kind in NAMES:
             if isinstance(names := getattr(self, kind), str):
                 raise TypeError(

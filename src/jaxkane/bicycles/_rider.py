@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import abc
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Sequence
 from itertools import takewhile
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -157,11 +157,6 @@ class LeaningRider(Rider):
         return Torque(torque * self._axis(B), motion["U"], reaction_on=B)
 
 
-def rider_of(values: Mapping[str, Any]) -> Rider:
-    """A rider with these parameters: a `LeaningRider` if they include a hinge, else a `RigidRider`."""
-    return (LeaningRider if "hinge_z" in values else RigidRider)(**values)
-
-
 def separate_rider(bicycle: BicycleLike, rider: Rider) -> Any:
     """The bicycle with this rider as a separate body, which is subtracted from the frame B.
 
@@ -182,13 +177,9 @@ def separate_rider(bicycle: BicycleLike, rider: Rider) -> Any:
             "separate_rider: the bicycle already has a separate rider, so its frame B does not include the rider's "
             "body. To replace the rider, use bicycle.with_parts(rider=...)."
         )
-    m = bicycle.mB - rider.mass
-    x = (bicycle.mB * bicycle.xB - rider.mass * rider.x) / m
-    z = (bicycle.mB * bicycle.zB - rider.mass * rider.z) / m
-    of_frame = _about(bicycle.mB, bicycle.xB, bicycle.zB, bicycle.IBxx, bicycle.IByy, bicycle.IBzz, bicycle.IBxz)
-    of_rider = _about(rider.mass, rider.x, rider.z, rider.Ixx, rider.Iyy, rider.Izz, rider.Ixz)
-    rest = [a - b for a, b in zip(of_frame, of_rider, strict=True)]  # about the rear contact
-    Ixx, Iyy, Izz, Ixz = (a - b for a, b in zip(rest, _about(m, x, z, 0.0, 0.0, 0.0, 0.0), strict=True))
+    body = [getattr(bicycle, name) for name in _IN_A_FILE]
+    rest = without(body, [getattr(rider, name) for name in _IN_A_FILE.values()])
+    m, _, _, Ixx, Iyy, Izz, Ixz = rest
     if is_concrete(bicycle, rider) and not (in_batches(bicycle) or in_batches(rider)):
         if not m > 0:
             raise ValueError(
@@ -202,8 +193,18 @@ def separate_rider(bicycle: BicycleLike, rider: Rider) -> Any:
                 f"separate_rider: the frame B cannot include the rider's body. Without it: {fault} If mB does not "
                 "include the rider's mass, use bicycle.with_parts(rider=...)."
             )
-    B = {"mB": m, "xB": x, "zB": z, "IBxx": Ixx, "IByy": Iyy, "IBzz": Izz, "IBxz": Ixz}
-    return bicycle.with_parts(**B, rider=rider)
+    return bicycle.with_parts(**dict(zip(_IN_A_FILE, rest, strict=True)), rider=rider)
+
+
+def without(body: Sequence[Any], part: Sequence[Any]) -> list[Any]:
+    """The body that remains if a part is removed.
+
+    All have the values m, x, z, Ixx, Iyy, Izz, Ixz: the mass, the mass centre, and the inertia about it.
+    """
+    m = body[0] - part[0]
+    x, z = ((body[0] * body[i] - part[0] * part[i]) / m for i in (1, 2))
+    about_origin = zip(_about(*body), _about(*part), _about(m, x, z, 0.0, 0.0, 0.0, 0.0), strict=True)
+    return [m, x, z, *(whole - removed - shift for whole, removed, shift in about_origin)]
 
 
 def _about(m: Scalar, x: Scalar, z: Scalar, Ixx: Any, Iyy: Any, Izz: Any, Ixz: Any) -> tuple[Any, Any, Any, Any]:
@@ -213,12 +214,6 @@ def _about(m: Scalar, x: Scalar, z: Scalar, Ixx: Any, Iyy: Any, Izz: Any, Ixz: A
 
 _SIDES = {"left": -1.0, "right": 1.0}
 _JOINTS = ("shoulder_flexion", "shoulder_rotation", "elbow")
-
-
-class _Arm(NamedTuple):
-    bodies: tuple[Body, Body]
-    elbow: Point
-    hand: Point
 
 
 class Arms(Part):
@@ -336,34 +331,26 @@ class Arms(Part):
         flexion = jnp.arctan2(forwards, down) - jnp.arctan2(across * jnp.cos(rotation), upper + fore * cos_elbow)
         return flexion, rotation, elbow
 
-    def _arms(self, bicycle: BicycleLike, motion: Motion, q: NamedVector, u: NamedVector) -> Iterator[tuple[str, _Arm]]:
-        U, angles = motion["U"], self.posture(_with_shoulders(bicycle.parts).right_shoulder)  # type: ignore[union-attr]
+    def motion(self, bicycle, motion, t, q, u):
+        rider: Any = _with_shoulders(bicycle.parts)
+        angles = self.posture(rider.right_shoulder)
+        bodies, residuals, points = [], [], {}
         for side, sign in _SIDES.items():
             names = [f"{side}_{joint}" for joint in _JOINTS]
             flexion, rotation, elbow = (add(q[name], angle) for name, angle in zip(names, angles, strict=True))
             rates = [u[f"{name}_rate"] for name in names]
-            shoulder = U.rotate(2, flexion, rates[0])
+            shoulder = motion["U"].rotate(2, flexion, rates[0])
             upper = shoulder.rotate(3, sign * rotation, sign * rates[1], f"{side} upper arm")
             fore = upper.rotate(2, elbow, rates[2], f"{side} forearm")
             begin = motion[f"{side}_shoulder"]
             bend = begin.fixed(self.upper_length * upper.z)
-            bodies = (
-                self._body(side, "upper arm", self.upper_mass, self.upper_inertia, begin, self.upper_center, upper),
-                self._body(side, "forearm", self.fore_mass, self.fore_inertia, bend, self.fore_center, fore),
-            )
-            yield side, _Arm(bodies, bend, bend.fixed(self.fore_length * fore.z))
-
-    def _body(self, side: str, name: str, mass: Scalar, inertia: Any, begin: Point, center: Scalar, A: Frame) -> Body:
-        moments = [inertia[i] for i in range(3)]
-        return Body(mass, moments, begin.fixed(center * A.z), A, name=f"{side} {name}")
-
-    def motion(self, bicycle, motion, t, q, u):
-        bodies, residuals, points = [], [], {}
-        for side, arm in self._arms(bicycle, motion, q, u):
-            grip = bicycle.on_fork(motion, self.grip[0], _SIDES[side] * self.grip[1], self.grip[2])
-            bodies += arm.bodies
-            residuals.append(arm.hand.velocity - grip.velocity)
-            points |= {f"{side}_elbow": arm.elbow, f"{side}_hand": arm.hand, f"{side}_grip": grip}
+            hand = bend.fixed(self.fore_length * fore.z)
+            G_upper, G_fore = begin.fixed(self.upper_center * upper.z), bend.fixed(self.fore_center * fore.z)
+            bodies.append(Body(self.upper_mass, self.upper_inertia, G_upper, upper, name=f"{side} upper arm"))
+            bodies.append(Body(self.fore_mass, self.fore_inertia, G_fore, fore, name=f"{side} forearm"))
+            grip = bicycle.on_fork(motion, self.grip[0], sign * self.grip[1], self.grip[2])
+            residuals.append(hand.velocity - grip.velocity)
+            points |= {f"{side}_elbow": bend, f"{side}_hand": hand, f"{side}_grip": grip}
         return motion.extended(bodies, residuals, points=points)
 
     def configuration_constraints(self, bicycle, t, q, motion):

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
 
+from .._common.lookup import decimal_number
 from .._scalarjit.components import Scalar
 from .._system.kinematics import Frame, Point, Vector, inertial
 from .._system.motion import Body, Motion, Torque, weight
 from .._system.parameters import parameter, parameter_info
 from .._system.system import System
-from ._entry import entry, read_bicycle_file
+from ._entry import entry
 
 # Meijaard et al. (2007), Table 1: the benchmark bicycle.
 _BENCHMARK = {
@@ -266,3 +269,75 @@ class WhippleBicycle(System):
 
 def _has_default(field: dataclasses.Field[Any]) -> bool:
     return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+
+
+def text_of(path: str | os.PathLike[str]) -> str:
+    """The text of a file, without the byte-order mark that some editors write.
+
+    **Raises:** `ValueError` for a file that does not contain UTF-8 text.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise ValueError(f"{os.fspath(path)} is not a text file in UTF-8. Save it with this encoding.") from None
+
+
+def checked_entries(
+    path: str | os.PathLike[str],
+    entries: Iterable[tuple[int, str, str, Sequence[Any]]],
+    form: str,
+    known: Sequence[str] | None = None,
+) -> dict[str, tuple[float, ...]]:
+    """Numbers by name from the entries of a file.
+
+    **Arguments:**
+
+    - `entries`: line number, text for messages, name, and the texts of a value and of numbers that are not negative.
+    - `form`: of a correct line.
+    - `known`: names to accept. The default is all names.
+
+    **Raises:** `ValueError` that lists every malformed, unknown or repeated entry with its line number.
+    """
+    values: dict[str, tuple[float, ...]] = {}
+    lines: dict[str, int] = {}
+    faults: list[str] = []
+    for number, text, name, texts in entries:
+        try:
+            numbers = tuple(map(decimal_number, texts))
+        except (ValueError, TypeError):
+            numbers = (math.nan, math.nan)
+        if not name or not all(number >= 0 for number in numbers[1:]):
+            faults.append(f"line {number}: {text} is not of the form {form}")
+        elif name in lines:
+            faults.append(f"line {number}: {name} was given before, on line {lines[name]}")
+        elif known is not None and name not in known:
+            faults.append(f"line {number}: {name} is not a parameter of this model")
+        else:
+            lines[name], values[name] = number, numbers
+    if faults:
+        raise ValueError(f"{os.fspath(path)}: " + "; ".join(faults) + ".")
+    return values
+
+
+def read_bicycle_file(
+    path: str | os.PathLike[str], known: Sequence[str] | None = None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Read values and standard deviations from a text file of BicycleParameters.
+
+    **Arguments:**
+
+    - `path`: path of the file.
+    - `known`: names to accept. The default is all names.
+
+    **Returns:** two dicts by name: the values, and their standard deviations (zero if not given).
+
+    **Raises:** `ValueError` that lists every malformed, unknown or repeated entry with its line number.
+    """
+    entries = []
+    for number, line in enumerate(map(str.strip, text_of(path).splitlines()), start=1):
+        if line and not line.startswith("#"):
+            name, equals, entry = (part.strip() for part in line.partition("="))
+            value, _, deviation = (part.strip() for part in entry.partition("+/-"))
+            entries.append((number, repr(line), name if equals else "", (value, deviation or "0")))
+    pairs = checked_entries(path, entries, "NAME = value+/-deviation", known)
+    return {name: pair[0] for name, pair in pairs.items()}, {name: pair[1] for name, pair in pairs.items()}

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..catalog import WhippleBicycle
-from ..catalog._entry import read_bicycle_file
+from ..catalog import WhippleBicycle, read_bicycle_file
 from .problem.bodies import Inertia
 from .problem.declarations import Items
 from .problem.from_declarations import parameters_of
