@@ -280,7 +280,7 @@ def variant(**members):
         ({"outputs": lambda self, t, q, u, motion, now: {"q": jnp.zeros(3)}}, "'q' must be one number"),
         (
             {"outputs": lambda self, t, q, u, motion, now: {"a.b": 1.0, "a": {"b": 2.0}}},
-            "two outputs have the name 'a.b'",
+            "two outputs have the name a.b",
         ),
         ({"outputs": lambda self, t, q, u, motion, now: {"x": now["motor"]}}, "no 'motor' in the inputs and states"),
         ({"outputs": lambda self, t, q, u, motion, now: {"x": now.acceleration(motion)}}, "needs a Point"),

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._common.lookup import refuse_if
 from .._scalarjit.components import Component, Numbers, as_vector, matvec, stack, sub
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.motion import kinetic_energy_of
@@ -121,8 +122,7 @@ def finite_or_explained(result: PyTree, arrays: PyTree) -> PyTree:
     numbers = jax.tree.leaves(result)
     if is_concrete(*numbers) and not all(np.all(np.isfinite(x)) for x in numbers):
         wrong = diagnosis(*arrays)
-        if wrong:
-            raise ValueError(wrong)
+        refuse_if(wrong, wrong)
     return result
 
 

@@ -24,7 +24,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -218,10 +218,24 @@ def layout_of(system: System) -> ContactLayout:
 
     def trace(t: Array, q: Array, u: Array) -> Any:
         kane = KaneEquations(system, t, q, u)
-        found.append(_traced_layout(kane))
+        at = kane.t, kane.q, kane.u_all
+        motion, by_name = _contacts(kane, *at)
+        contacts, names, own = [*by_name.values()], ", ".join(by_name), cast(Any, system)
+        refuse_if(
+            len(contacts) > MOST_CONTACTS,
+            f"{kane.name} has {len(contacts)} contacts: {names}. At most {MOST_CONTACTS} are possible. "
+            "Use MuJoCo for systems with many contacts.",
+        )
+        is_bearing = tuple(isinstance(x, DryFriction) for x in contacts)
+        has_friction = tuple(isinstance(x, DryFriction) or not is_zero(component(x.friction)) for x in contacts)
+        has_point = tuple(isinstance(x, Contact) and x.point is not None for x in contacts)
+        planes = tuple(_plane(x, motion.N) if has else 2 for x, has in zip(contacts, has_point, strict=True))
+        in_space = any(f and p is None for f, p in zip(has_friction, planes, strict=True))
+        n_residuals = len(own.multiplier_residuals(*at)) if has_multipliers(system) else 0
+        layout = tuple(by_name), has_friction, is_bearing, in_space, planes, has_point
+        found.append(ContactLayout(*layout, n_residuals=n_residuals))
         rows = ContactRows(kane, found[-1])
-        laws = [_laws(x) for x in _contacts(kane, kane.t, kane.q, kane.u_all)[1].values()]
-        return rows.velocities(kane.t, kane.q, kane.u_all), rows.gaps(kane.t, kane.q, kane.u_all), laws
+        return rows.velocities(*at), rows.gaps(*at), [_laws(x) for x in contacts]
 
     refuse_if(
         not is_written_out(len(system.speeds)),
@@ -242,24 +256,6 @@ def _contacts(kane: KaneEquations, t: Component, q: Row, u: Row) -> tuple[Motion
         checked(name or None, str, f"{label}: the name of a contact must be a string")
         checked(contact, Contact | DryFriction, f"{label}: {name!r} must be a jaxkane.Contact or jaxkane.DryFriction")
     return motion, {name: contacts[name] for name in sorted(contacts)}
-
-
-def _traced_layout(kane: KaneEquations) -> ContactLayout:
-    motion, contacts = _contacts(kane, kane.t, kane.q, kane.u_all)
-    refuse_if(
-        len(contacts) > MOST_CONTACTS,
-        f"{kane.name} has {len(contacts)} contacts: {', '.join(contacts)}. At most {MOST_CONTACTS} are possible. "
-        "Use MuJoCo for systems with many contacts.",
-    )
-    bearings = [isinstance(x, DryFriction) for x in contacts.values()]
-    frictions = [b or not is_zero(component(x.friction)) for b, x in zip(bearings, contacts.values(), strict=True)]
-    planes = [_plane(x, motion.N) if isinstance(x, Contact) and x.point is not None else 2 for x in contacts.values()]
-    in_space = any(f and p is None for f, p in zip(frictions, planes, strict=True))
-    points = [isinstance(x, Contact) and x.point is not None for x in contacts.values()]
-    system: Any = kane.system
-    n_residuals = len(system.multiplier_residuals(kane.t, kane.q, kane.u_all)) if has_multipliers(system) else 0
-    layout = tuple(contacts), tuple(frictions), tuple(bearings), in_space, tuple(planes), tuple(points)
-    return ContactLayout(*layout, n_residuals=n_residuals)
 
 
 def _relative_velocity(contact: Contact) -> Vector:

@@ -390,7 +390,8 @@ def _solved(M: Array, C: Array, before: Quantities) -> ImpactSolution:
 
     X (N, N) has X^T M X = 1, with the mass matrix of the N = n + a speeds and auxiliary speeds: u+ - u- = X w.
     """
-    n, X, h, released = len(M), _own_root(M), before.h, before.released
+    n, h, released = len(M), before.h, before.released
+    X = stack(inverse_root(_rows(M))).astype(M.dtype) if is_written_out(n) else _root_by_lapack(M)
     tolerance, is_determined = float(jnp.finfo(M.dtype).eps) ** 0.5, jnp.ones((), bool)
     if released is not None:
         # M = [[M_oo, M_oa], [M_ao, M_aa]],   X^T M X = 1,   S = M_aa - M_ao M_oo^-1 M_oa
@@ -429,15 +430,9 @@ def _rows(A: Array) -> list[list[Component]]:
     return [[A[i, j] for j in range(A.shape[1])] for i in range(A.shape[0])]
 
 
-def _own_root(M: Array) -> Array:
-    """X (n, n) with X^T M X = 1, upper triangular. NaN if M is singular within rounding."""
-    if is_written_out(len(M)):
-        return stack(inverse_root(_rows(M))).astype(M.dtype)
-    return _root_by_lapack(M)
-
-
 @jax.jit
 def _root_by_lapack(M: Array) -> Array:
+    """X (n, n) with X^T M X = 1, upper triangular. NaN if M is singular within rounding."""
     K = jnp.linalg.cholesky(M)
     K = jnp.where(jnp.all(jnp.diag(K) ** 2 > rounding_of_pivots(M.dtype) * jnp.diag(M)), K, jnp.nan)
     return jsl.solve_triangular(K, jnp.eye(len(M), dtype=M.dtype), lower=True).T

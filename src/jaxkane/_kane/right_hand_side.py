@@ -153,22 +153,15 @@ def _flat(label: str, outputs: Any) -> dict[str, Component]:
     flat: dict[str, Component] = {}
     for name, value in checked(outputs, Mapping, f"{label} must return a dict of numbers by name", hint).items():
         checked(name or None, str, f"{label}: the name of an output must be a string")
+        if isinstance(value, Vector):
+            raise TypeError(f"{label}: {name!r} is a Vector. Return its components instead: `a, b, c = v.to(frame)`.")
         if isinstance(value, Mapping):
             items = {f"{name}.{key}": x for key, x in _flat(label, value).items()}
         else:
-            items = {name: _number(label, name, value)}
+            items = {name: component(value, f"{label}: {name!r}")}
         refuse_any([key for key in items if key in flat], f"{label}: two outputs have the name", ". Rename one.")
         flat |= items
     return flat
-
-
-def _number(label: str, name: str, value: Any) -> Component:
-    if isinstance(value, Vector):
-        raise TypeError(f"{label}: {name!r} is a Vector. Return its components instead: `a, b, c = v.to(frame)`.")
-    try:
-        return component(value)
-    except TypeError as error:
-        raise TypeError(f"{label}: {name!r} must be one number: {error}") from None
 
 
 def outputs_at(system: System, t: Array, q: Array, u: Array, inputs: Mapping[str, Array]) -> dict[str, Array]:

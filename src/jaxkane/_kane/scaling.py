@@ -175,11 +175,6 @@ def singular_values(A: Numbers) -> Numbers:
     return s / xp.where(s[:1] > 0, s[:1], 1.0)
 
 
-def rank(A: Numbers, tolerance: float | None = None) -> Numbers:
-    """The rank of a matrix, independent of units. `tolerance`: for relative singular values, default eps**0.6."""
-    return (singular_values(A) > (rank_tolerance(A.dtype) if tolerance is None else tolerance)).sum()
-
-
 def rank_tolerance(dtype: Any) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.6
 

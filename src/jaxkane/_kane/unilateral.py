@@ -92,7 +92,9 @@ def contact_impact(
     states, signs = _combinations(rows)
     each = _Combination(jnp.asarray(states), jnp.asarray(signs, G.dtype))
     is_impact = slip is None
-    slip = Slip.unknown(friction, d) if slip is None else slip
+    if slip is None:
+        no = jnp.zeros(friction.shape, bool)
+        slip = Slip(no, jnp.zeros((c, d), friction.dtype), friction, ~no)
     problem = _Problem(G, v, restitution, friction, slip, is_impact)
     fixed = jax.tree.map(jax.lax.stop_gradient, problem)
     found = jax.vmap(fixed.solved)(each)
@@ -125,11 +127,6 @@ class Slip(NamedTuple):
     directions: Array
     static: Array
     may_stick: Array
-
-    @classmethod
-    def unknown(cls, friction: Array, d: int) -> Slip:
-        no = jnp.zeros(friction.shape, bool)
-        return cls(no, jnp.zeros((len(friction), d), friction.dtype), friction, ~no)
 
 
 class _Combination(NamedTuple):
