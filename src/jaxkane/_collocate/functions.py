@@ -142,7 +142,6 @@ class Variables(eqx.Module):
         return system, duration, t, y, inputs
 
     def now(self, node: Any, x: Array) -> Now:
-        """The values by name at a node."""
         system, _, t, y, inputs = self.at(node, x)
         return Now(system, t, y, inputs)
 

@@ -127,7 +127,6 @@ class BandedFactors:
 
     @property
     def log_determinant(self) -> float:
-        """log |det|."""
         return float(np.sum(np.log(np.abs(self.lu[self.below + self.above]))))
 
     def solve(self, b: np.ndarray) -> np.ndarray:

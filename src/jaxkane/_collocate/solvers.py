@@ -96,7 +96,6 @@ class Monitor:
             signal.signal(signal.SIGINT, before)
 
     def interrupted(self, z: np.ndarray, multipliers: np.ndarray, bound_multipliers: np.ndarray) -> Solution:
-        """The best iterate, after Ctrl-C."""
         best = z if self.best is None else self.best
         return Solution(best, multipliers, bound_multipliers, False, INTERRUPTED, self.iterations)
 
@@ -351,7 +350,6 @@ def default_solver() -> Solver:
 
 
 def show_progress(iteration: int, cost: float, violation: float) -> None:
-    """One line that is overwritten in each iteration."""
     text = f"\riteration {iteration}: cost {cost:.6g}, violation {violation:.1e}".ljust(72)
     print(text, end="", file=sys.stderr, flush=True)
 

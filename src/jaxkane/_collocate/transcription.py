@@ -77,7 +77,6 @@ class PhaseProblem:
 
     @property
     def n_constraints(self) -> int:
-        """The number of residuals of the configuration constraints."""
         q = jax.ShapeDtypeStruct((len(self.system.coordinates),), jnp.float64)
         return n_configuration_constraints(self.system, jnp.zeros(()), q)
 
@@ -176,7 +175,6 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """The number of states and controls."""
         n_y, n_w = self.variables.n_y, len(self.variables.controls)
         return self.K * n_y + (len(self.mesh) - 1 if self.problem.is_piecewise else self.K) * n_w
 
@@ -475,7 +473,6 @@ class Transcription:
 
 
 def _dynamics(layout: Layout) -> EvaluatedBlock:
-    """The equations of motion of a phase."""
     nodes, columns, _ = layout.dynamics
     variables = layout.variables
     return EvaluatedBlock(Block(Dynamics(variables), layout.node_data(layout.s[nodes]), columns, variables.n_y))

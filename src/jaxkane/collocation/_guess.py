@@ -152,7 +152,6 @@ def _values(problem: Problem, name: str, value: Any, s: np.ndarray, duration: fl
 def _clipped(
     problem: Problem, s: np.ndarray, Y: np.ndarray, W: np.ndarray, given: Any
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The guess within its bounds along the motion."""
     limits = problem.limits
     for rows, names in ((Y, problem.names), (W, tuple(problem.bounds_of_controls))):
         for i, name in enumerate(names):

@@ -165,20 +165,14 @@ class Plan:
         """
         self._refuse_phases("replay")
         ts = self.t if ts is None else ts
-        inputs = self._with_feedback() if feedback else self.inputs
+        inputs = self.inputs
+        if feedback:
+            polynomials = (jnp.asarray(coefficients_of(x, self.method)) for x in (self.motion.Y, self.motion.W))
+            controls, gains = tuple(self.problem.bounds_of_controls), jnp.asarray(_gains(self))
+            inputs = Regulator(jnp.asarray(self.mesh), *polynomials, gains, self.problem.signals, controls)
         system = without_events(self.system)
         return simulate(
             system, self.state(0), ts, inputs, rtol=rtol, atol=atol, discontinuities=self.mesh[1:-1], max_steps=100_000
-        )
-
-    def _with_feedback(self) -> Any:
-        return Regulator(
-            jnp.asarray(self.mesh),
-            jnp.asarray(coefficients_of(self.motion.Y, self.method)),
-            jnp.asarray(coefficients_of(self.motion.W, self.method)),
-            jnp.asarray(_gains(self)),
-            self.problem.signals,
-            tuple(self.problem.bounds_of_controls),
         )
 
     def deviation(self, ride: Trajectory) -> float:

@@ -154,7 +154,6 @@ class SolutionCurve:
         return True
 
     def tangent_ahead(self, y, new) -> Any:
-        """The tangent with which the curve continues from y."""
         return new
 
     def _passed(self, y, z) -> list[int]:

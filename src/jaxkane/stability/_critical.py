@@ -350,7 +350,6 @@ def _crossings_by_order(before, after):
 
 
 def _bisect(at, brackets: _Brackets):
-    """The critical values (k,), accurate to rounding."""
 
     def half(ends, _):
         lower, upper = ends

@@ -350,7 +350,6 @@ def closing_tolerance(dtype: Any) -> float:
 
 
 def packed_rates(args: OrbitArguments, t: Array, y: Array) -> Array:
-    """The rates of a packed state with the inputs of an orbit."""
     state = unpacked(args.system, y)
     signals = as_signals(args.inputs, args.system.inputs, jnp.stack([t, t + 1.0]), type(args.system).__name__)
     inputs = inputs_at(args.system, signals, t, state)
@@ -359,7 +358,6 @@ def packed_rates(args: OrbitArguments, t: Array, y: Array) -> Array:
 
 
 def section_value(system: System, section: str, t: Array, y: Array) -> Array:
-    """The event function of the section at a packed state."""
     names = own_events_of(system, t, unpacked(system, y)).names
     return event_values(system, t, y, jnp.zeros_like(y)).values[names.index(section)]
 

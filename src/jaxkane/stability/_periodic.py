@@ -341,7 +341,6 @@ def _refuse_equilibrium(name: str, equations: OrbitEquations, args: OrbitArgumen
 
 @jit
 def _normal(equations: OrbitEquations, args: OrbitArguments, y: Array) -> Array:
-    """The same for a guess whose period is unknown."""
     y, args = constant((y, args))
     z = equations.unknowns(jnp.tile(y, (equations.segments, 1)), jnp.ones((), y.dtype))
     return normal_at(equations, z, args)

@@ -186,7 +186,6 @@ def steady_turn(
 
 
 def quantity(system: System, t, q, u, name: str):
-    """A coordinate or a speed by name, also a dependent one."""
     if name in system.coordinates:
         return q[system.coordinates.index(name)]
     if name in system.speeds:
@@ -234,7 +233,6 @@ class SteadyEquations(eqx.Module):
         return jnp.concatenate([q[np.array(self.q_free, int)], u[np.array(self.u_free, int)], *trim])
 
     def parts(self, z, q, u, inputs):
-        """q, u and inputs of the unknowns z."""
         n_q, n_u = len(self.q_free), len(self.u_free)
         trim = {k: z[n_q + n_u + i] for i, k in enumerate(self.find)}
         q = q.at[np.array(self.q_free, int)].set(z[:n_q])
