@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._common.lookup import not_there, real_number
-from .._integrate.events import crossings, events_of
+from .._integrate.events import Crossing, crossings, events_of
 from .._integrate.inputs import inputs_at
 from .._integrate.jumps import stages_of, state_after
 from .._kane.api import _dependent_speeds
@@ -64,15 +64,19 @@ class Now:
         known = [each for names in names_of(system) for each in names]
         raise not_there(name, [*known, *self._inputs, *(self._outputs or {})], "`now`")
 
-    def event(self, name: str) -> Array:
-        """The event function of an event of the system."""
+    def events(self) -> dict[str, Crossing]:
+        """The events of the system by name."""
         state = self.state
         kane = KaneEquations(self.system, self.t, state.q, state.u)
         x = () if state.x is None else tuple(state.x)
-        events = crossings(self.system, kane.t, kane.q, kane.u_all, x, state.q.dtype)
+        return crossings(self.system, kane.t, kane.q, kane.u_all, x, state.q.dtype)
+
+    def event(self, name: str) -> Array:
+        """The event function of an event of the system."""
+        events = self.events()
         if name not in events:
             raise not_there(name, events, "the events of the system")
-        return jnp.asarray(events[name].value, state.q.dtype)
+        return jnp.asarray(events[name].value, self.state.q.dtype)
 
     def after(self, name: str) -> Now:
         """The values after the jump of an event of the system, with the same inputs."""

@@ -167,9 +167,9 @@ class Plan:
         ts = self.t if ts is None else ts
         inputs = self.inputs
         if feedback:
-            polynomials = (jnp.asarray(coefficients_of(x, self.method)) for x in (self.motion.Y, self.motion.W))
+            Y, W = (jnp.asarray(coefficients_of(x, self.method)) for x in (self.motion.Y, self.motion.W))
             controls, gains = tuple(self.problem.bounds_of_controls), jnp.asarray(_gains(self))
-            inputs = Regulator(jnp.asarray(self.mesh), *polynomials, gains, self.problem.signals, controls)
+            inputs = Regulator(jnp.asarray(self.mesh), Y, W, gains, self.problem.signals, controls)
         system = without_events(self.system)
         return simulate(
             system, self.state(0), ts, inputs, rtol=rtol, atol=atol, discontinuities=self.mesh[1:-1], max_steps=100_000

@@ -171,9 +171,9 @@ def names_of_modes(
 def motion_family(system: System, values: Numbers, motion: MotionAt, states: Sequence[str] | None):
     """Values, (system, value) -> motion, states, and the groups of states whose modes have names (None: no names)."""
     check_is_system(system)
-    is_straight = motion is None and isinstance(system, WhippleBicycle)
-    if is_straight:
-        motion = straight_ahead
+    is_straight = False
+    if motion is None and isinstance(system, WhippleBicycle):
+        is_straight, motion = True, straight_ahead
         has_more = len(system.speeds) > len(WhippleBicycle.speeds) or system.states
         # this bicycle does not name the lateral states of its other parts
         if states is None and not (has_more and type(system).lateral is LATERAL):
