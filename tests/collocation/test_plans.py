@@ -175,6 +175,18 @@ def test_continuation():
 
 
 @pytest.mark.slow
+class WithWall(Sled):
+    def events(self, t, q, u):
+        return {"wall": jk.rising(q["x"] - 0.5, then={"v": -0.5 * u["v"]}), "gate": jk.rising(q["x"] - 0.3)}
+
+
+def test_a_plan_through_an_event_that_changes_the_state_is_not_ok():
+    problem = Problem(WithWall(), 2.0, controls=["force"], cost=effort, **ENDS)
+    through = solve(problem, intervals=10)
+    assert not through.ok and "'wall' changes the state" in through.reason
+    assert solve(dataclasses.replace(problem, end={"x": 0.5, "v": 1.0}), intervals=10).ok  # it ends at the event
+
+
 def test_conditions_may_share_names_with_variables():
     plan = solve(
         Problem(

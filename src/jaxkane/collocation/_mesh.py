@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._collocate.functions import Integrand
+from .._collocate.functions import Integrand, Now
 from .._collocate.lobatto import Lobatto
 from .._collocate.program import Block, EvaluatedBlock, padded
 from .._collocate.transcription import Layout, Motion
@@ -129,6 +129,40 @@ def without_events(system: System) -> System:
 @functools.cache  # a class for each class, so that compiled programs are used again
 def _eventless(own: Any) -> Any:
     return type(own)(own.__name__, (own,), {"events": System.events, "__qualname__": own.__qualname__})
+
+
+def jumps_inside(system: System, t: np.ndarray, Y: np.ndarray) -> dict[str, float]:
+    """Events that would change the state inside a planned motion with the states Y (n_t, n_y): name and time.
+
+    A function that is zero at the start or the end is no event there: phases begin and end at events.
+    """
+    if type(system).events is System.events:
+        return {}
+    found = {}
+    along = jax.tree.map(lambda a: np.asarray(a)[: len(t)], _events_along(system, padded(t), padded(Y)))
+    for name, (g, when, direction) in along.items():
+        near = np.abs(g) <= 1e-6 * np.max(np.abs(g))
+        signs, times = np.sign(g)[~near], t[~near]
+        crossed = (signs[1:] * signs[:-1] < 0) & (signs[1:] * direction[0] >= 0) & (when[~near][1:] > 0)
+        if crossed.any():
+            found[name] = float(times[1:][crossed][0])
+    return found
+
+
+@jit
+def _events_along(system: System, t: Array, Y: Array) -> dict[str, tuple[Array, Array, Array]]:
+    """The function, condition and direction (n_t,) each of the events that change the state."""
+
+    def at(t: Array, y: Array) -> dict[str, Any]:
+        events = Now(system, t, y, {}).events()
+        like = lambda x: jnp.asarray(x, y.dtype)  # noqa: E731
+        return {
+            name: (like(e.value), like(1.0 if e.when is None else e.when), like(e.direction))
+            for name, e in events.items()
+            if e.stages
+        }
+
+    return jax.vmap(at)(t, Y)
 
 
 def with_controls(signals: Any, polynomials: dict[str, Any]) -> Any:

@@ -19,7 +19,7 @@ from .._collocate.transcription import Motion, Transcription, nodes_of, system_a
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
 from ._guess import detoured, detours, guess_of
-from ._mesh import interpolated, local_errors, quadrature_errors, refined, switch_errors
+from ._mesh import interpolated, jumps_inside, local_errors, quadrature_errors, refined, switch_errors
 from ._plan import Multipliers, Plan, trajectory_of
 from ._problem import Phases, Problem
 
@@ -351,11 +351,16 @@ class _Search:
     ) -> Plan:
         layout, motion = transcription.layouts[p], transcription.motions(x)[p]
         system = system_at(transcription, p, x)
+        trajectory = trajectory_of(system, self.phases.phases[p], motion)
+        if common["ok"] and (jumps := jumps_inside(system, np.asarray(trajectory.t), motion.Y)):
+            name, t = next(iter(jumps.items()))
+            reason = f"solved, but the event {name!r} changes the state before {t:.4g} s: link two phases there"
+            common = common | {"ok": False, "reason": reason}
         return Plan(
             problem=self.phases.phases[p],
             duration=motion.duration,
             system=system,
-            trajectory=trajectory_of(system, self.phases.phases[p], motion),
+            trajectory=trajectory,
             mesh=layout.mesh * motion.duration,
             errors=errors,
             multipliers=multipliers_of(transcription, solution, p),
@@ -465,7 +470,7 @@ def active_of(transcription: Transcription, solution: Solution, p: int) -> tuple
 
 def _joined(plans: Sequence[Plan]) -> Plan:
     """One plan for all phases, whose trajectory contains them one after another."""
-    first = plans[0]
+    first, worst = plans[0], min(plans, key=lambda plan: plan.ok)
     parts = [plan.trajectory for plan in plans if plan.trajectory is not None]
     trajectory = _concatenated(parts) if len({part.names for part in parts}) == 1 else None
     offsets = np.cumsum([0.0, *(plan.duration for plan in plans)])
@@ -481,7 +486,7 @@ def _joined(plans: Sequence[Plan]) -> Plan:
     multipliers = Multipliers(named(of_plans), named([each.costate for each in of_plans]))
     return dataclasses.replace(
         first, duration=float(offsets[-1]), trajectory=trajectory, mesh=mesh, errors=errors, unmet=unmet, active=active,
-        multipliers=multipliers, phases=tuple(plans),
+        multipliers=multipliers, phases=tuple(plans), ok=worst.ok, reason=worst.reason,
     )  # fmt: skip
 
 
