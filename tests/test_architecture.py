@@ -155,8 +155,9 @@ def test_the_names_for_type_checkers_are_those_of_the_module():
 def test_every_public_name_has_a_docstring():
     rooms = (jk.loads, jk.sensors, jk.fit, jk.sweep, jk.stability, jk.catalog, jk.bicycles, jk.rotations)
     for module in (jk, *rooms, jk.symbolic, jk.export):
-        for name, thing in vars(module).items():
-            ours = getattr(thing, "__module__", "").startswith("jaxkane")
+        for name in dir(module):
+            thing = getattr(module, name)
+            ours = str(getattr(thing, "__module__", "")).startswith("jaxkane")
             if ours and not name.startswith("_") and thing.__module__ != "jaxkane._scalarjit.components":
                 assert thing.__doc__, f"{module.__name__}.{name} has no docstring"
 

@@ -317,7 +317,7 @@ NO_NUMBERS = {
 AT = {"t": 0.0, "q": [0.3], "u": [0.5], "inputs": {"torque": 1.0}}
 OF_A_STATE = [
     name
-    for name, f in vars(jk).items()
+    for name, f in ((name, getattr(jk, name)) for name in dir(jk))
     if inspect.isfunction(f) and {"system", "t", "q"} <= {*inspect.signature(f).parameters}
 ]
 

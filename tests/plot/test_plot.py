@@ -1,5 +1,6 @@
 """Pictures: drawn on a dark and on a light page, with what was asked for in them."""
 
+import collections
 import dataclasses
 import io
 import re
@@ -104,7 +105,7 @@ def test_a_line_has_a_gap_at_each_jump():
     before, after = (jk.State(sign * np.stack([at, at], axis=-1), (sign * at)[..., None]) for sign in (1.0, -1.0))
     inputs = tuple({"steer_torque": sign * at} for sign in (2.0, 3.0))
     count = np.array([2, 1])
-    jumps = types.SimpleNamespace(t=at, before=before, after=after, inputs=inputs, count=count)
+    jumps = collections.namedtuple("Jumps", "t before after inputs count")(at, before, after, inputs, count)
     rides = dataclasses.replace(
         trajectory(status=np.array([0, 0]), t_end=np.array([2.0, 2.0]), batch=(2,)), jumps=jumps
     )

@@ -213,6 +213,8 @@ def inputs_at(
     context = InputState(state.q, state.u, state.x, now, system)
     if callable(signals):
         values: Any = called(CONTROLLER, signals, now, context)
+        if not isinstance(values, Mapping):
+            raise TypeError(f"{CONTROLLER} must return a dict by name, got {values!r}.")
     else:
         values = {
             name: f.piece(t, at)

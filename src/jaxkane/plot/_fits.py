@@ -50,6 +50,8 @@ def fits(
     all_channels = list(fit.problem.channels)
     channels = all_channels if channels is None else list(as_names(channels, "channels"))
     refuse_unknown(channels, all_channels, "fits: the fit has no channel")
+    if not channels:
+        raise ValueError(f"fits: `channels` is empty; {hint([], all_channels)}")
     units_by_name = {
         channel: unit_of(channel, units_of(fit.problem.system) | dict(units or {})) for channel in channels
     }
