@@ -174,3 +174,33 @@ def test_a_smooth_force_that_begins_after_a_rest_is_not_passed_over(begin):
     rates = lambda t, z: A @ z + [0.0, 2.0 * np.exp(-(((t - begin) / 0.05) ** 2))]  # noqa: E731
     exact = scipy.integrate.solve_ivp(rates, (0.0, 10.0), [0.0, 0.0], rtol=1e-11, atol=1e-13, max_step=0.01).y[0, -1]
     np.testing.assert_allclose(ride["x"][-1], exact, atol=1e-6)
+
+
+class Tilted(jk.System):
+    """A disk that falls against a wall in a frame whose angle changes nothing but roundings."""
+
+    tilt: jk.Scalar = jk.parameter(0.3)
+    wall: jk.Scalar = jk.parameter(0.1)
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.fixed(2.0 * N.rotate(3, self.tilt, 0.0).x)
+        rod = N.rotate(3, q["angle"], u["rate"])
+        return jk.Motion([jk.Body(1.0, (0.0, 0.0, 0.0), P.fixed(rod.x), rod)])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, 9.81 * motion.N.x)
+
+    def events(self, t, q, u):
+        return {"wall": jk.falling(q["angle"] - self.wall)}
+
+
+def test_a_parameter_that_changes_only_roundings_does_not_shorten_the_steps():
+    def t_end(tilt, wall):
+        return jk.simulate(Tilted(tilt, wall), jk.State([1.0], [0.0]), [0.0, 2.0]).t_end
+
+    slopes = jax.jit(jax.jacfwd(t_end, argnums=(0, 1)))(0.3, 0.1)
+    # Energy: rate^2 / 2 = 9.81 (cos 0.1 - cos 1), and the wall is passed earlier by 1 / rate
+    rate = np.sqrt(2 * 9.81 * (np.cos(0.1) - np.cos(1.0)))
+    np.testing.assert_allclose(slopes, [0.0, -1.0 / rate], rtol=1e-6, atol=1e-12)

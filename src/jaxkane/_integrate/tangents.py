@@ -246,7 +246,8 @@ RECORDED = 16384
 
 
 class Probe(NamedTuple):
-    """The largest size (n,) so far of each component of the tangent, and its errors (m,) in all steps."""
+    """The largest sizes (2, n) so far of the components of motion and tangent, and the errors (m,) of the tangent in all
+    steps."""
 
     size: Array
     errors: Array
@@ -265,17 +266,19 @@ class Probing(NamedTuple):
     def start(self, y: Array, most: int | None) -> tuple[Array, Probe]:
         """Motion and tangent at the start of a simulation of at most so many steps, and the probe."""
         errors = jnp.zeros(min(most or RECORDED, RECORDED), jnp.float32)
-        return jnp.stack([y, self.y]), Probe(jnp.abs(self.y), errors)
+        both = jnp.stack([y, self.y])
+        return both, Probe(jnp.abs(both), errors)
 
     def again(self, y: Array, probe: Probe) -> Array:
         """Motion and tangent after a jump of the motion to y. The direction is generic again, and its components keep
         their size, because an event may reset a coordinate."""
-        return jnp.stack([y, jnp.sign(generic(y, y.size)) * probe.size])
+        return jnp.stack([y, jnp.sign(generic(y, y.size)) * probe.size[1]])
 
     def step(self, probe: Probe, both: Array, error: Array, i: Array) -> tuple[Array, Probe]:
         """The error of the tangent in the step i, which ends at these values, relative to its size; and the probe."""
-        size = jnp.maximum(probe.size, jnp.abs(both[1]))
-        least = jnp.maximum(size, self.noise * jnp.max(size))
+        size = jnp.maximum(probe.size, jnp.abs(both))
+        # A tangent that is zero but for rounding errors is not smooth: its steps would become as short as possible.
+        least = jnp.maximum(size[1], self.noise * jnp.maximum(size[0], jnp.max(size[1])))
         share = jnp.where(least > 0, error[1] / jnp.where(least > 0, least, 1.0), 0.0)
         # Both loops use the rounded number: one that differs in the last digit can decide about an additional step
         # before a discontinuity, and from then on each step would read the error of its neighbour.
