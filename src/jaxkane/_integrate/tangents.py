@@ -246,7 +246,7 @@ RECORDED = 16384
 
 
 class Probe(NamedTuple):
-    """The largest sizes (2, n) so far of the components of motion and tangent, and the errors (m,) of the tangent in all
+    """The largest sizes (2, n) so far of motion and tangent, by component, and the errors (m,) of the tangent in all
     steps."""
 
     size: Array
