@@ -68,8 +68,8 @@ def test_predictions_of_a_filter():
 @pytest.mark.parametrize(
     ("ahead", "past", "message"),
     [
-        (0.0, 1.0, r"`ahead` \[s\] must be positive, got"),
-        ((0.1, np.nan), 1.0, r"`ahead` \[s\] must be positive, got"),
+        (0.0, 1.0, r"`ahead` \[s\] must be positive and finite, got"),
+        ((0.1, np.nan), 1.0, r"`ahead` \[s\] must be positive and finite, got"),
         (0.01, 1.0, "`ahead` = 0.01 s is shorter than half of the sample interval of trial, 0.1 s"),
         (0.5, -1.0, "`past` must be positive"),
         (0.5, 100.0, "no trial is longer than 100 s for the initial state plus 0.5 s to predict"),

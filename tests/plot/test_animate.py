@@ -234,7 +234,7 @@ def test_invalid_arguments_of_animate_are_rejected(ride, swing, tmp_path):
     with pytest.raises(ValueError, match="`elevation` must be a real number, got '18'"):
         jk.animate(system, trajectory, elevation="18")
     for name in ("seconds", "fps"):
-        with pytest.raises(ValueError, match=f"`{name}` must be positive, got -1"):
+        with pytest.raises(ValueError, match=f"`{name}` must be positive and finite, got -1"):
             animation.save(tmp_path / "swing.gif", **{name: -1.0})
     with pytest.raises(ValueError, match=r"\.html .* or \.gif"):
         animation.save(tmp_path / "swing.mp4")

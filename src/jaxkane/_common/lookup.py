@@ -48,7 +48,7 @@ def label_of(name: str) -> str:
 
 
 def checked(value: Any, kind: Any, what: str, remedy: str = "") -> Any:
-    """The value. `what` is the begin of the message, e.g. "The axis of a hinge must be a Vector".
+    """The value. `what` begins the message, e.g. "The axis of a hinge must be a Vector".
 
     **Raises:** `TypeError` if the value is not an instance of `kind`.
     """
@@ -57,10 +57,16 @@ def checked(value: Any, kind: Any, what: str, remedy: str = "") -> Any:
     return value
 
 
+def refuse(*rules: tuple[Any, str], error: type[Exception] = ValueError) -> None:
+    """Raise an exception for the first rule (is_wrong, message) that is wrong."""
+    for is_wrong, message in rules:
+        if is_wrong:
+            raise error(message)
+
+
 def refuse_if(condition: Any, message: str) -> None:
     """Raise `ValueError` if the condition is true."""
-    if condition:
-        raise ValueError(message)
+    refuse((condition, message))
 
 
 def refuse_any(wrong: Iterable[Any], before: str, after: str) -> None:
@@ -140,7 +146,7 @@ def positive_number(value: Any, what: str) -> float:
     **Raises:** `ValueError` for other numbers; otherwise as `real_number`.
     """
     number = real_number(value, what)
-    refuse_if(not 0.0 < number < float("inf"), f"{what} must be positive, got {value!r}.")
+    refuse_if(not 0.0 < number < float("inf"), f"{what} must be positive and finite, got {value!r}.")
     return number
 
 

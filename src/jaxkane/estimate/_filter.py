@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._common.lookup import refuse_unknown
+from .._common.lookup import refuse_unknown, whole_number
 from .._integrate.jumps import refuse_jumps
 from .._integrate.simulate import checked_state
 from .._kane.api import dependent_speeds
@@ -183,8 +183,7 @@ class Filter(eqx.Module):
         if method not in ("extended", "unscented"):
             raise ValueError(f"Filter: `method` must be 'extended' or 'unscented', got {method!r}.")
         for label, number, least in (("lag", lag, 0), ("substeps", substeps, 1)):
-            if not isinstance(number, int) or isinstance(number, bool) or number < least:
-                raise ValueError(f"Filter: `{label}` must be an integer of at least {least}, got {number!r}.")
+            whole_number(number, least, f"Filter: `{label}`")
 
         self.system, self.method, self.lag, self.substeps = system, method, lag, substeps
         self.sensors, self.parameters = tuple(measured), tuple(drifts)

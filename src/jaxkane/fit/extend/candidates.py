@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from ..._common.lookup import as_names, refuse_unknown
+from ..._common.lookup import as_names, refuse, refuse_unknown
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
 from ..problem.declarations import CalibrationTerm, Declaration, Delay, Free, Item, Items
@@ -19,7 +19,6 @@ from ..problem.model import Simulation, Unknowns
 from ..problem.parameters import Interval, with_entries
 from ..problem.problem import Problem
 from ..problem.specification import Names, ProblemSpec, deviations_by_name
-from ..problem.trial import refuse
 from ..result.fit_result import Fit
 from ..solve.local_unknowns import usable
 

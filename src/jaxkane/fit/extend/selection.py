@@ -10,10 +10,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ..._common.lookup import refuse_unknown
+from ..._common.lookup import refuse, refuse_unknown, whole_number
 from ..problem.from_declarations import parameters_of
 from ..problem.specification import refuse_other
-from ..problem.trial import refuse
 from ..result.diagnostics import Plausible, plausible_of, refuse_unless_at_a_minimum
 from ..result.fit_result import Fit
 from ..result.linearized import trial_folds
@@ -259,6 +258,5 @@ def _check_arguments(fit: Fit, depth: int, beam: int, refits: int | None, level:
         ("beam", beam, 1),
         ("refits", 0 if refits is None else refits, 0),
     ):
-        wrong = not isinstance(value, int) or value < smallest
-        refuse((wrong, f"forward_selection: `{name}` must be an integer of at least {smallest}, got {value!r}."))
+        whole_number(value, smallest, f"forward_selection: `{name}`")
     check_level(level)

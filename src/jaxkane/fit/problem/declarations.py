@@ -13,12 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._common.lookup import as_names, hint, positive_number, real_number, refuse_unknown
+from ..._common.lookup import as_names, hint, positive_number, real_number, refuse, refuse_unknown
 from ..._kane.right_hand_side import output_names
 from ..._system.parameters import ANY, ParameterInfo, declared, leaf_name, learned_part, names_of_leaf
 from ..._system.system import System, unit_of, units_of
 from .parameters import LOW_PASSES, Bijection, Entry, Interval, Prior, checked_prior
-from .trial import refuse
 
 Bounds = tuple[float | None, float | None]
 Where = Literal["input", "sensor", "start"]

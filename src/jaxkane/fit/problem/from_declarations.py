@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..._common.lookup import real_number, refuse_unknown
+from ..._common.lookup import real_number, refuse, refuse_unknown
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
 from .declarations import Declaration, Free, Items, Part, is_lognormal, scalar
 from .parameters import Entry, Interval, Parameters, checked_prior, floats, places_of
-from .trial import Trial, groups_of, refuse
+from .trial import Trial, groups_of
 
 
 @dataclasses.dataclass(frozen=True)

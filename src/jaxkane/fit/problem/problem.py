@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
-from ..._common.lookup import counted, refuse_unknown
+from ..._common.lookup import counted, refuse, refuse_unknown
 from ..._integrate.jumps import refuse_jumps
 from ..._integrate.trajectory import Trajectory
 from ..._kane.arguments import refuse_multipliers
@@ -45,7 +45,7 @@ from .specification import (
     start_assembly,
     with_options,
 )
-from .trial import Trial, as_trials, refuse
+from .trial import Trial, as_trials
 from .windows import Shape, Windows, WindowSlice, check_starts, cut, state_names, state_sizes
 
 MOST_SPARE_DERIVATIVES = 100_000

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax.numpy as jnp
 import numpy as np
 
-from ..._common.lookup import as_names, hint, real_number, refuse_unknown
+from ..._common.lookup import as_names, hint, real_number, refuse, refuse_unknown
 from ..._kane.consistent_state import AssemblyProblem, euler_parameters
 from ..._kane.constraint_residuals import has_configuration_constraints
 from ..._kane.right_hand_side import output_names
@@ -21,7 +21,7 @@ from .declarations import Delay
 from .from_declarations import JointPrior, Linear, as_items, parameters_of
 from .model import Nuisance, Simulation
 from .parameters import Parameters, Prior, floats
-from .trial import Trial, refuse
+from .trial import Trial
 from .windows import DelayRange, state_names
 
 Names = Sequence[str] | Mapping[str, float | None]

@@ -19,13 +19,6 @@ _FEEDBACK = (
 )
 
 
-def refuse(*rules: tuple[Any, str], error: type[Exception] = ValueError) -> None:
-    """Raise an exception for the first rule (is_wrong, message) that is wrong."""
-    for is_wrong, message in rules:
-        if is_wrong:
-            raise error(message)
-
-
 class Trial:
     """The measurements of one experiment.
 

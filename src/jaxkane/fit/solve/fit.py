@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from ..._common.lookup import refuse
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
 from ..collocated._fit import Collocation, CollocationFit
@@ -18,7 +19,7 @@ from ..problem.declarations import Items
 from ..problem.model import Simulation, Unknowns
 from ..problem.problem import Problem, finer, residual_deviation
 from ..problem.specification import refuse_other, with_options
-from ..problem.trial import Trial, refuse, trial_names
+from ..problem.trial import Trial, trial_names
 from ..result.diagnostics import AT_A_MINIMUM
 from ..result.fit_result import Fit
 from .checkpoints import Checkpoint
