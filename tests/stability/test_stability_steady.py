@@ -369,3 +369,46 @@ def test_invalid_families_raise_by_name(beside_capsize):
     at = steady_turn(BIKE, straight.q, straight.u, hold={"roll": 0.0, "rear_wheel_rate": straight.u[1]})
     with pytest.raises(ValueError, match="more than one curve of steady motions passes through the start"):
         family(BIKE, at, towards={"roll": 1})
+
+
+class Lifted(jk.System):
+    """A spring above a floor, lifted by an actuator with a lag. The stiffness is a plain number."""
+
+    stiffness: float = 2.0
+    coordinates, speeds, states, inputs = ("y",), ("v",), ("force",), ("command",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["y"] * N.y, u["v"] * N.y), name="block")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force((inputs["force"] - self.stiffness * q["y"]) * motion.N.y, motion["block"])
+
+    def state_rates(self, t, q, u, x, motion, inputs):
+        return {"force": (inputs["command"] - x["force"]) / 0.2}
+
+    def contacts(self, t, q, u, motion):
+        return {"floor": jk.Contact(motion["block"].center, motion.N.y)}
+
+
+def test_a_large_input_is_reached_from_a_guess_of_zero():
+    heights = jax.vmap(lambda command: equilibrium(Lifted(), inputs={"command": command})["y"])
+    np.testing.assert_allclose(heights(jnp.array([0.1, 2.0, 10.0, 1e3])), [0.05, 1.0, 5.0, 5e2], rtol=1e-12)
+
+
+def test_closed_contacts_are_refused_by_name():
+    # The equations of steady motions have no contact forces: a block below the floor is no equilibrium.
+    with pytest.raises(ValueError, match=r"Lifted has closed contacts here: floor.*no contact forces"):
+        equilibrium(Lifted(), inputs={"command": -1.0})
+    with pytest.raises(ValueError, match="Belt has closed contacts here: belt"):
+        equilibrium(jk.catalog.Belt())
+    above = equilibrium(Lifted(), inputs={"command": 1.0})
+    models = jax.vmap(lambda y: jk.stability.linearize(Lifted(), jk.State([y], [0.0], [1.0]), steady=False).A)
+    A = models(jnp.array([0.5, 0.0]))
+    np.testing.assert_allclose(A[0], [[0.0, 1.0, 0.0], [-2.0, 0.0, 1.0], [0.0, 0.0, -5.0]])
+    assert jnp.isnan(A[1]).all()
+    with pytest.raises(ValueError, match="closed contacts here: floor"):
+        jk.stability.linearize(Lifted(), jk.State([0.0], [0.0], [0.0]))
+    lowered = family(Lifted(), above, find=("command",), towards={"y": -1})
+    assert "a contact closes" in lowered.reason
+    assert 0 < lowered["y"][-1] < 1e-3

@@ -679,6 +679,25 @@ def gap_sizes(system: System, t: Component, q: Array, u: Array) -> tuple[Array, 
     return gaps(system, t, q, u), term_sizes(gaps, system, t, q, u)
 
 
+def closed_contacts(system: System, t: Component, q: Array) -> Array:
+    """Whether each contact (c,) touches or penetrates. A `DryFriction` always acts."""
+    if not has_contacts(system):
+        return jnp.zeros(0, bool)
+    gaps, sizes = gap_sizes(system, t, q, jnp.zeros(len(system.speeds), q.dtype))
+    return jnp.asarray(layout_of(system).is_bearing) | ~(gaps > float(jnp.finfo(q.dtype).eps) ** 0.6 * sizes)
+
+
+def refuse_closed_contacts(system: System, closed: Array) -> None:
+    """**Raises:** `ValueError` if any of the contacts (c,) is closed, for functions without contact forces."""
+    if np.any(closed):
+        names = ", ".join(np.array(layout_of(system).names)[np.asarray(closed)])
+        raise ValueError(
+            f"{type(system).__name__} has closed contacts here: {names}. Steady motions and linear models contain "
+            "no contact forces and no dry friction. Simulate until the motion rests, or replace a contact that "
+            "remains closed by a constraint."
+        )
+
+
 def event_functions(
     layout: ContactLayout, terms: ContactTerms, memory: ContactMemory, forces: Array
 ) -> tuple[Array, Array]:

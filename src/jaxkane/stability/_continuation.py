@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import by_name, hint
 from .._kane.constraint_residuals import coordinate_units
+from .._kane.contact import closed_contacts
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Numbers
 from .._system.prints import text_of, wrapped
@@ -202,7 +203,7 @@ class SolutionCurve:
 class SteadyCurve(SolutionCurve):
     """A curve of steady motions through one of them. The unknowns z and F are those of `steady_turn`."""
 
-    stuck = "no further motion was found: equations or coordinates become singular"
+    stuck = "no further motion was found: equations or coordinates become singular, or a contact closes"
 
     def __init__(self, system: System, start: SteadyMotion, hold: tuple[str, ...], find: tuple[str, ...], until: Any):
         q, t, find = start.q, jnp.asarray(start.t, start.q.dtype), (*find, *system.states)
@@ -270,6 +271,7 @@ def _residual_and_slope(equations: SteadyEquations, z, args, scale, names: tuple
         return equations.residual(z, args), jnp.stack(g) if g else jnp.zeros(0, z.dtype)
 
     F, g = both(z)
+    F = jnp.where(jnp.any(closed_contacts(system, t, equations.parts(z, q, u, inputs)[0])), jnp.nan, F)
     J, G = jacobian(both, z)
     sizes = row_sizes(J, (equations.sizes(z, jnp.abs(z), args)[0], scale))
     return F / sizes, J / sizes[:, None], g, G

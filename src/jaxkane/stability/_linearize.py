@@ -130,9 +130,9 @@ def linearize(
 
     **Returns:** a `LinearModel`. It can be unpacked: `A, B, C, D = linearize(...)`.
 
-    **Raises:** `ValueError` for unknown names, a motion that is not steady, coordinates that violate the constraints,
-    dependent coordinates that the constraints do not determine, an impossible parameter, or singular equations. Under a
-    trace the matrices and their derivatives are NaN instead.
+    **Raises:** `ValueError` for unknown names, a motion that is not steady, a closed contact, coordinates that violate
+    the constraints, dependent coordinates that the constraints do not determine, an impossible parameter, or singular
+    equations. Under a trace the matrices and their derivatives are NaN instead.
     """
     name = type(system).__name__
     check_is_system(system)

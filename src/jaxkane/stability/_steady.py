@@ -26,6 +26,7 @@ from .._kane.arguments import (
 )
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import configuration_residual
+from .._kane.contact import closed_contacts, refuse_closed_contacts
 from .._kane.diagnosis import diagnosis
 from .._kane.kanes_method import rates_and_forcing
 from .._kane.right_hand_side import first_order_rates, rates, rates_by_numpy, values_of
@@ -145,8 +146,8 @@ def steady_turn(
     **Returns:** a `SteadyMotion`, differentiable any number of times in the parameters, in `inputs` and in the values
     of `hold`, by the implicit function theorem.
 
-    **Raises:** `ValueError` if no steady motion is found, or if too few quantities are held to determine one. The
-    message names the quantities that can change. Under a trace the motion is NaN instead.
+    **Raises:** `ValueError` if no steady motion is found, if too few quantities are held to determine one, or if a
+    contact is closed in it. The message names the quantities that can change. Under a trace the motion is NaN instead.
     """
     name = type(system).__name__
     check_is_system(system)
@@ -179,7 +180,9 @@ def steady_turn(
     check_system(system, t, q)
     targets = [given[k] if k in given else quantity(system, t, q, u, k) for k in equations.hold]
     targets = jnp.stack(targets) if targets else jnp.zeros(0, q.dtype)
-    motion, rank = _solve(equations, (system, t, q, u, known, targets))
+    motion, rank, closed = _solve(equations, (system, t, q, u, known, targets))
+    if is_concrete(closed):
+        refuse_closed_contacts(system, closed)
     if is_concrete(motion.q) and not bool(jnp.all(jnp.isfinite(motion.q))):
         raise ValueError(_no_steady_motion(name, equations, tuple(values), float(motion.residual), *rank))
     return motion
@@ -295,8 +298,10 @@ def _solve(equations: SteadyEquations, args):
     J = _by_columns(J / sizes[:, None])[0]
     slopes = singular_values(without_rounding(J, jnp.ones_like(J))) if len(guess) else jnp.ones(1, q.dtype)
     tolerance = rank_tolerance(z.dtype)
-    missing = ~((r <= tolerance) & (slopes[-1] > tolerance))
-    return as_motion(system, t, *equations.parts(z, q, u, known), r, missing, args), (slopes, J)
+    is_root = (r <= tolerance) & (slopes[-1] > tolerance)
+    parts = equations.parts(z, q, u, known)
+    closed = is_root & closed_contacts(system, t, parts[0])
+    return as_motion(system, t, *parts, r, ~is_root | jnp.any(closed), args), (slopes, J), closed
 
 
 def _by_columns(J: Array) -> tuple[Array, Array]:
@@ -336,7 +341,7 @@ def _no_steady_motion(name: str, equations: SteadyEquations, held: tuple[str, ..
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def levenberg_marquardt(equations: SteadyEquations, z: Array, args: Any) -> Array:
+def levenberg_marquardt(equations: SteadyEquations, guess: Array, args: Any) -> Array:
     """z (n,) with equations.residual(z, args) = 0 (m >= n equations), by Levenberg and Marquardt's method from a guess.
 
     Differentiable in `args`, any number of times, both modes:  dz = -F_z^+ F_args dargs. The result need not be a
@@ -345,9 +350,9 @@ def levenberg_marquardt(equations: SteadyEquations, z: Array, args: Any) -> Arra
     # Steps are accepted if the residual decreases. Near a solution the damping vanishes, as in the Gauss-Newton method.
     # Equations are divided by the sizes of their terms, and unknowns by the columns of the derivative. The steps are
     # therefore equal in metres and in micrometres.
-    if not z.size:
-        return z
-    eps = float(jnp.finfo(z.dtype).eps)
+    if not guess.size:
+        return guess
+    eps = float(jnp.finfo(guess.dtype).eps)
 
     def F(z):
         return equations.residual(z, args)
@@ -377,13 +382,22 @@ def levenberg_marquardt(equations: SteadyEquations, z: Array, args: Any) -> Arra
     def going(carry):
         return (carry[4] == 0) & (carry[5] < _MAX_STEPS)
 
-    counters = jnp.asarray(1e-2, z.dtype), jnp.zeros((), int), jnp.zeros((), int)
-    z, r, largest, *_ = jax.lax.while_loop(going, step, (z, F(z), jnp.abs(z), *counters))
-    # If the guess was 0.1 m, 1e-17 m is zero within rounding, and is replaced by 0. Otherwise a spring's force at
-    # 1e-17 m would be as large as its own terms, and `linearize` would report that the motion is not steady.
-    rounded = jnp.where(jnp.abs(z) <= eps**0.5 * largest, 0.0, z)
-    sizes = row_sizes(jacobian(F, z), equations.sizes(z, largest, args))
-    return jnp.where(cost(F(rounded), sizes) <= cost(r, sizes), rounded, z)
+    def search(carry):
+        _, damping, _ = carry
+        counters = jnp.zeros((), int), jnp.zeros((), int)
+        z, r, largest, *_ = jax.lax.while_loop(going, step, (guess, F(guess), jnp.abs(guess), damping, *counters))
+        # If the guess was 0.1 m, 1e-17 m is zero within rounding, and is replaced by 0. Otherwise a spring's force at
+        # 1e-17 m would be as large as its own terms, and `linearize` would report that the motion is not steady.
+        rounded = jnp.where(jnp.abs(z) <= eps**0.5 * largest, 0.0, z)
+        sizes = row_sizes(jacobian(F, z), equations.sizes(z, largest, args))
+        costs = cost(r, sizes), cost(F(rounded), sizes)
+        z = jnp.where(costs[1] <= costs[0], rounded, z)
+        return z, jnp.where(damping > 0, 0.0, -1.0), jnp.minimum(*costs) > rank_tolerance(z.dtype) ** 2
+
+    # The size of an equation whose terms are all zero at the guess is a guess too. If it is too small by powers of ten,
+    # no damped step is better. The search is then repeated with a first step of Newton's method.
+    start = guess, jnp.asarray(1e-2, guess.dtype), jnp.array(True)
+    return jax.lax.while_loop(lambda carry: carry[2] & (carry[1] >= 0), search, start)[0]
 
 
 @levenberg_marquardt.defjvp
@@ -418,7 +432,7 @@ def cyclic_coordinates(system: System) -> tuple[str, ...]:
     """
     check_is_system(system)
     refuse_multipliers(system)
-    leaves, treedef = jax.tree.flatten(system)
+    leaves, treedef = jax.tree.flatten(jax.tree.map(jnp.asarray, system))
     shapes = tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)
     key = (type(system), str(treedef), shapes, version_of(system))
     with concretely():
@@ -527,11 +541,12 @@ _relative_imbalance_by_jax = jit(_relative_imbalance)
 
 
 def is_not_steady(system: System, t, q, u, x, w, steady: bool):
-    """Whether a state violates the constraints, is not finite or, with `steady`, is not steady."""
+    """Whether a state violates the constraints, is not finite, has closed contacts or, with `steady`, is not
+    steady."""
     values, still = values_of(system, x, inputs_by_name(system, w)), _non_cyclic(system)
     f, q_dot, x_dot, h = _relative_imbalance(system, t, q, u, values, still)
     zero = jnp.concatenate([f, q_dot[still], x_dot, h] if steady else [h])
-    fine = jnp.all(zero <= float(jnp.finfo(q.dtype).eps) ** _STEADY)
+    fine = jnp.all(zero <= float(jnp.finfo(q.dtype).eps) ** _STEADY) & ~jnp.any(closed_contacts(system, t, q))
     return jax.lax.stop_gradient(~(fine & jnp.all(jnp.isfinite(jnp.concatenate([q, u, x, w, t[None]])))))
 
 
@@ -543,6 +558,7 @@ def check_steady(system: System, t, q, u, x, w, steady: bool) -> None:
     bad = [k for k, value in zip(names, numbers, strict=True) if not np.isfinite(value)]
     if bad:
         raise ValueError(f"{name}: {', '.join(bad)} is not finite, so the linear model does not exist.")
+    refuse_closed_contacts(system, closed_contacts(system, t, q))
     values = values_of(system, x, inputs)
     rate = rates_by_numpy(system, t, q, u, x, inputs)
     if rate is None:

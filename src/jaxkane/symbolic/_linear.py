@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from .._common.lookup import as_names, refuse_unknown
+from .._kane.contact import closed_contacts, refuse_closed_contacts
 from .._kane.expression_graph import Formulas
 from .._system.system import System
 from ..stability._steady import check_dependent, cyclic_coordinates
@@ -113,8 +114,8 @@ def linearize(
     - `steady`: refuse a motion that is not steady or violates the constraints. This is checked with the system's own
         parameters, and with arbitrary values for your own symbols.
 
-    **Raises:** `ImportError` without sympy; `ValueError` for unknown names, a motion that is not steady, or singular
-    equations, and as `jaxkane.symbolic.equations`.
+    **Raises:** `ImportError` without sympy; `ValueError` for unknown names, a motion that is not steady, a closed
+    contact, or singular equations, and as `jaxkane.symbolic.equations`.
     """
     formulas = Formulas(system)
     if system.states:
@@ -132,6 +133,7 @@ def linearize(
     cyclic = cyclic_coordinates(system) if states is None or steady else ()
     states = tuple(x for x in free if x not in cyclic) if states is None else as_names(states, "states")
     refuse_unknown(states, free, f"{formulas.name}: not a possible state:", "independent coordinates and speeds are")
+    at_motion.refuse_closed_contacts()
     if steady:
         at_motion.check_steady(cyclic)
     T = at_motion.tangents(names, dependent)
@@ -234,6 +236,11 @@ class _FormulasAtMotion:
                 f"{self.formulas.name}: this motion is not steady: {', '.join(wrong)}, with the system's own "
                 "parameters. Pass other values as `at`, or linearize at one instant with steady=False."
             )
+
+    def refuse_closed_contacts(self) -> None:
+        q = np.array(self._numbers([*self.values["q"].values()]), self.formulas.dtype)
+        t = self._numbers([*self.values["t"].values()])[0]
+        refuse_closed_contacts(self.formulas.system, closed_contacts(self.formulas.system, t, q))
 
     def _numbers(self, expressions: Any) -> list[float]:
         """Values for the system's own parameters, and for an arbitrary number for each other symbol."""
