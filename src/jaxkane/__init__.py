@@ -63,10 +63,10 @@ if _typing.TYPE_CHECKING:  # the same names as below, for type checkers and the 
     from ._kane.api import partial_velocities as partial_velocities
     from ._kane.consistent_state import assemble as assemble
     from ._kane.constraint_residuals import best_dependent_speeds as best_dependent_speeds
-    from ._kane.contact import Contact as Contact
-    from ._kane.contact import DryFriction as DryFriction
-    from ._kane.impact import Impact as Impact
-    from ._kane.impact import impact as impact
+    from ._kane.contact.declarations import Contact as Contact
+    from ._kane.contact.declarations import DryFriction as DryFriction
+    from ._kane.contact.impulses import Impact as Impact
+    from ._kane.contact.impulses import impact as impact
     from ._kane.multipliers import with_multipliers as with_multipliers
     from ._scalarjit.cache_key import forget as forget
     from ._scalarjit.components import Scalar as Scalar
@@ -105,8 +105,8 @@ _NAMES = {
     "generalized_inertia_forces kinetic_energy mass_matrix partial_velocities",
     "_kane.consistent_state": "assemble",
     "_kane.constraint_residuals": "best_dependent_speeds",
-    "_kane.contact": "Contact DryFriction",
-    "_kane.impact": "Impact impact",
+    "_kane.contact.declarations": "Contact DryFriction",
+    "_kane.contact.impulses": "Impact impact",
     "_kane.multipliers": "with_multipliers",
     "_scalarjit.cache_key": "forget",
     "_scalarjit.components": "Scalar",

@@ -7,8 +7,8 @@ import pytest
 from mechanisms import KerbWheel, SliderCrank, SliderInGuides
 
 import jaxkane as jk
-from jaxkane._integrate.contact_jumps import ContactEvent, _states_by_accelerations
-from jaxkane._kane.contact import ContactMemory, layout_of, terms_at
+from jaxkane._kane.contact.forces import ContactMemory, layout_of, terms_at
+from jaxkane._kane.contact.states_after_jump import ContactEvent, _states_by_accelerations
 from jaxkane.catalog import Backlash, RockingBlock
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}

@@ -8,8 +8,8 @@ from mechanisms import SliderInGuides
 from scipy.integrate import solve_ivp
 
 import jaxkane as jk
+from jaxkane._kane.contact.laws import OPEN, SLIDES, STICKS, Slip, contact_impact
 from jaxkane._kane.right_hand_side import outputs_in_contact
-from jaxkane._kane.unilateral import OPEN, SLIDES, STICKS, Slip, contact_impact
 from jaxkane._system.system import packed
 from jaxkane.catalog import RockingBlock
 

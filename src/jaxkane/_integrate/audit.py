@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._kane.constraint_residuals import configuration_residual, relative_condition
-from .._kane.contact import forces_in_contact, layout_of
+from .._kane.contact.forces import forces_in_contact, layout_of
 from .._kane.kanes_method import accelerations_and_mass_matrix
 from .._kane.reactions import Reactions
 from .._kane.right_hand_side import vector_field

@@ -16,9 +16,9 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .._kane.arguments import is_numeric
-from .._kane.contact import NO_CONTACTS, ContactLayout, layout_of
+from .._kane.contact.forces import NO_CONTACTS, ContactLayout, layout_of
+from .._kane.contact.laws import OPEN
 from .._kane.kanes_method import KaneEquations
-from .._kane.unilateral import OPEN
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
 from .._scalarjit.scalar_function import ScalarFunction

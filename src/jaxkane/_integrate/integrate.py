@@ -17,10 +17,18 @@ from jaxtyping import Array
 from .._kane.api import _kinetic_energy
 from .._kane.checks import bodies_are_possible
 from .._kane.constraint_residuals import configuration_is_met, correction, has_configuration_constraints, projected
-from .._kane.contact import ContactMemory, layout_of
+from .._kane.contact.forces import ContactMemory, layout_of
+from .._kane.contact.laws import OPEN, SLIDES, STICKS
+from .._kane.contact.states_after_jump import (
+    REST,
+    Change,
+    ContactEvent,
+    changed_contacts,
+    contact_event_values,
+    gaps_at_start,
+)
 from .._kane.kanes_method import KaneEquations
 from .._kane.right_hand_side import outputs_at, outputs_in_contact, rates_are_native, values_of, vector_field
-from .._kane.unilateral import OPEN, SLIDES, STICKS
 from .._scalarjit.cache_key import captured_tracers, captures_any, jit
 from .._scalarjit.components import as_vector
 from .._scalarjit.jaxpr import LARGEST_SUM
@@ -36,7 +44,6 @@ from .._scalarjit.nan import (
 from .._scalarjit.scalar_function import Packed, ScalarFunction, tree_of
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
-from .contact_jumps import REST, Change, ContactEvent, changed_contacts, contact_event_values, gaps_at_start
 from .discontinuities import Discontinuities, all_end_steps, discontinuities_of, rounding
 from .events import EventPoint, Events, EventValues, event_values, events_of, moved_to_event, next_point
 from .inputs import (

@@ -23,8 +23,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._common.lookup import refuse_unknown
-from .._kane.contact import has_contacts
-from .._kane.impact import REDUNDANT, Impact, Permanent, after_impact, inverse_root
+from .._kane.contact.forces import has_contacts
+from .._kane.contact.impulses import REDUNDANT, Impact, Permanent, after_impact, inverse_root
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, as_vector, component, stack

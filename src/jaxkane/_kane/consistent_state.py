@@ -32,11 +32,11 @@ from .constraint_residuals import (
     scales_by_unit,
     violations,
 )
-from .contact import ContactRows, has_multipliers, layout_of, speeds_in_contact
-from .contact_checks import check_contacts
+from .contact.checks import check_contacts
+from .contact.forces import ContactRows, has_multipliers, layout_of, speeds_in_contact
+from .contact.impulses import REDUNDANT
 from .description import at_random_point, structure_of
 from .diagnosis import diagnosis
-from .impact import REDUNDANT
 from .kanes_method import KaneEquations
 from .scaling import SMALLEST_SIZE
 

@@ -19,7 +19,7 @@ from .._common.lookup import refuse_if
 from .._system.motion import Motion
 from .._system.system import System, call_with_states
 from .arguments import Row, check_is_system
-from .contact import has_multipliers
+from .contact.forces import has_multipliers
 from .description import DescriptionEvaluator, jvp
 
 

@@ -22,7 +22,7 @@ from .._system.motion import Motion
 from .._system.system import NamedVector, State, System, has_outputs, packed, unpacked
 from .arguments import Inputs, Row, as_row, inputs_of
 from .constraint_residuals import configuration_residual
-from .contact import forces_in_contact, has_multipliers, layout_of
+from .contact.forces import forces_in_contact, has_multipliers, layout_of
 from .description import jvp
 from .kanes_method import KaneEquations, motion_rates
 from .reactions import Reactions

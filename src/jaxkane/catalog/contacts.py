@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from .._integrate.events import falling
-from .._kane.contact import Contact, DryFriction
+from .._kane.contact.declarations import Contact, DryFriction
 from .._scalarjit.components import Scalar
 from .._system.kinematics import inertial
 from .._system.motion import Body, Force, Motion, Torque, weight

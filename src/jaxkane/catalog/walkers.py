@@ -7,7 +7,7 @@ import math
 import jax.numpy as jnp
 
 from .._integrate.events import falling, rising
-from .._kane.impact import Impact
+from .._kane.contact.impulses import Impact
 from .._scalarjit.components import Scalar
 from .._system.kinematics import inertial
 from .._system.motion import Body, Motion, weight

@@ -19,7 +19,7 @@ from .._integrate.jumps import names_of_jumps
 from .._kane.arguments import check_is_system, is_concrete, refuse_multipliers
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import check_state, configuration_residual
-from .._kane.contact import has_contacts
+from .._kane.contact.forces import has_contacts
 from .._kane.right_hand_side import output_names
 from .._system.parameters import in_batches
 from .._system.system import State, System, packed

@@ -26,7 +26,7 @@ from .._common.files import write_file
 from .._common.lookup import real_number, refuse_unknown
 from .._kane.arguments import check_is_system, is_concrete
 from .._kane.consistent_state import assemble
-from .._kane.contact import has_contacts, has_multipliers, layout_of
+from .._kane.contact.forces import has_contacts, has_multipliers, layout_of
 from .._scalarjit.components import is_written_out
 from .._system.parameters import in_batches
 from .._system.system import State, System

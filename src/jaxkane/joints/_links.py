@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import rotations
 from .._common.lookup import checked, refuse_any, refuse_if, refuse_unknown
-from .._kane.unilateral import MOST_CONTACTS
+from .._kane.contact.laws import MOST_CONTACTS
 from .._scalarjit.compat import Tracer
 from ..rotations import Matrix
 from ._joints import Hinge, Joint, JointType, Slide, components, exact, exact_numbers, is_structural_zero

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from .._common.lookup import not_there, refuse_any, refuse_unknown
-from .._kane.contact import Contact, DryFriction
+from .._kane.contact.declarations import Contact, DryFriction
 from .._scalarjit.components import (
     ZERO3,
     Component,

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import by_name, hint
 from .._kane.constraint_residuals import coordinate_units
-from .._kane.contact import closed_contacts
+from .._kane.contact.forces import closed_contacts
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Numbers
 from .._system.prints import text_of, wrapped

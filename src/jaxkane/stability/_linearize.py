@@ -27,7 +27,7 @@ from .._kane.arguments import (
 )
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import SINGULAR_ROUNDING, configuration_residual
-from .._kane.contact import has_contacts
+from .._kane.contact.forces import has_contacts
 from .._kane.diagnosis import diagnosis
 from .._kane.right_hand_side import has_outputs, output_names, outputs_at, rates, values_of
 from .._scalarjit.cache_key import jit

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._integrate.contact_jumps import rates_from_motion
 from .._integrate.events import event_values, events_of, own_events_of
 from .._integrate.inputs import Samples, as_signals, inputs_at, samples_of
 from .._integrate.jumps import stages_of, state_after
@@ -23,7 +22,8 @@ from .._integrate.status import Status
 from .._integrate.trajectory import Trajectory
 from .._kane.arguments import is_concrete
 from .._kane.constraint_residuals import configuration_residual, coordinate_units, projected
-from .._kane.contact import has_contacts, layout_of, terms_at
+from .._kane.contact.forces import has_contacts, layout_of, terms_at
+from .._kane.contact.states_after_jump import rates_from_motion
 from .._kane.kanes_method import KaneEquations
 from .._kane.right_hand_side import reads_time, values_of, vector_field
 from .._scalarjit.cache_key import captures_any, jit

@@ -26,7 +26,7 @@ from .._kane.arguments import (
 )
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import configuration_residual
-from .._kane.contact import closed_contacts, refuse_closed_contacts
+from .._kane.contact.forces import closed_contacts, refuse_closed_contacts
 from .._kane.diagnosis import diagnosis
 from .._kane.kanes_method import rates_and_forcing
 from .._kane.right_hand_side import first_order_rates, rates, rates_by_numpy, values_of

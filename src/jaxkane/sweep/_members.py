@@ -20,7 +20,7 @@ from .._integrate.simulate import as_state, checked_state, clock_of, first_of, r
 from .._kane.arguments import is_concrete
 from .._kane.checks import check_system
 from .._kane.consistent_state import assemble
-from .._kane.contact_checks import check_contacts
+from .._kane.contact.checks import check_contacts
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, Inputs, Numbers
 from .._system.parameters import in_batches, parameters_in, with_parameters

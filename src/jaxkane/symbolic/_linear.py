@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .._common.lookup import as_names, refuse_unknown
-from .._kane.contact import closed_contacts, refuse_closed_contacts
+from .._kane.contact.forces import closed_contacts, refuse_closed_contacts
 from .._kane.expression_graph import Formulas
 from .._system.system import System
 from ..stability._steady import check_dependent, cyclic_coordinates

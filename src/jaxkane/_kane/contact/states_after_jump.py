@@ -2,7 +2,7 @@
 
 All of them happen at jumps. A jump has two stages:
 
-1. If contacts close, one impact with all of them and with the contacts that are closed already (`unilateral`).
+1. If contacts close, one impact with all of them and with the contacts that are closed already (`laws`).
 2. The contacts that neither approach nor separate get the state that their accelerations allow: the same conditions,
    with accelerations and forces instead of velocities and impulses.
 
@@ -19,7 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._kane.contact import (
+from ..._scalarjit.nan import constant
+from ..._scalarjit.scalar_function import ScalarFunction
+from ..._system.system import State, System, packed, unpacked
+from ..right_hand_side import values_of, vector_field
+from .forces import (
     ContactLayout,
     ContactMemory,
     ContactTerms,
@@ -33,11 +37,7 @@ from .._kane.contact import (
     terms_at,
     without_gaps,
 )
-from .._kane.right_hand_side import values_of, vector_field
-from .._kane.unilateral import OPEN, SLIDES, STICKS, Slip, contact_impact
-from .._scalarjit.nan import constant
-from .._scalarjit.scalar_function import ScalarFunction
-from .._system.system import State, System, packed, unpacked
+from .laws import OPEN, SLIDES, STICKS, Slip, contact_impact
 
 REST = 1e-9
 """A contact rests if the rest of its bounces, 2 v / (a (1 - e)), takes less than this share of the duration."""

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Array
 
-from .._common.lookup import refuse_if
-from .._scalarjit.compat import concretely
-from .._scalarjit.components import Component, Numbers, as_vector
-from .._scalarjit.scalar_function import ScalarFunction
-from .._system.parameters import in_batches
-from .._system.system import System
-from .arguments import is_concrete, without_derivatives
-from .constraint_residuals import configuration_residual
-from .contact import ContactLayout, ContactRows, gap_sizes, has_contacts, layout_of
-from .description import at_random_point
-from .kanes_method import KaneEquations
-from .scaling import nearest_root
+from ..._common.lookup import refuse_if
+from ..._scalarjit.compat import concretely
+from ..._scalarjit.components import Component, Numbers, as_vector
+from ..._scalarjit.scalar_function import ScalarFunction
+from ..._system.parameters import in_batches
+from ..._system.system import System
+from ..arguments import is_concrete, without_derivatives
+from ..constraint_residuals import configuration_residual
+from ..description import at_random_point
+from ..kanes_method import KaneEquations
+from ..scaling import nearest_root
+from .forces import ContactLayout, ContactRows, gap_sizes, has_contacts, layout_of
 
 
 @ScalarFunction

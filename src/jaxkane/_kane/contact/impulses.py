@@ -33,9 +33,9 @@ import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._common.lookup import checked, not_there, refuse_if
-from .._scalarjit.cache_key import jit
-from .._scalarjit.components import (
+from ..._common.lookup import checked, not_there, refuse_if
+from ..._scalarjit.cache_key import jit
+from ..._scalarjit.components import (
     Component,
     Rows,
     add,
@@ -52,16 +52,16 @@ from .._scalarjit.components import (
     sub,
     total,
 )
-from .._scalarjit.nan import nan_where
-from .._scalarjit.scalar_function import ScalarFunction
-from .._system.kinematics import Frame, Point
-from .._system.motion import flatten_residuals
-from .._system.prints import module_text
-from .._system.system import NamedVector, System
-from .api import checked_arrays, finite_or_explained
-from .arguments import Row, as_row, check_number, is_concrete
-from .kanes_method import KaneEquations, mass_matrix_columns
-from .reactions import AuxiliarySpeeds
+from ..._scalarjit.nan import nan_where
+from ..._scalarjit.scalar_function import ScalarFunction
+from ..._system.kinematics import Frame, Point
+from ..._system.motion import flatten_residuals
+from ..._system.prints import module_text
+from ..._system.system import NamedVector, System
+from ..api import checked_arrays, finite_or_explained
+from ..arguments import Row, as_row, check_number, is_concrete
+from ..kanes_method import KaneEquations, mass_matrix_columns
+from ..reactions import AuxiliarySpeeds
 
 
 class Impact(eqx.Module):

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._common.lookup import refuse_if
+from ..._common.lookup import refuse_if
 
 MOST_CONTACTS = 4
 """More contacts have too many combinations of states: four contacts in a plane have 256."""

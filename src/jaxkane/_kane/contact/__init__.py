@@ -1,0 +1,1 @@
+"""Contacts and impacts: declarations, laws, forces, impulses, and the contact states after a jump."""
