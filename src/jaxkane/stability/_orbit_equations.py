@@ -118,7 +118,8 @@ class OrbitEquations(eqx.Module):
         return args.period if self.period_of is None else jnp.asarray(self.period_of(args.system), z.dtype)
 
     def skipped(self, z: Array, args: OrbitArguments) -> Array:
-        """The time [s] before the clock of the orbit. Time stamps near 1.7e9 s would blur the times of its steps."""
+        """The time [s] at which the clock of the orbit starts. Time stamps near 1.7e9 s would round the times of its
+        steps."""
         return args.skipped * (1.0 if self.autonomous else self.period(z, args))
 
     def rows(self, z: Array) -> Float[Array, "K n"]:
