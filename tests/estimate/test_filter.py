@@ -429,7 +429,7 @@ def test_filter_estimates_satisfy_the_constraints():
         (
             {"rate": 0.1},
             {"noise": {"angle": 0.1}},
-            "`noise` contains angle. Noise in the rate of a coordinate would break",
+            "`noise` contains angle. Coordinates and dependent speeds have no noise of their own",
         ),
         ({"rate": 0.1}, {"noise": {"rate": float("nan")}}, "`noise` of rate must be finite and not negative, got nan"),
         ({"rate": 0.1}, {"drift": {"pul": 0.1}}, "`drift` contains unknown names: pul; did you mean 'pull'"),

@@ -1,10 +1,10 @@
 """Whether a stationary point of a nonlinear program is a minimum.
 
-A solver stops where the gradient of the Lagrangian is zero, which is also so at a maximum or a saddle. At a minimum,
-the Hessian H of the Lagrangian has no negative curvature along directions d with J d = 0, where J contains the active
-constraints, and the variables at their bounds are fixed (J. Nocedal, S. Wright, Numerical Optimization, 2006, section
-12.5). The least curvature is found by the method of Lanczos, which needs products with H and projections onto J d = 0
-only. Each projection is a solution with banded factors.
+A solver stops where the gradient of the Lagrangian is zero. It is also zero at a maximum or a saddle point. At a
+minimum, the Hessian H of the Lagrangian has no negative curvature along directions d with J d = 0 (J. Nocedal, S.
+Wright, Numerical Optimization, 2006, section 12.5). Here J contains the active constraints, and variables at their
+bounds are fixed. The least curvature is computed by the method of Lanczos, which only needs products with H and
+projections onto J d = 0. Each projection solves a system of linear equations with banded factors.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NOT_A_MINIMUM = "stationary, but not a minimum: pass another guess"
 
 
 def refused_unless_minimum(program: NonlinearProgram, border: np.ndarray, solution: Solution) -> Solution:
-    """The same solution, with its own status if it is stationary but not a minimum.
+    """The solution, with the status `NOT_A_MINIMUM` if it is stationary but not a minimum.
 
     **Arguments:**
 
@@ -74,7 +74,7 @@ _STEPS = 80  # of the method of Lanczos
 
 
 def _at_bound(x: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """Whether numbers are at a bound: in an interior point method, the distance is then less than the multiplier."""
+    """Whether numbers are at a bound. In an interior point method, their distance is then less than the multiplier."""
     distance = np.minimum(x - lower, upper - x)
     return (lower >= upper) | (distance < np.maximum(1e-6, np.abs(multipliers)))
 

@@ -427,7 +427,7 @@ class Transcription:
         if callable(how):
             names = [*self._returned("how", link, data, columns)]
             if not names:
-                raise ValueError("The function `links` returns no residuals. Return by name what must be zero.")
+                raise ValueError("The function `links` returns no residuals. Return a dict of residuals.")
         else:
             names = [f"link {i}: {name}" for name in ([how] if how is not None else []) + [*linked]]
         block = EvaluatedBlock(Block(link, data, columns, len(names)))

@@ -58,7 +58,7 @@ def checked(value: Any, kind: Any, what: str, remedy: str = "") -> Any:
 
 
 def refuse(*rules: tuple[Any, str], error: type[Exception] = ValueError) -> None:
-    """Raise an exception for the first rule (is_wrong, message) that is wrong."""
+    """Raise an exception with the message of the first rule (is_wrong, message) whose condition is true."""
     for is_wrong, message in rules:
         if is_wrong:
             raise error(message)
@@ -70,7 +70,7 @@ def refuse_if(condition: Any, message: str) -> None:
 
 
 def refuse_any(wrong: Iterable[Any], before: str, after: str) -> None:
-    """Raise `ValueError` with the `wrong` names between two parts of the message, if there are any."""
+    """Raise `ValueError` if there are `wrong` names. The message contains them between `before` and `after`."""
     names = [*map(str, wrong)]
     refuse_if(names, f"{before} {', '.join(names)}{after}")
 

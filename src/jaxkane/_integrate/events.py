@@ -102,7 +102,7 @@ def first_crossing(
     - `slope0`, `slope1` (n,): slopes at 0 and 1.
     - `direction` (n,): 1 upwards, -1 downwards, 0 both. A function that is zero at 0 crosses there if it then changes
         in its direction; with the direction 0 it does not.
-    - `resolution`: a crossing so near to 1 must be visible in the value at 1.
+    - `resolution`: a crossing within this distance of 1 is reported only if the value at 1 has changed its sign.
     """
     ends = zip(g0, slope0, g1, slope1, direction, strict=True)
     places = [_first_crossing(*(jnp.asarray(x, g0.dtype) for x in (*end, resolution))) for end in ends]
@@ -335,13 +335,13 @@ class EventValues(NamedTuple):
     ) -> EventValues:
         """The same where steps begin: at the start, or after the jump of an `event`.
 
-        A function is set to zero if it would reach zero within a rounding error [s]. If its condition is not met, its
-        crossing is passed over: it is set to the side on which it will be.
+        A function is set to zero if it would reach zero within a rounding error [s]. If its condition is not met, the
+        crossing has no effect: the function is set to its sign after the crossing.
 
-        `before`: at the jump. Functions that cross zero together with the event have the sign from before they cross
-        (see `with_sides`), and are due if the jump does not change them. A function that is zero before and after the
-        jump stays on its side, so an event that has occurred does not occur again. The function of the `event` itself
-        changes to its other side if it then crosses zero in its direction.
+        `before`: the values at the jump. Functions that cross zero together with the event have their sign from before
+        the crossing (see `with_sides`). Their events follow if the jump does not change them. A function that is zero
+        before and after the jump keeps its sign, so an event that has occurred does not occur again. The function of
+        the `event` itself changes its sign if it then crosses zero in its direction.
 
         `closing` (n,): whether it is the gap of a contact that touches and closes at the start of the simulation.
         """
@@ -375,8 +375,8 @@ class EventValues(NamedTuple):
         return self._replace(values=values).passed(events, vanishes)
 
     def with_sides(self, events: Events, start: EventValues, jumps: Array, resolution: Array) -> EventValues:
-        """The same at the end of a step. A function that is zero keeps its side at the `start`. If the step `jumps` at
-        its end, each function that then crosses zero in its direction has its sign from the start."""
+        """The same at the end of a step. A function that is zero gets its sign at the `start`. If the step ends at a
+        jump (`jumps`), each function that crosses zero there in its direction also gets its sign at the start."""
         side, direction = jnp.sign(start.values), jnp.asarray(events.directions, self.values.dtype)
         way = jnp.where(direction == 0, -side, direction)
         # A crossing whose condition was not met may be earlier in the step.
@@ -456,7 +456,7 @@ def first_event(
 ) -> tuple[Array, Array]:
     """Which event function first crosses zero in a step, as a float, and where in [0, 1]; infinity if none does.
 
-    Of events at the same time, this is the first in alphabetical order.
+    If several events occur at the same time, the result is the first in alphabetical order.
 
     **Arguments:**
 
@@ -464,7 +464,7 @@ def first_event(
     - `rounding`: events within this time are simultaneous [s].
     - `resolution`: the longest time from an event to the end of its step [s].
     - `start`, `end`: the event functions at both ends of the step. `h`: its length [s].
-    - `is_ahead`: whether a longer step from a time before has crossed zero.
+    - `is_ahead`: whether an earlier, longer step has crossed zero.
     - `is_last`: whether the simulation ends at the end of the step.
     """
     # A gap opens like t^3. The cubic through both ends of a step may then be negative by a rounding error.

@@ -354,9 +354,8 @@ def _as_signal(label: str, value: Any, ts: Array) -> Any:
     array = real_array(value, label, jnp.result_type(ts.dtype))  # without 64 bits, float32
     if array.shape not in ((), ts.shape):
         raise ValueError(
-            f"{label} has samples of the shape {array.shape}, the times `ts` {ts.shape}. An array must contain one "
-            "value for each of the times `ts`, with linear interpolation between them. For other times pass "
-            "jaxkane.Samples(times, values)."
+            f"{label} has samples of the shape {array.shape}, but `ts` has the shape {ts.shape}. Pass one value for "
+            "each of the times `ts`. For other times, pass jaxkane.Samples(times, values)."
         )
     check_finite(label, array)
     return Samples(ts, array) if array.ndim else array

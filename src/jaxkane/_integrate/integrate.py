@@ -114,7 +114,7 @@ def solve(
 
 
 def _with_captured_numbers(system: System, state: State, t: Array, signals: Any) -> Any:
-    """The signals. Numbers that a function of them captures from outside, traced ones, become numbers of the signal."""
+    """The signals. Traced numbers in the closure of an input function become numbers of its signal."""
     if isinstance(signals, SharedTimes):
         return dataclasses.replace(signals, signals=_with_captured_numbers(system, state, t, signals.signals))
     context = _with_arrays(InputState(state.q, state.u, state.x, t, system))
@@ -253,8 +253,8 @@ class Problem(NamedTuple):
     - `taus` (n_t,): the requested times since the start [s]. `valid`: whether the simulation may begin.
     - `args`: the arguments of the right-hand side. `discontinuities`: where steps end, or None.
     - `events`: the event functions. `settings`: the options of `simulate`.
-    - `args_dot`: the direction in which `args` move if the errors of tangents are controlled, else None.
-    - `start_moves`: whether the tangent that is controlled moves at the start.
+    - `args_dot`: the tangent of `args` if the errors of tangents are controlled, else None.
+    - `start_moves`: whether the controlled tangent is nonzero at the start.
     """
 
     system: System

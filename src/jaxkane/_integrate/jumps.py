@@ -195,10 +195,10 @@ def _after_stage(system: System, t: Component, y: Array, name: str, stage: int) 
 
 
 def _onto_constraints(system: System, t: Component, y: Array, names: Sequence[str]) -> Array:
-    """For a system with multipliers, the state with speeds that satisfy its constraints; NaN if there are none.
+    """For a system with multipliers, the state with speeds that satisfy its constraints; NaN if no such speeds exist.
 
-    Of the speeds `names`, the dependent speeds of the system without multipliers change, or all if it has none. The
-    change has the smallest kinetic energy.
+    Only speeds in `names` change. If the system without multipliers has dependent speeds, only these change. The change
+    has the smallest kinetic energy.
     """
     state, n_q = unpacked(system, y), len(system.coordinates)
     kane = KaneEquations(system, t, state.q, state.u)

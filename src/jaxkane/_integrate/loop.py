@@ -59,7 +59,7 @@ class Steps(NamedTuple):
     - `state`: the state of the controller.
     - `taken`, `accepted`: numbers of steps.
     - `jumps`, `n_jumps`: the jumps and their number, or None if no event changes the state. Later rows are unused.
-    - `errors`: the errors of the tangent in all steps if it moves with the motion, or None.
+    - `errors`: the errors of the tangent in all steps if it is integrated with the motion, or None.
     """
 
     motion: Array
@@ -130,8 +130,8 @@ def fast_loop(
     """The steps of `diffeqsolve`, to the last digit. No steps are taken unless the simulation `may_begin`.
 
     `jumps`: a function (t, y, event, reach) -> `Jump`, from a time near the event, and the largest number of jumps.
-    `probing`: move a tangent with the motion, and let steps be so short that its error meets the tolerance too.
-    `errors`: take the errors of this tangent from an earlier loop.
+    `probing`: integrate a tangent with the motion. A step is accepted only if the error of the tangent is small, too.
+    `errors`: the errors of this tangent, recorded by an earlier loop.
     """
     kind: Any = _KINDS[type(adjoint)]
     checkpoints = getattr(adjoint, "checkpoints", None)

@@ -18,7 +18,7 @@ from jax.typing import DTypeLike
 from .._scalarjit.compat import Tracer
 
 ADJOINTS = "auto", "reverse", "forward", "both"
-"""All mean the same: every simulation supports both modes. The last three were necessary in earlier versions."""
+"""All four mean the same, because every simulation supports both modes. The last three are from earlier versions."""
 
 
 class Settings(eqx.Module):

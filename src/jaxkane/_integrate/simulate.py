@@ -80,7 +80,7 @@ def simulate(
     - `step`: a fixed step size [s], instead of error control. It is reduced so that the duration is a multiple of it.
     - `max_step`: the longest step with error control [s], by default a fiftieth of the duration. Pass it if a force
         acts for a short time after a rest, or if an event function may be constant at first and then change its sign
-        twice within one step. Both could be missed.
+        twice within one step. Otherwise, both may be missed.
     - `controller`: a step size controller of diffrax, such as `diffrax.PIDController(pcoeff=0.3, icoeff=0.4, ...)`,
         instead of `rtol` and `atol`. Steps still end at discontinuities and events.
     - `discontinuities` (n,): times [s] at which inputs or loads are discontinuous. Steps end there. The times of
@@ -89,10 +89,11 @@ def simulate(
         change. The dependent speeds are computed at the projected coordinates.
     - `stabilize`: Baumgarte stabilization: the rate [1/s] at which the residuals h of the configuration constraints
         decay, h_dot = -stabilize * h. About 10 suits some seconds. With 0.0 the residuals drift by the solver's error.
-    - `adjoint`: how the simulation is differentiated. "auto": in forward mode (`jax.jvp`, `jax.jacfwd`, nested for
-        second derivatives; cheaper for fewer than about fifty parameters) and in reverse mode (`jax.grad`, `jax.vjp`),
-        with steps that limit the errors of derivatives too. "forward", "reverse" and "both" mean the same. An adjoint
-        of diffrax differentiates the steps of the motion instead. `Trajectory.adjoint` contains the choice.
+    - `adjoint`: how the simulation is differentiated. "auto" supports forward mode (`jax.jvp`, `jax.jacfwd`) and
+        reverse mode (`jax.grad`, `jax.vjp`), with steps that limit the errors of derivatives too. Forward mode can be
+        nested for second derivatives. It is cheaper for fewer than about fifty parameters. "forward", "reverse" and
+        "both" mean the same as "auto". An adjoint of diffrax differentiates the steps of the motion instead.
+        `Trajectory.adjoint` contains the choice.
     - `max_steps`: the largest number of steps.
     - `max_jumps`: the largest number of jumps: events with `then`, see `falling`.
     - `progress`: show a progress bar.
@@ -104,7 +105,7 @@ def simulate(
     - `ValueError`: wrong shapes or times; values that are not finite; an unknown input; coordinates that violate a
         constraint; an inconsistent system; equations without a finite solution at the initial state; times
         that the type of the state cannot resolve.
-    - `TypeError`: a derivative of a derivative, unless both are in forward mode.
+    - `TypeError`: a second derivative that uses reverse mode.
     """
     refuse_captured(system)
     warn_of_float32()

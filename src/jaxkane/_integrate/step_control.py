@@ -184,8 +184,8 @@ class StepSizeController(diffrax.AbstractAdaptiveStepSizeController[Array, None]
 
 
 FEWEST_STEPS = 50
-"""The fewest steps of a simulation with error control. Where a motion rests, its error says nothing about longer steps:
-they would pass over a force that begins later."""
+"""The fewest steps of a simulation with error control. While a system is at rest, its error does not limit the steps.
+Longer steps would skip a force that begins later."""
 
 TANGENT = 10.0
 """The permitted error of a tangent in a step, relative to its largest size so far, is this multiple of `rtol`."""

@@ -2,18 +2,15 @@
 
 The value of a simulation is computed without derivatives. Its tangents are computed by a second simulation, which also
 controls their errors (see below). This second simulation is one linear operation: forward mode evaluates it, reverse
-mode evaluates its transpose. So it does not matter how a simulation is differentiated, or in which order with `jax.jit`
-and `jax.vmap`.
+mode evaluates its transpose. Both modes are therefore supported, in any order with `jax.jit` and `jax.vmap`.
 
-The probe is one tangent of the motion, in a generic direction, whose error the step control limits.
-
-Steps that suit a motion may be far too long for its tangents: a motion that rests has no error at all. All tangents
-obey the same equation, so one that moves in all directions shows how long their steps may be:
+Steps that are short enough for a motion may be far too long for its tangents: a motion at rest has no error at all. All
+tangents obey the same equation. Therefore one tangent with a generic direction determines how long the steps may be:
 
     y_dot = f(t, y, args),   d_dot = df/dy d + df/dargs args_dot
 
-A first loop moves motion and probe, and records the errors of the probe. The loop that is differentiated reads them, so
-that it takes the same steps.
+This tangent is called the probe. A first loop integrates motion and probe, and records the errors of the probe. The
+loop that is differentiated reads these errors, so that it takes the same steps.
 """
 
 from __future__ import annotations
@@ -42,7 +39,8 @@ for the value alone. `reverse`: whether the result supports reverse mode, else f
 
 def with_own_tangents(run: Run, arguments: Any, constants: Any) -> Any:
     """`run((arguments, constants), None, False)`, which can be differentiated with respect to `arguments` in both
-    modes, and in forward mode again. `run` must not use traced numbers from outside."""
+    modes. A forward-mode derivative can be differentiated again in forward mode. `run` must not use traced numbers of
+    a closure."""
     moving, other = eqx.partition(arguments, eqx.is_inexact_array)
     arrays, rest = eqx.partition((other, constants), eqx.is_array)
     moving, structure = jax.tree.flatten(moving)
@@ -175,9 +173,8 @@ def _batch(args: Any, dims: Any, *, simulated: Any, n: int) -> Any:
 
 def _refused(*_: Any) -> Any:
     raise TypeError(
-        "A derivative of a simulation is differentiated in reverse mode, or a derivative in reverse mode (jax.grad, "
-        "jax.jacrev, jax.vjp) again. For a second derivative of a simulation use forward mode twice, as in "
-        "jax.jacfwd(jax.jacfwd(f))."
+        "A second derivative of a simulation cannot use reverse mode (jax.grad, jax.jacrev, jax.vjp, jax.hessian). "
+        "Instead, use forward mode twice, as in jax.jacfwd(jax.jacfwd(f))."
     )
 
 
@@ -254,9 +251,13 @@ class Probe(NamedTuple):
 
 
 class Probing(NamedTuple):
-    """How a loop moves motion and tangent, (2, n), as one state: with these `rates` of the motion, from the direction
-    `y` (n,), while the arguments of the rates move in the direction `args` (None where they do not). A component below
-    the share `noise` of the largest one counts as rounding errors of others."""
+    """How a loop integrates motion and tangent, (2, n), as one state.
+
+    - `rates`: the rates of the motion.
+    - `y` (n,): the tangent of the initial state.
+    - `args`: the tangent of the arguments of the rates, None for those that are not differentiated.
+    - `noise`: a component below this share of the largest one is regarded as a rounding error.
+    """
 
     rates: Callable[..., Array]
     y: Array
@@ -264,18 +265,19 @@ class Probing(NamedTuple):
     noise: Array
 
     def start(self, y: Array, most: int | None) -> tuple[Array, Probe]:
-        """Motion and tangent at the start of a simulation of at most so many steps, and the probe."""
+        """Motion and tangent at the start of a simulation of at most `most` steps, and the probe."""
         errors = jnp.zeros(min(most or RECORDED, RECORDED), jnp.float32)
         both = jnp.stack([y, self.y])
         return both, Probe(jnp.abs(both), errors)
 
     def again(self, y: Array, probe: Probe) -> Array:
-        """Motion and tangent after a jump of the motion to y. The direction is generic again, and its components keep
-        their size, because an event may reset a coordinate."""
+        """Motion and tangent after a jump of the motion to y.
+
+        The direction is generic again, because an event may reset a coordinate. Its components keep their sizes."""
         return jnp.stack([y, jnp.sign(generic(y, y.size)) * probe.size[1]])
 
     def step(self, probe: Probe, both: Array, error: Array, i: Array) -> tuple[Array, Probe]:
-        """The error of the tangent in the step i, which ends at these values, relative to its size; and the probe."""
+        """The error of the tangent in the step i, relative to its size; and the probe. `both`: the end of the step."""
         size = jnp.maximum(probe.size, jnp.abs(both))
         # A tangent that is zero but for rounding errors is not smooth: its steps would become as short as possible.
         least = jnp.maximum(size[1], self.noise * jnp.maximum(size[0], jnp.max(size[1])))
@@ -286,7 +288,7 @@ class Probing(NamedTuple):
         return e.astype(both.dtype), Probe(size, probe.errors.at[i].set(e))
 
     def of_both(self, t: Array, both: Array, args: RateArguments) -> Array:
-        """The rates of motion and tangent, (2, n), as one state: the solver has as many operations as for one."""
+        """The rates of motion and tangent, (2, n). As one state, they need no more operations of the solver."""
         direction = self._along(args)
         moved = jax.tree.map(lambda d, x: None if d is None else x, direction, args, is_leaf=_is_none)
         still = jax.tree.map(lambda d, x: x if d is None else None, direction, args, is_leaf=_is_none)
@@ -294,7 +296,7 @@ class Probing(NamedTuple):
         return jnp.stack(jax.jvp(of_motion, (both[0], moved), (both[1], direction)))
 
     def _along(self, args: RateArguments) -> Any:
-        """The direction of these arguments, in which a solver may have replaced samples by numbers."""
+        """The tangent of these arguments. A solver may have replaced samples by numbers."""
         if callable(args.signals):
             return self.args
         signals = {
@@ -309,8 +311,8 @@ class Probing(NamedTuple):
 
 
 def as_integers(errors: Array) -> Array:
-    """Recorded errors, bit by bit as integers. In reverse mode, a loop adds a cotangent of the size of each array of
-    floats that it reads in every step, also of a constant one."""
+    """The bits of recorded errors as integers. In reverse mode, a loop would add a cotangent of the size of an array of
+    floats in every step that reads it, even if the array is constant."""
     return jax.lax.bitcast_convert_type(errors, jnp.int32)
 
 
@@ -320,7 +322,7 @@ def read_errors(errors: Array, i: Array, dtype: Any) -> Array:
 
 
 def generic(like: Array, n: int) -> Array:
-    """A direction of no special kind in which the first n numbers move."""
+    """A generic tangent of the first n numbers; zero for the others."""
     numbers = _factors(n)
     return jnp.asarray(np.concatenate([numbers, np.zeros(like.size - n)]), like.dtype)
 
@@ -332,10 +334,10 @@ def _factors(n: int) -> np.ndarray:
 
 
 def direction_of(args: RateArguments, moved: Any, signals_move: bool) -> Any:
-    """A direction of no special kind in which the arguments of the rates move, None for those that do not.
+    """A generic tangent of the arguments of the rates, None for those that are not differentiated.
 
-    `moved`: the system with True for each number that moves. Numbers move in proportion to their size. All samples of a
-    signal move by the same amount, because a rough signal would need short steps.
+    `moved`: the system with True for each number that is differentiated. The tangent of a number is proportional to its
+    size. It is the same for all samples of a signal, because a rough tangent would need short steps.
     """
     factors = iter(_factors(len(jax.tree.leaves(moved))))
     system_dot = jax.tree.map(

@@ -50,7 +50,7 @@ class Trajectory(eqx.Module):
         their derivatives are NaN.
     - `stats`: numbers of steps taken, accepted and rejected.
     - `adjoint`: how the simulation is differentiated: "controlled" if the errors of derivatives are controlled too,
-        "fixed steps", or "steps of the motion" (with `controller` or a solver of several terms); or the name of an
+        "fixed steps", or "steps of the motion" (with `controller` or an implicit-explicit solver); or the name of an
         adjoint of diffrax.
     - `units`: pairs of a name and its unit, as the system declares them.
     - `discontinuities`: where inputs are discontinuous, and their values on both sides, for `audit`; else None.

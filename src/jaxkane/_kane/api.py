@@ -55,7 +55,7 @@ def checked_arrays(
 ):
     """Check the arguments of a public function and return them as arrays of one dtype.
 
-    `of_motion`: whether the result depends on the accelerations, which for a system with multipliers need these.
+    `of_motion`: whether the result depends on the accelerations. Systems with multipliers are then refused.
     """
     check_is_system(system)
     if of_motion:

@@ -123,7 +123,7 @@ def why_no_body(mass: float, I: np.ndarray, check_inertia: bool, accepted: float
 
 
 def is_possible(mass: Numbers, I: Any, check_inertia: bool, accepted: float = MEASURED) -> Any:
-    """Whether a mass and an inertia are possible. The only rule for this: for users, batches and files.
+    """Whether a mass and an inertia are physically possible. Checks of systems, batches and files all use this rule.
 
     **Arguments:**
 

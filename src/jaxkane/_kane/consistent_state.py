@@ -153,7 +153,7 @@ def _root(xp: ModuleType, equations: Any, slopes: Any, start: Numbers, met: floa
     **Arguments:**
 
     - `met`: the largest values that are regarded as zero.
-    - `redundant`: whether equations may depend on others. The steps are then the shortest.
+    - `redundant`: whether equations may depend on others. Each step is then the shortest solution.
     """
     eps = float(jnp.finfo(start.dtype).eps)
 
@@ -349,8 +349,8 @@ def assemble(
         that are solved for, such as dependent coordinates in an array, are initial guesses.
     - `u`: independent speeds (n_u,), or a dict by name. Omitted speeds are zero. A dict may also contain dependent
         speeds, which are compared with the solution of the velocity residuals. With `touching`, and for a system of
-        `with_multipliers`, values in a dict are fixed and omitted speeds follow from them; all speeds of an array are
-        changed. The changes are the smallest in the metric of the mass matrix.
+        `with_multipliers`, speeds in a dict are fixed, and omitted speeds are computed from them. All speeds of an
+        array may change. The changes are the smallest in the metric of the mass matrix.
     - `x`: first-order states (n_x,), or a dict by name. Omitted states are zero.
     - `t`: time [s], one finite number.
     - `free`: names of the coordinates that are solved for. The default is `system.dependent_coordinates`. If a dict

@@ -110,7 +110,7 @@ def regressor_model(system: System, bodies: Bodies) -> RegressorModel:
             if body.name in names
         )
     skew = [body.name for body in chosen if body.axis == SKEW]
-    after = " rotates in its frame about an axis that is not one of the frame. "
+    after = " rotates in its frame about an axis that is not an axis of the frame. "
     after += "Pass a frame that rotates with the body, or name only the other bodies in `bodies`."
     refuse_any(skew, f"{type(system).__name__}: the body", after)
     return RegressorModel(system, chosen, leaves)

@@ -132,9 +132,9 @@ def _eventless(own: Any) -> Any:
 
 
 def jumps_inside(system: System, t: np.ndarray, Y: np.ndarray) -> dict[str, float]:
-    """Events that would change the state inside a planned motion with the states Y (n_t, n_y): name and time.
+    """Events that would change the state inside a planned motion with the states Y (n_t, n_y): times by name.
 
-    A function that is zero at the start or the end is no event there: phases begin and end at events.
+    A function that is zero at the start or the end is not reported, because phases begin and end at events.
     """
     if type(system).events is System.events:
         return {}

@@ -60,7 +60,7 @@ class Belief(eqx.Module):
     - `mean`: means (lag + 1, n) of the states at these times. The order is that of `Filter.names`.
     - `root`: roots S (lag + 1, n, k) of the covariances S S^T. The columns of all times belong to the same variables,
         so the covariance of two times is S_i S_j^T.
-    - `rounding`: the present time [s] minus `t[0]`, which is rounded.
+    - `rounding`: the rounding error of the present time: the exact time minus `t[0]` [s].
     """
 
     t: Float[Array, " m"]

@@ -98,9 +98,8 @@ def checked_noise(system: System, noise: Any, label: str) -> tuple[tuple[str, ..
     """
     if isinstance(noise, Mapping) and (impossible := {*noise} & {*system.dependent_speeds, *system.coordinates}):
         raise ValueError(
-            f"{label} contains {', '.join(sorted(impossible))}. Noise in the rate of a coordinate would break q_dot = "
-            "q_dot(q, u), and dependent speeds are disturbed by noise in the independent speeds. Name these, "
-            "first-order states or inputs."
+            f"{label} contains {', '.join(sorted(impossible))}. Coordinates and dependent speeds have no noise of "
+            "their own: they follow from the independent speeds. Name independent speeds, first-order states or inputs."
         )
     known = (*system.speeds, *system.states, *system.inputs)
     density = checked_numbers(noise, known, label, f"To estimate one, add SpectralDensity({known[0]!r}) to `free`.")

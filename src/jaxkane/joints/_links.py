@@ -370,7 +370,7 @@ def _check_names(structure: Structure) -> None:
         ("actuators", [actuator.name for actuator in structure.actuators]),
     ):
         twice = sorted({name for name in names if names.count(name) > 1})
-        refuse_any(twice, f"Two {what} have the name", ".")
+        refuse_any(twice, f"Two {what} have the name", ". Rename one.")
 
 
 def _check_stops(structure: Structure) -> None:

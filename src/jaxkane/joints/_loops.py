@@ -50,7 +50,7 @@ def with_dependent(
         ("independent", independent, [joint.name for joint in structure.joints], "the joints"),
         ("pose", pose or (), coordinates, "the coordinates"),
     ):
-        refuse_unknown(names, known, f"`{what}` names what is not among {kind}:")
+        refuse_unknown(names, known, f"`{what}` contains names that are not among {kind}:")
     for name, value in (pose or {}).items():
         number = real_number(value, f"`pose`: {name!r}")
         refuse_if(not np.isfinite(number), f"`pose`: {name!r} = {value!r} is not finite.")
@@ -156,7 +156,7 @@ def _named_dependent(
     trial: _Trial, C: np.ndarray, dependent: Sequence[str], norms: list[str]
 ) -> tuple[list[str], list[str]]:
     simple = [joint.name for joint in trial.structure.joints if len(joint.speeds) == 1]
-    refuse_unknown(dependent, simple, "`dependent` names what is not among the hinges and sliders:")
+    refuse_unknown(dependent, simple, "`dependent` contains names that are not among the hinges and sliders:")
     refuse_if(
         len(set(dependent)) != len(C),
         f"`dependent` names {len(set(dependent))} joints, but the loops have {len(C)} independent residuals. Name "
@@ -307,7 +307,7 @@ class _Trial:
         return self.normalized(q + rng.uniform(-size, size, q.shape))
 
     def are_implied(self, q: np.ndarray, rows: list[int], rng: np.random.Generator) -> bool:
-        """Whether all residuals vanish wherever these do, also at a distance from the closed coordinates q."""
+        """Whether all residuals are zero wherever these are zero, also at a distance from the closed coordinates q."""
         G = np.concatenate([self.slopes(q)[rows], self.norm_slopes(q)])
         free = scipy.linalg.null_space(G, rcond=NEARLY_REDUNDANT)  # (n_q,d)
         for _ in range(2 if free.size else 0):
@@ -401,8 +401,8 @@ class _Trial:
         return h / np.array([1e-2 if i in redundant else 1e-6 for i in range(len(h))])
 
     def check_implied(self, q: np.ndarray, rows: list[int], redundant: list[int]) -> None:
-        """Check that residuals that depend on the independent ones are zero where those are. Those that nearly depend
-        on them may be slightly different from zero, and are reported.
+        """Check that residuals that depend on the independent ones are zero where the independent ones are zero.
+        Residuals that nearly depend on them may be slightly different from zero, and are reported.
 
         **Raises:** `ValueError` for one that is not zero, e.g. if the sites of a planar loop are not in one plane.
         """

@@ -202,7 +202,8 @@ class Mechanism(System):
         """
         extra = dict(parameters or {})
         twice = [name for name in extra if hasattr(self, name) or not name.isidentifier()]
-        refuse_any(twice, f"{type(self).__name__}:", " cannot be the name of an additional parameter.")
+        after = " cannot be the name of an additional parameter. Use a new identifier."
+        refuse_any(twice, f"{type(self).__name__}:", after)
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         kind: Any = type(self)
         return _equipped(kind, outputs, tuple(extra))(**values, **extra)

@@ -76,7 +76,7 @@ class SolutionCurve:
     """Newton's method on a curve F(y) = 0 with fewer equations than unknowns, and the tangents of the curve.
 
     - `scale` (n,): the unit of each unknown: z = y * scale. `first` (n,): the unknowns y at the start.
-    - `until`: values by name of quantities, at the first of which the curve ends.
+    - `until`: values of quantities by name. The curve ends where the first of them is reached.
     - `eps`: the rounding error.
     """
 
@@ -114,7 +114,7 @@ class SolutionCurve:
     def follow(
         self, place: int, sign: float, step: float, max_step: float | None, steps: int
     ) -> tuple[Any, list[float], str]:
-        """Follow the curve from its start, along which the unknown at `place` first rises or falls by `sign`.
+        """Follow the curve from its start. `sign`: whether the unknown at `place` increases or decreases at first.
 
         **Returns:** unknowns z (m, n), arclengths (m,), and why the curve ends.
         """

@@ -143,8 +143,8 @@ def critical_speeds(
     if is_concrete(found):
         if found["is_missing"]:
             raise ValueError(
-                f"critical_speeds({type(system).__name__}): there is no steady motion at {float(found['missing']):.6g} "
-                "and crossings near it would be missed. Choose `values` with steady motions at and between them."
+                f"critical_speeds({type(system).__name__}): there is no steady motion at {float(found['missing']):.6g}"
+                ", so crossings near it would be missed. Choose `values` with steady motions at and between them."
             )
         if found["count"] > most:
             return critical_speeds(system, values, motion, states=states, modes=modes, most=2 * int(found["count"]))

@@ -185,8 +185,8 @@ def motion_family(system: System, values: Numbers, motion: MotionAt, states: Seq
         )
     if callable(motion) is (values is None):
         raise ValueError(
-            "`values` belong to a function `motion`. Pass the values of the parameter, e.g. speeds "
-            "jnp.linspace(0.0, 10.0, 201), or omit them for one motion."
+            "A function `motion` needs `values` of the parameter, e.g. speeds jnp.linspace(0.0, 10.0, 201). A single "
+            "motion needs none: omit `values`."
         )
     if not callable(motion):
         motion, values = _OneMotion(motion), jnp.zeros(1)

@@ -182,7 +182,7 @@ def family(
 
 
 def _released(label: str, system: System, start: Orbit, name: str) -> tuple[OrbitEquations, str, OrbitArguments]:
-    """The equations without the released entry, the name of the parameter that changes, or "" if none does, and the
+    """The equations without the released entry; the name of the parameter that changes, "" if none changes; and the
     arguments."""
     equations, args = start.equations, start.arguments._replace(system=system, center=packed(start.state))
     parameters = [key for key, value, _ in parameters_in(system) if np.ndim(value) == 0]

@@ -118,7 +118,8 @@ class OrbitEquations(eqx.Module):
         return args.period if self.period_of is None else jnp.asarray(self.period_of(args.system), z.dtype)
 
     def skipped(self, z: Array, args: OrbitArguments) -> Array:
-        """The time [s] before the clock of the orbit. Time stamps near 1.7e9 s would blur the times of its steps."""
+        """The time [s] at which the clock of the orbit starts. Time stamps near 1.7e9 s would round the times of its
+        steps."""
         return args.skipped * (1.0 if self.autonomous else self.period(z, args))
 
     def rows(self, z: Array) -> Float[Array, "K n"]:
@@ -385,7 +386,7 @@ def _with_section(kind: Any, section: str, jumps: bool) -> Any:
 
 def drifting_coordinates(system: System, inputs: Any, y: Array) -> set[str]:
     """Names of the cyclic coordinates that need not be periodic: no event, no contact, no input function and no
-    periodic coordinate uses them. The trials have parameters near one, so that the result is the same under a trace."""
+    periodic coordinate uses them. They are detected with random parameters near one, also under a trace."""
     names, cyclic = system.coordinates, cyclic_coordinates(system)
     if not cyclic:
         return set()
@@ -454,7 +455,7 @@ def uses_time(system: System, inputs: Any, y: Array) -> tuple[bool, bool]:
 @jit
 def repeats(system: System, inputs: Any, t: Array, y: Array, period: Array, skipped: Array) -> Array:
     """Whether the equations near a packed state are the same at random times, one `period` later, and `skipped` [s]
-    later. True with `Samples`, which need not continue after one period. Samples that an input function calls must
+    later. True with `Samples`, which need not continue after one period. Samples that an input function evaluates must
     continue, because the function may delay them."""
     of_rates, of_events = uses_time(system, inputs, y)
     if not (of_rates or of_events) or samples_of((system, inputs)) or captures_any(Samples, system):

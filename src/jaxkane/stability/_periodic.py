@@ -661,7 +661,7 @@ def _no_orbit(name: str, equations: OrbitEquations, entries: tuple[str, ...], fo
             not found["repeats"],
             "the equations at t and t + period differ, or the type of the state cannot resolve these times. Pass a "
             "period of the force with all its digits, e.g. as a function of the system. Samples that an input function "
-            "calls must cover two periods, and its delays.",
+            "evaluates must cover two periods and the delays.",
         ),
         (
             not np.isfinite(residual),

@@ -330,8 +330,8 @@ def _check(members: PyTree, shared: PyTree, t: Component, table: Table | None) -
 
 
 def _check_description(members: PyTree, shared: PyTree, t: Component) -> None:
-    """Refuse a contradictory system, checked with the first member; contacts, where numbers decide, also with the last
-    one. An impossible body makes only its member invalid."""
+    """Refuse a contradictory system. The first member is checked, and also the last one, because checks of contacts
+    depend on numbers. An impossible body makes only its member invalid."""
     if any(x.shape[0] == 0 for x in jax.tree.leaves(members)):
         return
     for i in (0, -1):
@@ -381,9 +381,9 @@ def _signals(inputs: Inputs, system: System, columns: dict[str, Any], ts: Number
 
 
 def _batches(places: Any, dims: Sequence[int]) -> dict[int, str]:
-    """The leaves that have a leading axis of members, by number, with their names.
+    """The names of the leaves that have a leading axis of members, by index.
 
-    `places`: system, state, signals and columns with numbers of leaves; `dims`: the numbers of axes of these leaves.
+    `places`: system, state, signals and columns, with indices as leaves. `dims`: the numbers of axes of the leaves.
     """
     system, state, signals, columns = places
     candidates: list[tuple[str, Any, int]] = []  # name, leaf, axes of one member

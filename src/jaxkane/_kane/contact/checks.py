@@ -35,10 +35,10 @@ def _gaps(system: System, t: Component, q: Array) -> Array:
 
 
 def check_contacts(system: System, t: Component, q: Numbers, *, may_penetrate: bool = False) -> None:
-    """Raise `ValueError` if the description of a contact contradicts itself, or if bodies penetrate.
+    """Raise `ValueError` if the gap of a contact contradicts the velocity of its point, or if bodies penetrate.
 
-    A contact is checked at the coordinates `q`, and at coordinates and a time nearby at which it touches. The result
-    depends on the values of the parameters. Traced numbers, and coordinates that are None, are replaced as by
+    A contact is checked at the coordinates `q`, and at nearby coordinates and a later time at which it touches. The
+    result depends on the values of the parameters. Traced numbers, and coordinates that are None, are replaced as by
     `check_system`. With `may_penetrate`, the gaps at `q` may be negative.
     """
     if not has_contacts(system) or in_batches(system):
@@ -66,7 +66,7 @@ def check_contacts(system: System, t: Component, q: Numbers, *, may_penetrate: b
 def _touching(system: System, t: np.ndarray, q: np.ndarray, i: int) -> np.ndarray:
     """Coordinates near `q` at which contact `i` touches, by the Gauss-Newton method; NaN if there are none.
 
-    The gap to a curved surface need not be a distance: its rate must be the velocity where it is zero.
+    The gap to a curved surface need not be a distance. Only where it is zero, its rate must be the normal velocity.
     """
     along = None, None, np.eye(len(q), dtype=q.dtype)
 
@@ -93,10 +93,9 @@ def _check_rows(system: System, layout: ContactLayout, t: np.ndarray, q: np.ndar
         size = size if size > 1e4 * eps else 1.0  # the velocity of a point that cannot move is a rounding error
         refuse_if(
             layout.has_point[i] and abs(rates[i] - v[i, 0]) > tolerance * (abs(rates[i]) + size),
-            f"{label}: the gap of {name!r} changes by {rates[i]:.6g}, but the velocity of its point along the "
-            f"normal is {v[i, 0]:.6g} (at speeds of size 1, near the initial coordinates). Pass the point of the "
-            "body that touches, with the velocity of its material, and the gap of this point. If the surface "
-            "turns, pass a `surface` point below this point, with the velocity of the surface there.",
+            f"{label}: the gap of {name!r} changes by {rates[i]:.6g}, but the velocity of its point along the normal "
+            f"is {v[i, 0]:.6g} (at speeds of size 1). Pass the material point that touches, and its gap. "
+            "If the surface turns, also pass the point of the surface below it as `surface`.",
         )
         refuse_if(
             np.any(np.abs(v_2[i] - v_0[i] + 2.0 * (v[i] - v_0[i])) > tolerance * size)

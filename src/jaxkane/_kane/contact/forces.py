@@ -1,8 +1,8 @@
 """Kane's equations with the forces of contacts and dry friction.
 
 Every contact has a gap, a normal velocity v_N (positive if the bodies separate) and, with friction, the slip v_T. Its
-contact state is open, slides or sticks, and changes only at jumps (see `states_after_jump`). Between two jumps the closed
-contacts are constraints with multipliers:
+contact state is open, slides or sticks, and changes only at jumps (see `states_after_jump`). Between two jumps the
+closed contacts are constraints with multipliers:
 
     M u_dot = f + C^T F,   v = C u + c0
     v_N_dot = 0,  F_T = -mu F_N v_T / |v_T|         while a contact slides
@@ -581,7 +581,7 @@ def gap_sizes(system: System, t: Component, q: Array, u: Array) -> tuple[Array, 
 
 
 def closed_contacts(system: System, t: Component, q: Array) -> Array:
-    """Whether each contact (c,) touches or penetrates. A `DryFriction` always acts."""
+    """Whether each contact (c,) touches or penetrates. True for each `DryFriction`, which always acts."""
     if not has_contacts(system):
         return jnp.zeros(0, bool)
     gaps, sizes = gap_sizes(system, t, q, jnp.zeros(len(system.speeds), q.dtype))
@@ -594,7 +594,7 @@ def refuse_closed_contacts(system: System, closed: Array) -> None:
         names = ", ".join(np.array(layout_of(system).names)[np.asarray(closed)])
         raise ValueError(
             f"{type(system).__name__} has closed contacts here: {names}. Steady motions and linear models contain "
-            "no contact forces and no dry friction. Simulate until the motion rests, or replace a contact that "
+            "no contact forces and no dry friction. Simulate until the system is at rest, or replace a contact that "
             "remains closed by a constraint."
         )
 

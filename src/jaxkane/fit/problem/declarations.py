@@ -24,7 +24,7 @@ Where = Literal["input", "sensor", "start"]
 
 
 class Part(NamedTuple):
-    """The parameters of a declaration with one bijection, and by entry, initial guesses, scales and priors."""
+    """Declared parameters that share one bijection. `start`, `scale`, `priors`: initial guesses, scales and priors."""
 
     entries: list[Entry]
     bijection: Bijection

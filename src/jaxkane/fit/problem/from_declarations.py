@@ -99,9 +99,9 @@ class JointPrior:
 
 
 def as_items(free: Any, kinds: tuple[type, ...] = (Declaration,)) -> list[Any]:
-    """The argument `free` of a fit as a list, in which names and functions are declared by `Free`.
+    """The argument `free` of a fit as a list, with a `Free` for each name and function.
 
-    `kinds`: types of elements that are not changed.
+    `kinds`: the types of elements that do not change.
     """
     free = [free] if isinstance(free, (str, *kinds)) or callable(free) else free
     if not isinstance(free, Iterable):

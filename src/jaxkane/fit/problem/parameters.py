@@ -471,8 +471,8 @@ class Parameters(eqx.Module):
     def resting(self, place: int, x: Float[Array, " p"]) -> tuple[Parameters, np.ndarray] | None:
         """The parameters with the sum at this index fixed at its nearer bound, and the x that remain free.
 
-        None if the sum is not near a bound: its slope is above a tenth of that at the initial guess. Below, the sum has
-        covered nine tenths of the distance to the bound.
+        None if the sum is not near a bound, i.e. if its slope is above a tenth of that at the initial guess. With a
+        smaller slope, the sum has covered nine tenths of the distance to the bound.
         """
         free = np.asarray(self.places)
         now, first = (abs(np.diagonal(self._each(_slope, at))[place]) for at in (self.all(x), np.zeros(self.rest.size)))

@@ -173,7 +173,7 @@ def _residuals(fit: Any) -> Iterator[str]:
         text = f"The residuals are not white noise: they are correlated in time ({', '.join(channels)})."
         unit, number = fit.clusters
         yield (
-            f"{text} Intervals account for this within each of {number} {unit}s, formal errors do not. "
+            f"{text} Intervals account for this within each of {number} {unit}s. Formal errors do not. "
             "For intervals of the estimate from another run, use `cross_validate(fit).intervals()`."
             if fit.uses_clustered_errors
             else f"{text} Errors and intervals are infinite, because there are too few trials to estimate how the "

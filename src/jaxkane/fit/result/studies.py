@@ -196,9 +196,10 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
 
     - `fit`: a `Fit`.
     - `name`: a free parameter.
-    - `n`: number of values, half of them on either side of the estimate. A side without an end has more.
+    - `n`: number of values, half of them on either side of the estimate. Without `span`, values are added on a side
+        until the interval has an end there.
     - `span`: half-width of the range of values, in formal standard errors. By default 1.5 times the half-width of the
-        interval, and on a side without an end up to six times.
+        interval, and at most six times on a side on which values are added.
     - `level`: confidence level of the interval, between 0 and 1.
 
     **Returns:** a `Profile`.

@@ -198,8 +198,8 @@ def minimize(
 
         minimize(Problem.of(system, trials, free), LeastSquares(rtol=1e-9), steps=200)
 
-    As in `fit`, the search is repeated with finer integration steps where these change the result, the standard
-    deviations of distributions over groups are estimated, and a sum near its bound is fixed there.
+    As in `fit`, the search is repeated with finer integration steps if these change the result. The standard deviations
+    of distributions over groups are estimated. A sum near its bound is fixed at the bound.
 
     **Arguments:**
 
