@@ -49,7 +49,7 @@ def cosine_and_sine(angle: Component) -> tuple[Component, Component]:
     return jnp.cos(angle), jnp.sin(angle)
 
 
-def _frozen(rows) -> Matrix:
+def _frozen(rows: Sequence[Sequence[Component]]) -> Matrix:
     return tuple(tuple(row) for row in rows)  # type: ignore[return-value]
 
 

@@ -19,6 +19,11 @@ from .._scalarjit.scalar_function import ScalarFunction
 from .._system.motion import kinetic_energy_of
 from .._system.system import System
 from .arguments import (
+    Coordinates,
+    InputArrays,
+    InputValues,
+    Speeds,
+    Time,
     as_array,
     as_row,
     check_is_system,
@@ -32,8 +37,6 @@ from .checks import check_system
 from .constraint_residuals import check_left_out
 from .diagnosis import diagnosis
 from .kanes_method import KaneEquations, as_one_program, motion_rates, rates_and_equations
-
-InputValues = Mapping[str, Component] | None
 
 
 def _at_state(read: Callable[[KaneEquations, Array], Array]) -> ScalarFunction:
@@ -150,7 +153,7 @@ def partial_velocities(
 
 
 @ScalarFunction
-def _partial_velocities(system, t, q, u, inputs):
+def _partial_velocities(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays):
     kane = KaneEquations(system, t, q, u, inputs)
     motion, partials = kane.motion(kane.t, kane.q, kane.u_all), kane.partial_velocities()
     V, W = [], []
@@ -189,7 +192,9 @@ def generalized_inertia_forces(
 
 
 @ScalarFunction
-def _generalized_inertia_forces(system, t, q, u, inputs, u_dot):
+def _generalized_inertia_forces(
+    system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, u_dot: Speeds | None
+):
     kane = KaneEquations(system, t, q, u, inputs)
     partials = kane.partial_velocities()
     Fr_star = kane.inertia_forces(partials)
@@ -228,7 +233,7 @@ def dependent_accelerations(
 
 
 @ScalarFunction
-def _dependent_accelerations(system, t, q, u, inputs, u_dot):
+def _dependent_accelerations(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, u_dot: Speeds):
     kane = KaneEquations(system, t, q, u, inputs)
     return as_vector(kane.dependent_accelerations(as_row(u_dot, system.speeds, "u_dot")), q)
 

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PyTree
 
 from .._common.lookup import refuse_any, refuse_if
@@ -159,7 +160,7 @@ def has_no_implied(system: System) -> bool:
     return type(system).implied_constraints is System.implied_constraints
 
 
-def configuration_tolerance(dtype: Any) -> float:
+def configuration_tolerance(dtype: DTypeLike) -> float:
     """The largest residual, relative to its terms, with which the configuration constraints are satisfied."""
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
@@ -266,7 +267,7 @@ def projected(system: System, t: Component, q: Array, steps: int = 3) -> Float[A
     return q
 
 
-def n_configuration_constraints(system: System, t: Component, q: Any) -> int:
+def n_configuration_constraints(system: System, t: Component, q: Array | jax.ShapeDtypeStruct) -> int:
     """The number of residuals of the configuration constraints. `q` may be a `jax.ShapeDtypeStruct`."""
     return jax.eval_shape(lambda q: configuration_residual(system, t, q), q).shape[0]
 

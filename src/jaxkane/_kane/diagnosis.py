@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from .._scalarjit.components import Component, Numbers, rounding_of_pivots, stack
@@ -11,6 +9,10 @@ from .._scalarjit.scalar_function import ScalarFunction
 from .._system.motion import Force
 from .._system.system import System
 from .arguments import (
+    Coordinates,
+    InputValues,
+    Speeds,
+    Time,
     as_row,
     is_concrete,
     without_derivatives,
@@ -19,7 +21,7 @@ from .constraint_residuals import SINGULAR_ROUNDING, dependent_speeds_at
 from .kanes_method import KaneEquations, compiled, rates_and_equations
 
 
-def diagnosis(system: System, t: Component, q: Numbers, u: Numbers, inputs: Any = None) -> str:
+def diagnosis(system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None) -> str:
     """Explain why accelerations or rates are not finite at a state, and what to do. Return "" if no cause is found.
 
     The order of the checks is: the given numbers, the dependent speeds, the mass matrix, the rates of the coordinates,
@@ -83,7 +85,7 @@ def diagnosis(system: System, t: Component, q: Numbers, u: Numbers, inputs: Any 
     return ""
 
 
-def _loads_not_finite(system: System, t: Component, q: Numbers, u: Numbers, inputs: Any) -> str:
+def _loads_not_finite(system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues) -> str:
     kane = KaneEquations(system, t, q, u, inputs)
     motion = kane.motion(kane.t, kane.q, kane.u_all)
     reason = system.why_not_finite(motion, kane.inputs)
@@ -107,7 +109,7 @@ def _moves_nothing(system: System, t: Component, q: Numbers, u: Numbers, directi
 
 
 @ScalarFunction.compile_cheaply
-def _body_velocities(system, t, q, u, direction):
+def _body_velocities(system: System, t: Time, q: Coordinates, u: Speeds, direction: Speeds):
     kane = KaneEquations(system, t, q, u)
     along = kane.with_dependent(as_row(direction, system.speeds, "direction"))
     return stack([x for pair in kane.along_speeds(kane.velocities, along)[0] for x in pair]).astype(q.dtype)

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 from .._common.lookup import refuse_if
+from .._scalarjit.components import Component, Numbers
 from .._system.motion import Motion
 from .._system.system import System, call_with_states
 from .arguments import Row, check_is_system
@@ -30,14 +31,14 @@ class _WithMultipliers(System):
     def speeds(self) -> tuple[str, ...]:  # type: ignore[override]
         return (*self.inner.speeds, *self.inner.dependent_speeds)
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: Numbers, u: Numbers):
         motion = self.inner.motion(t, q, u)
         return Motion(motion.bodies, points=motion.points, frames=motion.frames)
 
-    def events(self, t, q, u, x=()):
+    def events(self, t: Component, q: Numbers, u: Numbers, x: Numbers = ()):
         return call_with_states(self.inner.events, t, q, u, x)
 
-    def multiplier_residuals(self, t: Any, q: Row, u: Row) -> Row:
+    def multiplier_residuals(self, t: Component, q: Row, u: Row) -> Row:
         evaluator, q, u = DescriptionEvaluator(self.inner), tuple(q), tuple(u)
         c = evaluator.read("velocity_residuals", t, q, u)
         if self.inner.dependent_speeds and len(c) >= len(self.inner.dependent_speeds):

@@ -23,31 +23,33 @@ from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point, auxiliary_speed
 from .._system.motion import Motion
 from .._system.system import System
-from .api import InputValues
-from .arguments import Row, as_row
+from .arguments import Coordinates, InputArrays, InputValues, Row, Speeds, Time, as_row
 from .description import EvaluatedDescription
 from .kanes_method import KaneEquations, motion_rates, unit
 
+Partial = tuple[list, list]
+"""Partial velocities of the bodies and of the loads along one direction of the speeds."""
+
 
 @jit
-def multipliers_now(system, t, q, u, inputs):
+def multipliers_now(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays):
     """Multipliers of the velocity residuals (k,), at the accelerations of the motion."""
     return _multipliers(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
 @jit
-def forces_now(system, t, q, u, inputs):
+def forces_now(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays):
     """Constraint forces by name, at the accelerations of the motion: numbers, or components in N (3,)."""
     return _forces(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
 @ScalarFunction
-def _multipliers(system, t, q, u, inputs, u_dot):
+def _multipliers(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, u_dot: Speeds):
     return as_vector(Reactions(system, t, q, u, inputs, u_dot).multipliers, q)
 
 
 @ScalarFunction
-def _forces(system, t, q, u, inputs, u_dot):
+def _forces(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, u_dot: Speeds):
     kane = Reactions(system, t, q, u, inputs, u_dot)
     vectors = {name: as_vector(row, q) for name, row in kane.forces_of_parts()}
     return vectors | {name: jnp.asarray(x, dtype=q.dtype) for name, x in kane.forces_of_auxiliary_speeds()}
@@ -56,7 +58,7 @@ def _forces(system, t, q, u, inputs, u_dot):
 class AuxiliarySpeeds(KaneEquations):
     """Kane's equations at a state, and derivatives along auxiliary speeds of points and frames."""
 
-    def __init__(self, system: System, t: Any, q: Any, u: Any, inputs: InputValues = None):
+    def __init__(self, system: System, t: Component, q: Numbers, u: Numbers, inputs: InputValues = None):
         super().__init__(system, t, q, u, inputs)
         self.description: Motion = self.motion(self.t, self.q, self.u_all)
 
@@ -114,7 +116,7 @@ class Reactions(AuxiliarySpeeds):
         R = [mul(-1.0, self.unbalanced(self.along_speeds(self.velocities, direction))) for direction in directions]
         self.multipliers: Row = solve(tuple(zip(*self.C_dep, strict=True)), R)[0] if self.k else ()
 
-    def unbalanced(self, partial: Any) -> Component:
+    def unbalanced(self, partial: Partial) -> Component:
         """R = sum F . V + T . W - V . dp/dt - W . dH/dt along one direction."""
         bodies, columns = partial
         active = [dot(V, F) for V, F in zip(columns, self.load_vectors, strict=True)]

@@ -12,9 +12,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
-from .._scalarjit.compat import evaluated, interpret, operation_of
+from .._scalarjit.compat import Equation, Variable, evaluated, interpret, operation_of
 from .._scalarjit.components import Numbers
 from .._scalarjit.jaxpr import is_inexact, opened, program_of
 
@@ -65,11 +66,11 @@ def term_sizes(f: Callable[..., Any], *args: Any, sizes: Sequence[Any] | None = 
     return jax.tree.unflatten(jax.tree.structure(shape), [size for _, size in results])
 
 
-def _sized_constant(_: Any, x: Numbers) -> tuple[Any, Any]:
+def _sized_constant(_: Variable, x: Numbers) -> tuple[Any, Any]:
     return x, jnp.abs(x)
 
 
-def _sized(equation: Any, operands: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+def _sized(equation: Equation, operands: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
     """The results of an equation and their sizes, from its operands and their sizes."""
     inner = opened(equation)
     if inner is not None:
@@ -97,7 +98,7 @@ def inside_pure_functions(f: Callable[..., Any], n: int) -> set[int]:
     program = program_of(f, *[jax.ShapeDtypeStruct((), jnp.result_type(float))] * n)
     found: set[int] = set()
 
-    def depends_on(equation: Any, operands: list[frozenset[int]]) -> list[frozenset[int]]:
+    def depends_on(equation: Equation, operands: list[frozenset[int]]) -> list[frozenset[int]]:
         inner = opened(equation)
         if inner is not None:
             return interpret(inner, operands, depends_on, lambda *_: frozenset())
@@ -141,7 +142,7 @@ def equilibrated(A: Numbers) -> tuple[Any, Any, Any]:
 
 
 def nearest_root(
-    f: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], q: np.ndarray, scales: Any = 1.0
+    f: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], q: np.ndarray, scales: Numbers = 1.0
 ) -> np.ndarray:
     """The nearest q (n,) with f = 0, by the Gauss-Newton method with NumPy; NaN if it does not converge.
 
@@ -175,7 +176,7 @@ def singular_values(A: Numbers) -> Numbers:
     return s / xp.where(s[:1] > 0, s[:1], 1.0)
 
 
-def rank_tolerance(dtype: Any) -> float:
+def rank_tolerance(dtype: DTypeLike) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.6
 
 

@@ -34,6 +34,9 @@ Component: TypeAlias = Any
 Numbers: TypeAlias = Any
 """An array of numbers of JAX or NumPy, also traced. These have the same operators, but no common type to declare."""
 
+ComponentsLike: TypeAlias = Sequence[Component] | np.ndarray | Array
+"""Several numbers: a sequence of components, or an array."""
+
 Bool: TypeAlias = Any
 """A bool, or an array of bools, also traced."""
 

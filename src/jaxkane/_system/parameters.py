@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from .._common.lookup import checked, refuse_if
 from .._scalarjit.compat import Tracer
@@ -20,7 +21,7 @@ from .._scalarjit.components import Numbers
 
 
 def parameter(
-    default: Any = dataclasses.MISSING,
+    default: Numbers = dataclasses.MISSING,
     *,
     positive: bool = False,
     within: tuple[float, float] = (-math.inf, math.inf),
@@ -52,7 +53,7 @@ def parameter(
     return eqx.field(converter=to_float, metadata=metadata, default_factory=lambda: default)
 
 
-def learned(default: Any = dataclasses.MISSING) -> Any:
+def learned(default: object = dataclasses.MISSING) -> Any:
     """Declare a function with parameters, such as a small neural network, as a field of a `System`.
 
         friction: Any = jk.learned(eqx.nn.MLP("scalar", "scalar", 8, 1, jnp.tanh, key=jax.random.key(0)))
@@ -76,7 +77,7 @@ class Learned(eqx.Module):
     arrays: Any
     rest: Any = eqx.field(static=True)
 
-    def __init__(self, function: Any):
+    def __init__(self, function: object):
         if isinstance(function, Learned):
             self.arrays, self.rest = function.arrays, function.rest
             return
@@ -122,7 +123,7 @@ class ParameterInfo:
         """Whether some finite values are rejected."""
         return self.positive or self.within != (-math.inf, math.inf)
 
-    def allows(self, x: Any) -> Numbers:
+    def allows(self, x: Numbers) -> Numbers:
         """Which values of an array are allowed. Values that are not finite are not allowed."""
         lower, upper = self.within
         conditions = [x > 0] if self.positive else []
@@ -151,7 +152,7 @@ def names_of_leaf(path: tuple[Any, ...]) -> tuple[str, ...]:
     return tuple(leaf_name(path[:n]) for n in range(1, len(path) + 1))
 
 
-def _steps(part: Any, path: tuple[Any, ...]) -> Iterator[tuple[Any, ParameterInfo]]:
+def _steps(part: PyTree, path: tuple[Any, ...]) -> Iterator[tuple[Any, ParameterInfo]]:
     """The objects along the path to a leaf, and the declaration of the field that contains it."""
     info = ANY
     for key in path:
@@ -166,24 +167,24 @@ def _steps(part: Any, path: tuple[Any, ...]) -> Iterator[tuple[Any, ParameterInf
         yield part, info
 
 
-def declared(system: Any, path: tuple[Any, ...]) -> ParameterInfo:
+def declared(system: PyTree, path: tuple[Any, ...]) -> ParameterInfo:
     """The declaration of the field that contains this leaf."""
     return [ANY, *(info for _, info in _steps(system, path))][-1]
 
 
-def learned_part(system: Any, path: tuple[Any, ...]) -> str:
+def learned_part(system: PyTree, path: tuple[Any, ...]) -> str:
     """The name of the learned function that contains this leaf, or ""."""
     lengths = [n for n, (part, _) in enumerate(_steps(system, path), 1) if isinstance(part, Learned)]
     return leaf_name(path[: lengths[0]]) if lengths else ""
 
 
-def parameters_in(system: Any) -> list[tuple[str, Any, ParameterInfo]]:
+def parameters_in(system: PyTree) -> list[tuple[str, Any, ParameterInfo]]:
     """Name, value and declaration of each parameter, including those of parts. Omits parameters that are None."""
     leaves = [(path, x, declared(system, path)) for path, x in jax.tree_util.tree_leaves_with_path(system)]
     return [(leaf_name(path), x, info) for path, x, info in leaves if info is not ANY]
 
 
-def in_batches(system: Any) -> list[str]:
+def in_batches(system: PyTree) -> list[str]:
     """Names of the parameters of a system, or of a part, that have more leading axes than declared."""
     return [
         leaf_name(path)
@@ -192,14 +193,14 @@ def in_batches(system: Any) -> list[str]:
     ]
 
 
-def with_parameters(system: Any, values: Mapping[str, Any]) -> Any:
+def with_parameters(system: PyTree, values: Mapping[str, Any]) -> Any:
     """The system with other values of some parameters, by the names of `parameters_in`. Every part is constructed and
     checked again."""
     paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(system)] if values else []
     return _replaced(system, {path: values[name] for path in paths if (name := leaf_name(path)) in values})
 
 
-def _replaced(part: Any, values: Mapping[tuple[Any, ...], Any]) -> Any:
+def _replaced(part: PyTree, values: Mapping[tuple[Any, ...], Any]) -> Any:
     if not values or () in values:
         return values.get((), part)
     inner: dict[Any, dict[tuple[Any, ...], Any]] = {}
@@ -215,7 +216,7 @@ def _replaced(part: Any, values: Mapping[tuple[Any, ...], Any]) -> Any:
     return kind(items)
 
 
-def to_float(value: Any) -> Numbers:
+def to_float(value: PyTree) -> Numbers:
     # Keep values that are not numbers. `System.__check_init__` raises an exception with their name.
     if isinstance(value, np.ma.MaskedArray):
         refuse_if(np.ma.is_masked(value), "Some values are masked. Fill or remove them.")
@@ -255,7 +256,7 @@ def check_fields(system: eqx.Module) -> None:
             )
 
 
-def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:
+def check_parameter(label: str, value: object, info: ParameterInfo) -> None:
     """Raise an exception for values that are not finite floats. Batches are judged by the status of their members."""
     if isinstance(value, Tracer):
         return

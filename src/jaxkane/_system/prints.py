@@ -18,7 +18,7 @@ _MOST_NUMBERS = 100  # of an array; a larger one prints its shape
 _TIE = "\N{NO-BREAK SPACE}"  # lines are not broken between a number and its unit
 
 
-def concrete_numbers(value: Any) -> np.ndarray | None:
+def concrete_numbers(value: object) -> np.ndarray | None:
     """The numbers of an array, or None for a traced or deleted one, and for other objects."""
     if not isinstance(value, (jax.Array, np.ndarray, np.number, bool, int, float, complex)):
         return None
@@ -28,7 +28,7 @@ def concrete_numbers(value: Any) -> np.ndarray | None:
         return None
 
 
-def text_of(value: Any, unit: str = "", ndim: int | None = None) -> str:
+def text_of(value: object, unit: str = "", ndim: int | None = None) -> str:
     """A value as text, such as "0.3 rad" and "[1, 2] kg", with spaces at which `wrapped` does not break a line.
 
     **Arguments:**
@@ -71,7 +71,7 @@ def wrapped(text: str) -> str:
     return "\n".join(lines).replace(_TIE, " ")
 
 
-def _one_line(module: Any, ndim: int | None = None) -> str:
+def _one_line(module: eqx.Module, ndim: int | None = None) -> str:
     infos = parameter_info(module)
     items = []
     for field in dataclasses.fields(module):
@@ -84,7 +84,7 @@ def _one_line(module: Any, ndim: int | None = None) -> str:
     return f"{type(module).__name__}({', '.join(items)})"
 
 
-def _nested(x: Any) -> str:
+def _nested(x: object) -> str:
     if isinstance(x, list):
         return f"[{', '.join(map(_nested, x))}]"
     return f"{x + 0.0:.6g}" if isinstance(x, (float, complex)) else str(x)  # -0.0 + 0.0 is 0.0

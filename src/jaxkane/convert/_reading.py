@@ -85,7 +85,7 @@ def without_dots(name: str) -> str:
     return name.replace(".", "_")
 
 
-def names_without_dots(names: Any) -> Any:
+def names_without_dots(names: Sequence[str] | None) -> Any:
     """A list of names of a file, with underscores. A string is not a list, and is refused later."""
     return names if names is None or isinstance(names, str) else [without_dots(name) for name in names]
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._common.lookup import not_there, refuse_if
+from .._scalarjit.components import ComponentsLike
 from ..joints import Coupling, Joint, Link, Mechanism, ball, free, hinge, mechanism, planar, slide
 from ._inertias import Choice, FileBody, possible_inertias
 from ._reading import Path, Selection, report_left_out, selected, text_of
@@ -22,7 +23,7 @@ def from_urdf(
     merge_fixed: bool = True,
     stops: Selection = (),
     friction: Selection = (),
-    gravity: Any = (0.0, 0.0, -9.81),
+    gravity: ComponentsLike = (0.0, 0.0, -9.81),
     strict: bool = False,
     dependent: Sequence[str] | None = None,
     name: str | None = None,

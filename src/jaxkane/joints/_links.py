@@ -8,11 +8,13 @@ from typing import Any
 
 import jax
 import numpy as np
+import numpy.typing as npt
 
 from .. import rotations
 from .._common.lookup import checked, refuse_any, refuse_if, refuse_unknown
 from .._kane.contact.laws import MOST_CONTACTS
 from .._scalarjit.compat import Tracer
+from .._scalarjit.components import ComponentsLike
 from ..rotations import Matrix
 from ._joints import Hinge, Joint, JointType, Slide, components, exact, exact_numbers, is_structural_zero
 from ._loops import with_dependent
@@ -132,7 +134,7 @@ class Coupling:
 def mechanism(
     links: Sequence[Link],
     *,
-    gravity: Any = (0.0, 0.0, -9.81),
+    gravity: ComponentsLike = (0.0, 0.0, -9.81),
     actuators: Sequence[Actuator] = (),
     sites: Sequence[Site] = (),
     loops: Sequence[Loop | Coupling] = (),
@@ -224,7 +226,7 @@ def _poses(structure: Structure, poses: Mapping[str, Mapping[str, float]]) -> tu
     return tuple((label, tuple(float(pose[name]) for name in names)) for label, pose in poses.items())
 
 
-def _checked(part: Any, kind: type) -> Any:
+def _checked(part: object, kind: type) -> Any:
     return checked(part, kind, f"mechanism needs a {kind.__name__}")
 
 
@@ -248,7 +250,7 @@ def _in_order(links: list[Link]) -> list[Link]:
     return list(ordered.values())
 
 
-def _check_name(name: Any, what: str) -> None:
+def _check_name(name: object, what: str) -> None:
     if not isinstance(name, str) or not name or "." in name:
         raise ValueError(
             f"The name of a {what} must be a string without a dot, because dots separate the parts of a parameter's "
@@ -256,7 +258,7 @@ def _check_name(name: Any, what: str) -> None:
         )
 
 
-def _check_known(label: str, name: Any, known: Iterable[str], where: str) -> None:
+def _check_known(label: str, name: object, known: Iterable[str], where: str) -> None:
     refuse_unknown([name], known, f"{label} is not among {where}:")
 
 
@@ -336,7 +338,9 @@ def _actuator(actuator: Actuator, joints: Mapping[str, JointType], values: dict[
     return ActuatorStructure(actuator.name, joint.name, gear)
 
 
-def _loop(loop: Any, structure: Structure, joints: Mapping[str, JointType]) -> LoopStructure | CouplingStructure:
+def _loop(
+    loop: Loop | Coupling, structure: Structure, joints: Mapping[str, JointType]
+) -> LoopStructure | CouplingStructure:
     if isinstance(loop, Loop):
         sites = [site.name for site in structure.sites]
         for end in (loop.first, loop.second):
@@ -406,7 +410,7 @@ def _field(name: str, joints: Mapping[str, JointType]) -> Field:
     return name, positive, (_OF_SLIDERS if isinstance(joint, Slide) else _OF_HINGES)[kind]
 
 
-def _matrix(orientation: Any, name: str) -> Matrix | None:
+def _matrix(orientation: npt.ArrayLike | None, name: str) -> Matrix | None:
     """[R] (components in the parent -> components here) as exact floats; None for no rotation.
 
     **Raises:** `ValueError` if it is not a rotation.
