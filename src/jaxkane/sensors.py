@@ -24,7 +24,7 @@ from ._scalarjit.components import Component, positive
 from ._system.kinematics import Frame, Point, Vector
 from ._system.motion import Body, point_of
 from ._system.system import Measurements
-from .loads._laws import check_numbers
+from .loads import check_numbers
 
 Named = dict[str, Component]
 

@@ -14,7 +14,7 @@ import pytest
 
 from jaxkane._scalarjit.backends import compiler as objects
 from jaxkane._scalarjit.backends import llvm, native
-from jaxkane._scalarjit.backends.compiler import LLVMCompiler
+from jaxkane._scalarjit.backends.native import LLVMCompiler
 from jaxkane._scalarjit.scalar_function import ScalarFunction
 
 pytestmark = pytest.mark.usefixtures("native")

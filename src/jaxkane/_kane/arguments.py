@@ -104,9 +104,14 @@ def check_is_system(system: System) -> None:
         refuse_if(not names, f"{type(system).__name__} has no {what}. Name them in its class: {what} = (...).")
 
 
+def has_multipliers(system: System) -> bool:
+    """Whether the constraints of a system have multipliers instead of dependent speeds."""
+    return hasattr(system, "multiplier_residuals")
+
+
 def refuse_multipliers(system: System) -> None:
     """**Raises:** `ValueError` for a system of `with_multipliers`, whose equations are more than M u_dot = f."""
-    if hasattr(system, "multiplier_residuals"):
+    if has_multipliers(system):
         raise ValueError(
             f"{type(system).__name__} has multipliers: it can be assembled, simulated and swept, but this function "
             "does not contain its constraint forces. Pass the system without multipliers (its attribute `inner`)."
@@ -154,7 +159,7 @@ def refuse_incomplete(system: System, q: Numbers, u: Numbers) -> None:
             refuse_unknown(values, names, f"{name}: {label} has no", "it has")
     missing = [c for c in system.dependent_coordinates if c not in q] if isinstance(q, Mapping) else []
     label, determined = "q", missing
-    if not missing and isinstance(u, Mapping) and u and hasattr(system, "multiplier_residuals"):
+    if not missing and isinstance(u, Mapping) and u and has_multipliers(system):
         label, determined = "u", [s for s in system.speeds if s not in u]
     after = ", which the others determine. Find the state with jaxkane.assemble(system, q, u) and "
     refuse_any(determined, f"{name}: {label} omits", f"{after}pass its state.{label}, or pass the value in {label}.")

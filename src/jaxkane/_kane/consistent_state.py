@@ -21,8 +21,8 @@ from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component, Numbers
 from .._scalarjit.nan import nan_where
 from .._system.system import State, System, with_class
-from .api import constraint_jacobian, dependent_speeds
-from .arguments import Coordinates, as_array, check_is_system, check_time, is_concrete
+from .api import constraint_jacobian, dependent_speeds, diagnosis
+from .arguments import Coordinates, as_array, check_is_system, check_time, has_multipliers, is_concrete
 from .checks import check_system
 from .constraint_residuals import (
     configuration_residual,
@@ -34,10 +34,9 @@ from .constraint_residuals import (
     violations,
 )
 from .contact.checks import check_contacts
-from .contact.forces import ContactRows, has_multipliers, layout_of, speeds_in_contact
+from .contact.forces import ContactRows, layout_of, speeds_in_contact
 from .contact.impulses import REDUNDANT
 from .description import at_random_point, structure_of
-from .diagnosis import diagnosis
 from .kanes_method import KaneEquations
 from .scaling import SMALLEST_SIZE
 

@@ -21,12 +21,23 @@ from .._scalarjit.scalar_function import ScalarFunction, tree_of
 from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
 from .._system.system import NamedVector, State, System, has_outputs, packed, unpacked
-from .arguments import Coordinates, InputArrays, Inputs, PackedState, Row, Speeds, Time, as_row, inputs_of
+from .arguments import (
+    Coordinates,
+    InputArrays,
+    Inputs,
+    PackedState,
+    Row,
+    Speeds,
+    Time,
+    as_row,
+    has_multipliers,
+    inputs_of,
+)
 from .constraint_residuals import configuration_residual
-from .contact.forces import forces_in_contact, has_multipliers, layout_of
+from .contact.forces import forces_in_contact, layout_of
 from .description import jvp
 from .kanes_method import KaneEquations, motion_rates
-from .reactions import Reactions
+from .multipliers import Reactions
 
 
 class MeasurementContext(Inputs):

@@ -4,7 +4,7 @@ A key contains
 
 1. the structure, shapes and dtypes of the arguments, and their static values,
 2. the settings of JAX on which a trace depends: precision, promotion, checks for NaN,
-3. a digest of the values that the code in the arguments uses (`captured_values`; see `docs/caching.md`).
+3. a digest of the values that the code in the arguments uses (`CapturedValues`; see `docs/caching.md`).
 
 A check takes some microseconds. The digest is computed again only if a value has changed. If a value changes back, the
 earlier program is used again. Mutations during tracing do not invalidate the trace. Programs are kept in `Cache`,
@@ -29,8 +29,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .cache import Cache, owners_of
-from .captured_values import NUMBERS, CapturedValues, is_of_library
 from .compat import Tracer, filter_jit_uncached, is_under_way, settings, storable_checks
+from .digest import NUMBERS, CapturedValues, is_of_library
 
 _count = itertools.count()
 _forgotten = b"0"

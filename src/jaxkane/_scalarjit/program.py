@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from .backends import native
 from .backends.native import BatchMask, Scalars
-from .backends.numpy import NumPyProgram
+from .backends.source import NumPyProgram
 from .backends.xla import Windows, as_one_function, chunks_of, one_chunk_at_a_time, pays_as_windows
 from .compat import (
     ClosedJaxpr,

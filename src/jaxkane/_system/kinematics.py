@@ -38,7 +38,7 @@ from .._scalarjit.components import (
     stack,
 )
 from ..rotations import Matrix
-from .prints import text_of
+from .parameters import text_of
 
 
 class AuxiliarySpeed(NamedTuple):

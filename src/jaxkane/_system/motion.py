@@ -14,7 +14,7 @@ from jaxtyping import Array
 from .._common.lookup import Kind, checked, not_there, refuse_if
 from .._scalarjit.components import Component, Triple, add, component, dot, is_zero, mul, sub
 from .kinematics import Frame, Point, Vector
-from .prints import concrete_numbers, text_of, wrapped
+from .parameters import concrete_numbers, text_of, wrapped
 
 Inertia: TypeAlias = Component | Sequence[Component] | Sequence[Sequence[Component]] | Array
 """Three principal moments, a matrix (3, 3), or 0.0."""

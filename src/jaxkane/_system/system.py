@@ -20,8 +20,7 @@ from .._scalarjit.cache_key import leaked_tracer
 from .._scalarjit.components import Component, Numbers
 from .kinematics import Frame, Point, Vector
 from .motion import Motion, motion_number
-from .parameters import check_fields, check_parameter, parameter_info, to_float
-from .prints import concrete_numbers, module_text, text_of
+from .parameters import check_fields, check_parameter, concrete_numbers, module_text, parameter_info, text_of, to_float
 
 
 class NamedVector(Sequence[Component]):
@@ -48,7 +47,7 @@ class NamedVector(Sequence[Component]):
             start, stop = (self._place(end) if isinstance(end, str) else end for end in (key.start, key.stop))
             places = slice(start, stop + 1 if isinstance(key.stop, str) else stop, key.step)  # type: ignore[operator]
             return NamedVector(self._items[places], self.names[places])
-        if isinstance(key, (tuple, list)):
+        if isinstance(key, Sequence) and not isinstance(key, str):
             places = [self._place(k) for k in key]
             return NamedVector([self._items[i] for i in places], [self.names[i] for i in places if self.names])
         return self._items[self._place(key)]
@@ -131,11 +130,12 @@ def _prepared(system: str, name: str, value: object) -> Any:
     return _named(value, name) if name in METHODS and callable(value) else value
 
 
-def _checked_units(system: str, units: Mapping[str, str]) -> Mapping[str, str]:
+def _checked_units(system: str, units: object) -> Mapping[str, str]:
     what = f'{system}.units must be a dict of strings by name, such as {{"angle": "rad"}}'
-    for name, unit in checked(units, Mapping, what).items():
+    declared: Mapping[str, str] = checked(units, Mapping, what)
+    for name, unit in declared.items():
         checked(checked(name, str, what) and unit, str, f"{what}: {name!r}")
-    return units
+    return declared
 
 
 def _checked_names(system: str, kind: str, names: object) -> tuple[str, ...]:

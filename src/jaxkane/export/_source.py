@@ -20,12 +20,12 @@ from .._common.files import write_file
 from .._common.lookup import refuse_unknown
 from .._integrate.jumps import warn_of_jumps
 from .._kane.expression_graph import JACOBIANS, OFFERED, Formulas
-from .._scalarjit.backends.numpy import NUMPY_NAMES
 from .._scalarjit.backends.source import (
     ARITHMETIC,
     COMPARED,
     COMPARISONS,
     LOOSE,
+    NUMPY_NAMES,
     SIGNED,
     SUM,
     TIGHT,

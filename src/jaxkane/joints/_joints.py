@@ -323,7 +323,7 @@ def _limits(stops: Stops, name: str) -> tuple[tuple[bool, bool], dict[str, Any]]
     limits = {end: x for end, x in (("lower", lower), ("upper", upper)) if x is not None}
     is_concrete = not any(isinstance(x, Tracer) for x in limits.values())
     if any(np.ndim(x) or isinstance(x, str) for x in limits.values()) or (
-        is_concrete and len(limits) == 2 and not float(lower) < float(upper)
+        is_concrete and len(limits) == 2 and not float(limits["lower"]) < float(limits["upper"])
     ):
         raise ValueError(f"The stops of {name!r} must be a lower and a larger upper limit, or None; got {stops!r}.")
     return (lower is not None, upper is not None), _numbers(name, **limits)

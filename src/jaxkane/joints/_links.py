@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import numpy as np
-import numpy.typing as npt
+from jaxtyping import PyTree
 
 from .. import rotations
 from .._common.lookup import checked, refuse_any, refuse_if, refuse_unknown
@@ -258,7 +258,7 @@ def _check_name(name: object, what: str) -> None:
         )
 
 
-def _check_known(label: str, name: object, known: Iterable[str], where: str) -> None:
+def _check_known(label: str, name: str, known: Iterable[str], where: str) -> None:
     refuse_unknown([name], known, f"{label} is not among {where}:")
 
 
@@ -410,7 +410,7 @@ def _field(name: str, joints: Mapping[str, JointType]) -> Field:
     return name, positive, (_OF_SLIDERS if isinstance(joint, Slide) else _OF_HINGES)[kind]
 
 
-def _matrix(orientation: npt.ArrayLike | None, name: str) -> Matrix | None:
+def _matrix(orientation: PyTree, name: str) -> Matrix | None:
     """[R] (components in the parent -> components here) as exact floats; None for no rotation.
 
     **Raises:** `ValueError` if it is not a rotation.

@@ -303,7 +303,7 @@ class Mechanism(System):
                 contacts[f"{joint.name} friction"] = DryFriction(u[f"{joint.name}_rate"], friction)
         return contacts
 
-    def _loops_at_rest(self, t: Component, q: NamedVector, independent: bool) -> GroupedResiduals:
+    def _loops_at_rest(self, t: Component, q: Named, independent: bool) -> GroupedResiduals:
         rest = dict.fromkeys((*self.speeds, *self.dependent_speeds), 0.0)
         return loop_residuals(self, self.sites_at(q, rest), q, rest, independent)[0]
 

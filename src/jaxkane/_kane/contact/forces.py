@@ -48,7 +48,7 @@ from ..._scalarjit.scalar_function import ScalarFunction
 from ..._system.kinematics import Frame, Vector
 from ..._system.motion import Motion
 from ..._system.system import System
-from ..arguments import Row
+from ..arguments import Row, has_multipliers
 from ..constraint_residuals import configuration_tolerance
 from ..description import dtype_of, jvp
 from ..kanes_method import KaneEquations
@@ -100,11 +100,6 @@ NO_CONTACTS = ContactLayout((), (), (), False, (), ())
 
 def has_contacts(system: System) -> bool:
     return type(system).contacts is not System.contacts
-
-
-def has_multipliers(system: System) -> bool:
-    """Whether the constraints of a system have multipliers instead of dependent speeds."""
-    return hasattr(system, "multiplier_residuals")
 
 
 def layout_of(system: System) -> ContactLayout:

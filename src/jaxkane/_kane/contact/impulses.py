@@ -61,7 +61,7 @@ from ..._system.system import NamedVector, System
 from ..api import checked_arrays, finite_or_explained
 from ..arguments import Row, as_row, check_number, is_concrete
 from ..kanes_method import KaneEquations, mass_matrix_columns
-from ..reactions import AuxiliarySpeeds
+from ..multipliers import AuxiliarySpeeds
 
 
 class Impact(eqx.Module):

@@ -1,21 +1,187 @@
-"""Native kernels: whether they are enabled and possible, and programs as such kernels."""
+"""Native kernels: LLVM in this process, compiled code on disk, whether kernels are enabled and possible, and programs
+as such kernels."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import ctypes.util
 import functools
+import hashlib
 import os
+import platform
 import threading
 import warnings
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from ..._common.files import atomic_write
 from ..compat import ClosedJaxpr, types_of
 from ..graph import LIBRARY, Graph, NotScalarError, graph_of, symbol
-from .compiler import LLVMCompiler, ObjectCache, cache_folder, without_llvm
 from .llvm import Writer, mismatch, wrapper_text
+
+_MARK = b"jaxkane compiled code 1\n"
+
+
+def cache_folder() -> Path | None:
+    """A folder next to JAX's persistent compilation cache, if that is enabled and a local folder."""
+    config: Any = jax.config
+    folder = config.jax_compilation_cache_dir if config.jax_enable_compilation_cache else None
+    return Path(folder) / "jaxkane" if folder and "://" not in folder else None
+
+
+class ObjectCache(NamedTuple):
+    """A folder of compiled code."""
+
+    folder: Path
+
+    def read(self, name: str) -> bytes | None:
+        path = self.folder / f"{name}.o"
+        try:
+            whole = path.read_bytes()
+        except OSError:
+            return None
+        length = len(_seal(name, b""))
+        seal, code = whole[:length], whole[length:]
+        if seal == _seal(name, code):
+            return code
+        warnings.warn(f"The compiled code in {path} is damaged. It is deleted and compiled again.", stacklevel=2)
+        with contextlib.suppress(OSError):
+            path.unlink()
+        return None
+
+    def write(self, name: str, code: bytes) -> None:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            atomic_write(self.folder / f"{name}.o", lambda file: file.write(_seal(name, code) + code))
+        except OSError as error:
+            text = f"Compiled code could not be stored in {self.folder}: {error.strerror or error}."
+            warnings.warn(text, stacklevel=2)
+
+
+def _seal(name: str, code: bytes) -> bytes:
+    return _MARK + hashlib.sha256(name.encode() + b"\n" + code).hexdigest().encode() + b"\n"
+
+
+_MATHEMATICS = {"Linux": "libm.so.6", "Darwin": "/usr/lib/libSystem.B.dylib", "Windows": "ucrtbase.dll"}
+
+
+class LLVMCompiler:
+    """LLVM for this processor: its name and `features`, and the number of float64 `lanes` of its vectors.
+
+    LLVM may be used by one thread at a time. A function must not be compiled twice, because the first code would be
+    freed while XLA calls it. Hold `lock` to compile and register.
+    """
+
+    def __init__(self) -> None:
+        import llvmlite
+        import llvmlite.binding as llvm
+
+        self.llvm, self.lock = llvm, threading.RLock()
+        llvm.initialize_native_target()
+        llvm.initialize_native_asmprinter()
+        features = llvm.get_host_cpu_features()
+        self.cpu, self.features = llvm.get_host_cpu_name(), features.flatten()
+        self.version = f"llvmlite {llvmlite.__version__}, LLVM {'.'.join(map(str, llvm.llvm_version_info))}"
+        self.lanes = 8 if features.get("avx512f") else 4 if features.get("avx2") else 2
+        on_linux = platform.system() == "Linux"
+        self.has_libmvec = on_linux and platform.machine() == "x86_64" and _load(llvm, "libmvec.so.1", "mvec")
+        _load(llvm, _MATHEMATICS.get(platform.system()), "m")
+        self._engines: dict[int, Any] = {}  # by optimization level
+        self._compiled: dict[str, int] = {}
+
+    def name_of(self, text: str, level: int = 2) -> str:
+        """The name under which `compile(text)` defines its function. It depends on the text, the level, the processor
+        and the version of LLVM."""
+        return "jaxkane_" + hashlib.sha256("\n".join((text, str(level), *self.key)).encode()).hexdigest()[:32]
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        return self.cpu, self.features, self.version
+
+    def compile(self, text: str, store: ObjectCache | None = None, level: int = 2) -> tuple[int, str]:
+        """Compile a text that defines the function @it.
+
+        **Arguments:**
+
+        - `text`: in LLVM's language.
+        - `store`: the folder of compiled code, or None.
+        - `level`: of optimization.
+
+        **Returns:** the address of the function, and a name by which other texts can call it.
+        """
+        name = self.name_of(text, level)
+        with self.lock:
+            if name not in self._compiled:
+                address = self._address(name, text.replace("@it(", f"@{name}("), store, level)
+                self.llvm.add_symbol(name, address)
+                self._compiled[name] = address
+            return self._compiled[name], name
+
+    def _address(self, name: str, text: str, store: ObjectCache | None, level: int) -> int:
+        module = self.llvm.parse_assembly(text)
+        module.name = name
+        engine = self._engine(level)
+        kept, made = store.read(name) if store else None, []
+        engine.set_object_cache(lambda _, code: made.append(code), lambda _: kept)
+        engine.add_module(module)
+        engine.finalize_object()
+        if store and made:
+            store.write(name, made[0])
+        return engine.get_function_address(name)
+
+    def _engine(self, level: int) -> Any:
+        """One engine for all functions; its code remains until the process ends. An engine with its target takes 0.8
+        MB, a function in it 0.01 MB."""
+        if level not in self._engines:
+            target = self.llvm.Target.from_default_triple().create_target_machine(
+                cpu=self.cpu, features=self.features, opt=level, codemodel="jitdefault", jit=True
+            )
+            engine = self._engines[level] = self.llvm.create_mcjit_compiler(self.llvm.parse_assembly(""), target)
+            # otherwise the object cache of the first function would apply to this empty module
+            engine.finalize_object()
+        return self._engines[level]
+
+    def has(self, function: str) -> bool:
+        """Whether a function of the mathematical library can be called. LLVM terminates the process at an unknown
+        function."""
+        return self.llvm.address_of_symbol(function) is not None
+
+    @functools.cache  # noqa: B019, there is one machine
+    def of_lanes(self, function: str, arity: int, lanes: int) -> str | None:
+        """The name in glibc's libmvec of a function for this number of float64 lanes, or None."""
+        kind = {8: "e", 4: "d", 2: "b"}.get(lanes)
+        name = f"_ZGV{kind}N{lanes}{'v' * arity}_{function}"
+        return name if self.has_libmvec and kind and self.has(name) else None
+
+
+@functools.cache
+def without_llvm() -> str | None:
+    """Why LLVM cannot be used in this process; None if it can."""
+    try:
+        import llvmlite.binding  # noqa: F401
+    except ImportError:
+        return "llvmlite is not installed: pip install llvmlite"
+    except OSError as error:  # its shared library cannot be loaded
+        return f"LLVM does not work here: {error}"
+    return None
+
+
+def _load(llvm: Any, file: str | None, name: str) -> bool:
+    """Make LLVM search a shared library for functions, found by its file or else by its name."""
+    for place in (lambda: file, lambda: ctypes.util.find_library(name)):
+        try:
+            if path := place():
+                llvm.load_library_permanently(path)
+                return True
+        except RuntimeError:  # llvmlite's exception for a missing file
+            continue
+    return False
+
 
 _ON, _OFF = ("", "1", "true", "yes", "on"), ("0", "false", "no", "off")
 
