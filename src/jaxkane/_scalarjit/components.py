@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PyTree
 
 from .compat import ClosedJaxpr, Equation, Tracer, Variable, evaluated, is_literal
@@ -203,12 +204,12 @@ def _written_out(
 
 
 @jax.jit
-def _solved_by_lapack(matrix, rights):
+def _solved_by_lapack(matrix: Float[Array, "n n"], rights: Float[Array, "n k"]):
     return jnp.linalg.solve(matrix, rights)
 
 
 @jax.jit
-def _det_by_lapack(matrix):
+def _det_by_lapack(matrix: Float[Array, "n n"]):
     return jnp.linalg.det(matrix)
 
 
@@ -300,7 +301,7 @@ def _eliminated(A: Rows, rights: Sequence[Sequence[Component]]) -> tuple[list[tu
     return solutions, det
 
 
-def _chosen(condition: Any, a: Component, b: Component) -> Component:
+def _chosen(condition: Bool, a: Component, b: Component) -> Component:
     """`a` if the condition is true, else `b`."""
     if isinstance(condition, (bool, np.bool_)):
         return a if condition else b
@@ -323,7 +324,7 @@ def is_written_out(n: int) -> bool:
     return n <= _UNROLL_UP_TO
 
 
-def solve_positive_array(M, b):
+def solve_positive_array(M: Float[Array, "n n"], b: Float[Array, " n"]):
     """The solution x (n,) of M x = b for a symmetric positive definite array M (n, n), by LAPACK. NaN if M is singular
     within rounding."""
     factor = jsl.cho_factor(M)
@@ -331,7 +332,7 @@ def solve_positive_array(M, b):
     return jnp.where(is_regular, jsl.cho_solve(factor, b), jnp.nan)
 
 
-def rounding_of_pivots(dtype: Any) -> float:
+def rounding_of_pivots(dtype: DTypeLike) -> float:
     """Pivots of L D L^T are regarded as zero if they are below this factor times the diagonal entry of M. The criterion
     does not depend on units or on the size of masses."""
     return 100 * float(jnp.finfo(dtype).eps)

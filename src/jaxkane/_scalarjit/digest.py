@@ -20,7 +20,7 @@ import re
 import sys
 import sysconfig
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from operator import attrgetter, is_
 from typing import Any
 
@@ -28,7 +28,7 @@ import jax
 import numpy as np
 
 from .cache import Cache, owners_of
-from .compat import Tracer
+from .compat import ClosedJaxpr, Tracer
 
 _LARGEST_ARRAY = 1 << 20  # [bytes] compared number by number
 _MOST_PLACES = 20_000  # beyond this number, objects are identified without their contents
@@ -87,6 +87,12 @@ def _numbers_of(array: np.ndarray) -> tuple[Any, ...]:
     return array.dtype.str, str(array.shape), np.ma.getdata(array).tobytes(), np.ma.getmask(array).tobytes()
 
 
+def _add_words(sha: Any, *words: object) -> None:
+    for word in words:
+        data = word if isinstance(word, bytes) else str(word).encode()
+        sha.update(b"%d:%b" % (len(data), data))  # with its length: ("ab", "c") differs from ("a", "bc")
+
+
 class CapturedValues:
     """All places that the code of `root` uses, with their values. The constructor visits every place, records it and
     adds its value to a digest.
@@ -98,9 +104,10 @@ class CapturedValues:
     tracers: traced values among these.
     """
 
-    def __init__(self, root: Any, lasting: bool = False):
+    def __init__(self, root: object, lasting: bool = False):
         self.root, self.lasting = root, lasting
         self.sha = hashlib.blake2b(digest_size=16)
+        self.add = functools.partial(_add_words, self.sha)
         self.seen: dict[Any, tuple[int, Any]] = {}
         self.named: list[tuple[dict[str, Any], str, Any]] = []
         self.places: list[tuple[Callable[[Any], tuple[Any, ...]], Any, tuple[Any, ...]]] = []
@@ -119,7 +126,7 @@ class CapturedValues:
         self.version = self.sha.digest()
         del self.root
 
-    def unchanged(self, root: Any) -> bool:
+    def unchanged(self, root: object) -> bool:
         """Whether every place still has its value."""
         try:
             for names, name, before in self.named:
@@ -133,20 +140,14 @@ class CapturedValues:
         except RuntimeError:  # a dict or a set that another thread is changing
             return False
 
-    def add(self, *words: Any) -> None:
-        for word in words:
-            data = word if isinstance(word, bytes) else str(word).encode()
-            self.sha.update(b"%d:" % len(data))
-            self.sha.update(data)
-
-    def is_new(self, key: Any, keep: Any) -> bool:
+    def is_new(self, key: object, keep: object) -> bool:
         if key in self.seen:
             self.add("again", self.seen[key][0])
             return False
         self.seen[key] = len(self.seen), None if keep is self.root else keep
         return True
 
-    def read(self, read: Callable[[Any], tuple[Any, ...]], thing: Any) -> tuple[Any, ...]:
+    def read(self, read: Callable[[Any], tuple[Any, ...]], thing: object) -> tuple[Any, ...]:
         """The values at a place, which is recorded."""
         values = read(thing)
         self.places.append((read, _ROOT if thing is self.root else thing, values))
@@ -169,7 +170,7 @@ class CapturedValues:
                 self.add(kind.__qualname__, len(parts))
                 waiting += reversed(parts)
 
-    def parts(self, value: Any) -> Sequence[Any]:
+    def parts(self, value: object) -> Sequence[Any]:
         """The values that an object contains or uses, and what identifies it."""
         if isinstance(value, types.FunctionType):
             return self.function(value)
@@ -193,7 +194,7 @@ class CapturedValues:
             return (wrapped,)
         return self.opaque(value)
 
-    def items(self, container: Any) -> Sequence[Any]:
+    def items(self, container: Collection[Any]) -> Sequence[Any]:
         if isinstance(container, (tuple, frozenset)):
             items = tuple(container)
         else:
@@ -201,7 +202,7 @@ class CapturedValues:
         # the order of a set differs between processes
         return sorted(items, key=repr) if isinstance(container, (set, frozenset)) else items
 
-    def attributes(self, thing: Any) -> Sequence[Any]:
+    def attributes(self, thing: object) -> Sequence[Any]:
         """The class of an object of the user, and its attributes."""
         kind = () if is_of_library(type(thing)) else (type(thing),)
         return *kind, *(self.items(vars(thing)) if _has_attributes(thing) else ())
@@ -251,7 +252,7 @@ class CapturedValues:
                     parts += name, value
         return parts
 
-    def opaque(self, thing: Any) -> Sequence[Any]:
+    def opaque(self, thing: object) -> Sequence[Any]:
         """What identifies an object whose contents are not compared."""
         if not self.lasting:
             return (_serial(thing),)
@@ -261,7 +262,7 @@ class CapturedValues:
             return ("not pickled",)
 
 
-def _has_attributes(thing: Any) -> bool:
+def _has_attributes(thing: object) -> bool:
     """Whether the values of an object are its `__dict__`: one of the user's classes without slots, or a record."""
     kind = type(thing)
     if not isinstance(getattr(thing, "__dict__", None), dict):
@@ -292,7 +293,7 @@ _serials = Cache(10_000)
 _count = itertools.count()
 
 
-def _serial(thing: Any) -> int:
+def _serial(thing: object) -> int:
     """A number that no other object has had or will have, unlike its `id`.
 
     An object without weak references (`np.random.Generator`) is kept, because its end cannot be detected. With a new
@@ -302,7 +303,7 @@ def _serial(thing: Any) -> int:
     return _serials.get(id(thing), lambda: (next(_count), None if owners else thing), owners)[0]
 
 
-def digest(value: Any, code: Callable[[Any], bytes] | None = None) -> str:
+def digest(value: object, code: Callable[[Any], bytes] | None = None) -> str:
     """Sixteen hexadecimal digits that identify data: numbers, arrays and containers of these.
 
     **Arguments:**
@@ -325,20 +326,16 @@ _ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+|0x[0-9a-fA-F]{8,}")
 class _Hash:
     def __init__(self, code: Callable[[Any], bytes] | None, programs: dict[int, tuple[Any, str]] | None = None) -> None:
         self.sha = hashlib.sha256()
+        self.words = functools.partial(_add_words, self.sha)
         self.code = code
         # programs that were already read: one is often called many times
         self.programs = {} if programs is None else programs
 
-    def of(self, value: Any) -> str:
+    def of(self, value: object) -> str:
         self.add(value)
         return self.sha.hexdigest()[:16]
 
-    def words(self, *words: Any) -> None:
-        for word in words:
-            data = word if isinstance(word, bytes) else str(word).encode()
-            self.sha.update(str(len(data)).encode() + b":" + data)
-
-    def add(self, value: Any) -> None:
+    def add(self, value: object) -> None:
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes)):
             self.words(type(value).__name__, value if isinstance(value, bytes) else repr(value))
         elif hasattr(value, "eqns") or (hasattr(value, "jaxpr") and hasattr(value, "consts")):
@@ -353,7 +350,7 @@ class _Hash:
             for part in parts:
                 self.add(part)
 
-    def parts(self, value: Any) -> tuple[str, Sequence[Any]]:
+    def parts(self, value: object) -> tuple[str, Sequence[Any]]:
         """What a value is, and its contents."""
         name = type(value).__qualname__
         inner, params = getattr(value, "program", None), getattr(value, "params", None)
@@ -386,7 +383,7 @@ class _Hash:
             return "named", (name, str(getattr(value, "__qualname__", "")))
         return name, (_ADDRESS.sub("", str(value)),)
 
-    def program(self, program: Any) -> None:
+    def program(self, program: ClosedJaxpr) -> None:
         """Operations in their order; variables are identified by the position at which they were computed."""
         constants = getattr(program, "consts", ())
         program = getattr(program, "jaxpr", program)

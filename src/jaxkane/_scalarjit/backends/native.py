@@ -14,6 +14,7 @@ import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -171,7 +172,7 @@ def without_llvm() -> str | None:
     return None
 
 
-def _load(llvm: Any, file: str | None, name: str) -> bool:
+def _load(llvm: ModuleType, file: str | None, name: str) -> bool:
     """Make LLVM search a shared library for functions, found by its file or else by its name."""
     for place in (lambda: file, lambda: ctypes.util.find_library(name)):
         try:
@@ -251,6 +252,7 @@ def warn_not_native(why: str) -> None:
 
 Groups = tuple[tuple[int, ...], ...]
 BatchMask = tuple[tuple[bool, ...], ...]
+Sizes = tuple[int, ...]
 FMOD = "fmod"  # the C function of JAX's `rem`
 
 
