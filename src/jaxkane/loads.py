@@ -276,7 +276,7 @@ def spring(P: Point | Body, Q: Point | Body, stiffness: Law, length: Component =
     """
     P, Q, length = point_of(P), point_of(Q), component(length)
     r = Q.position_from(P)
-    if is_zero(length) and not callable(stiffness):
+    if is_zero(length) and not callable(stiffness):  # |r| has no derivative where the points coincide
         return _pair("spring", stiffness * r, P, Q)
     return _pair("spring", _law(stiffness, r.norm() - length) * r.normalize(), P, Q)
 

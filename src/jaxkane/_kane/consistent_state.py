@@ -28,6 +28,7 @@ from .constraint_residuals import (
     configuration_residual,
     configuration_tolerance,
     implied_residual,
+    n_configuration_constraints,
     residual_sizes,
     scales_along,
     scales_by_unit,
@@ -420,7 +421,7 @@ def assemble(
 
 def _solve_configuration(system: System, q0: Coordinates, t: Component, problem: AssemblyProblem):
     t = jnp.asarray(t if isinstance(t, jax.Array) else np.asarray(t, q0.dtype), dtype=q0.dtype)
-    n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
+    n_h = n_configuration_constraints(system, t, q0)
     if n_h == 0:
         return q0
     if len(problem.moved) < n_h:  # e.g. a plane loop that is closed by a Vector, whose third component is always zero

@@ -85,7 +85,7 @@ class Learned(eqx.Module):
             return
         checked(function, Callable, "jk.learned() needs a function with parameters, such as an equinox module")
         arrays, rest = eqx.partition(function, eqx.is_array_like)
-        leaves, structure = jax.tree.flatten(rest)
+        leaves, structure = jax.tree.flatten(rest)  # static fields are compared and hashed, and a tree has no hash
         # It may have been created in float32, before `jk.configure()`.
         floats, others = eqx.partition(
             jax.tree.map(to_float, arrays), lambda x: jnp.isrealobj(x) and eqx.is_inexact_array(x)

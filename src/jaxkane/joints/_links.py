@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
-from jaxtyping import PyTree
 
 from .. import rotations
 from .._common.lookup import checked, refuse_any, refuse_if, refuse_unknown
 from .._kane.contact.laws import MOST_CONTACTS
 from .._scalarjit.compat import Tracer
-from .._scalarjit.components import ComponentsLike
+from .._scalarjit.components import Component, ComponentsLike
 from ..rotations import Matrix
 from ._joints import Hinge, Joint, JointType, Slide, components, exact, exact_numbers, is_structural_zero
 from ._loops import with_dependent
@@ -30,6 +29,9 @@ from ._mechanism import (
     Structure,
     class_of,
 )
+
+Orientation: TypeAlias = Any
+"""Euler parameters, a sequence with its angles, a rotation matrix, or None for no rotation; see `Link`."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -59,11 +61,11 @@ class Link:
     name: str
     parent: str | None = None
     joints: Joint | Sequence[Joint] = ()
-    position: Any = (0.0, 0.0, 0.0)
-    orientation: Any = None
-    mass: Any = None
-    center: Any = (0.0, 0.0, 0.0)
-    inertia: Any = (0.0, 0.0, 0.0)
+    position: ComponentsLike = (0.0, 0.0, 0.0)
+    orientation: Orientation = None
+    mass: Component | None = None
+    center: ComponentsLike = (0.0, 0.0, 0.0)
+    inertia: ComponentsLike | Sequence[ComponentsLike] = (0.0, 0.0, 0.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -76,8 +78,8 @@ class Site:
 
     name: str
     link: str | None
-    position: Any = (0.0, 0.0, 0.0)
-    orientation: Any = None
+    position: ComponentsLike = (0.0, 0.0, 0.0)
+    orientation: Orientation = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -98,11 +100,11 @@ class Actuator:
 
     name: str
     joint: str
-    gear: Any = 1.0
-    gain: Any = 1.0
-    offset: Any = 0.0
-    position_gain: Any = 0.0
-    velocity_gain: Any = 0.0
+    gear: Component | ComponentsLike = 1.0
+    gain: Component = 1.0
+    offset: Component = 0.0
+    position_gain: Component = 0.0
+    velocity_gain: Component = 0.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -410,7 +412,7 @@ def _field(name: str, joints: Mapping[str, JointType]) -> Field:
     return name, positive, (_OF_SLIDERS if isinstance(joint, Slide) else _OF_HINGES)[kind]
 
 
-def _matrix(orientation: PyTree, name: str) -> Matrix | None:
+def _matrix(orientation: Orientation, name: str) -> Matrix | None:
     """[R] (components in the parent -> components here) as exact floats; None for no rotation.
 
     **Raises:** `ValueError` if it is not a rotation.
