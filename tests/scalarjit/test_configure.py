@@ -14,10 +14,10 @@ import equinox._errors as checks
 import jax
 import pytest
 
-from jaxkane._scalarjit.backends import native
-from jaxkane._scalarjit.backends.native import switched_on
+from jaxkane._scalarjit import native
 from jaxkane._scalarjit.compat import storable_checks
 from jaxkane._scalarjit.configure import _made_folder, _split_cpu, configure
+from jaxkane._scalarjit.native import switched_on
 
 KERNELS = f"no native kernels ({native.why_not()})" if native.why_not() else "native kernels"
 CLEAN = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "EQX_", "XLA_"))}

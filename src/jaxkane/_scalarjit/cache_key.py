@@ -26,7 +26,6 @@ from typing import Any, NamedTuple, cast
 import equinox as eqx
 import jax
 import numpy as np
-from jax.tree_util import PyTreeDef
 from jaxtyping import PyTree
 
 from .cache import Cache, owners_of
@@ -185,7 +184,7 @@ class _Compiled:
     function refers to this object only by a weak reference, and has arrays as its only arguments.
     """
 
-    def __init__(self, f: Callable[..., Any], structure: PyTreeDef, fixed: list[Callable[[], Any] | None]) -> None:
+    def __init__(self, f: Callable[..., Any], structure: PyTree, fixed: list[Callable[[], Any] | None]) -> None:
         self.f, self.structure, self.fixed = f, structure, fixed
         itself = weakref.ref(self)
 

@@ -265,7 +265,7 @@ def concretely() -> contextlib.AbstractContextManager[Any]:
     return eval_context()
 
 
-def on_device(x: npt.ArrayLike, dtype: npt.DTypeLike = None) -> jax.Array:
+def on_device(x: npt.ArrayLike, dtype: npt.DTypeLike | None = None) -> jax.Array:
     """A NumPy array as an array of JAX. `jax.numpy.asarray` would compile a program for each shape (JAX 0.12)."""
     return jax.device_put(np.asarray(x, dtype))
 

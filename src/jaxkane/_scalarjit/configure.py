@@ -14,7 +14,7 @@ import numpy as np
 
 from .._common.files import remove_broken_programs
 from .._common.lookup import whole_number
-from .backends import native as kernels
+from . import native as kernels
 from .compat import backends_are_initialized, reset_cache
 
 

@@ -26,6 +26,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from .cache import Cache, owners_of
 from .compat import ClosedJaxpr, Tracer
@@ -303,7 +304,7 @@ def _serial(thing: object) -> int:
     return _serials.get(id(thing), lambda: (next(_count), None if owners else thing), owners)[0]
 
 
-def digest(value: object, code: Callable[[Any], bytes] | None = None) -> str:
+def digest(value: PyTree, code: Callable[[Any], bytes] | None = None) -> str:
     """Sixteen hexadecimal digits that identify data: numbers, arrays and containers of these.
 
     **Arguments:**
@@ -331,11 +332,11 @@ class _Hash:
         # programs that were already read: one is often called many times
         self.programs = {} if programs is None else programs
 
-    def of(self, value: object) -> str:
+    def of(self, value: PyTree) -> str:
         self.add(value)
         return self.sha.hexdigest()[:16]
 
-    def add(self, value: object) -> None:
+    def add(self, value: PyTree) -> None:
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes)):
             self.words(type(value).__name__, value if isinstance(value, bytes) else repr(value))
         elif hasattr(value, "eqns") or (hasattr(value, "jaxpr") and hasattr(value, "consts")):
@@ -350,7 +351,7 @@ class _Hash:
             for part in parts:
                 self.add(part)
 
-    def parts(self, value: object) -> tuple[str, Sequence[Any]]:
+    def parts(self, value: PyTree) -> tuple[str, Sequence[Any]]:
         """What a value is, and its contents."""
         name = type(value).__qualname__
         inner, params = getattr(value, "program", None), getattr(value, "params", None)

@@ -3,7 +3,7 @@
 A right-hand side written in scalars is thousands of tiny operations. XLA splits them into many kernels and repeats
 operations in each kernel: a few times for the value, hundreds of times for derivatives. Here the function is one
 primitive of JAX (`program_p`), whose derivatives, transposes and batches are also programs of this kind. Each is traced
-once and compiled as one function, by LLVM (`backends.native`) or by XLA (`backends.xla`). Measured with XLA on the
+once and compiled as one function, by LLVM (`native`) or by XLA (`xla`). Measured with XLA on the
 nonlinear bicycle (float64, one thread, jax 0.10.2): 8.6 -> 0.9 us for an evaluation inside a loop, 3000 -> 4.5 us for
 its directional derivative, 2450 -> 17 us for its reverse derivative.
 """
@@ -19,13 +19,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.tree_util import PyTreeDef
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
-from .backends import native
-from .backends.native import BatchMask, Scalars, Sizes
-from .backends.source import NumPyProgram
-from .backends.xla import Windows, as_one_function, chunks_of, one_chunk_at_a_time, pays_as_windows
+from . import native
 from .compat import (
     ClosedJaxpr,
     as_lowering,
@@ -36,6 +32,7 @@ from .compat import (
     jaxpr_as_fun,
     new_primitive,
     no_tangent,
+    types_of,
 )
 from .graph import NotScalarError
 from .jaxpr import (
@@ -51,6 +48,9 @@ from .jaxpr import (
     tangent_program,
     transposed_program,
 )
+from .native import BatchMask, Scalars, Sizes
+from .source import NumPyProgram
+from .xla import Windows, as_one_function, chunks_of, one_chunk_at_a_time, pays_as_windows
 
 _FEW = 8  # numbers: for XLA, this many separate arguments cost as much as making an array of them
 
@@ -111,7 +111,7 @@ class Program:
         roles: ArgumentRoles = ArgumentRoles(),
         *,
         label: str = "A function",
-        structure: PyTreeDef | None = None,
+        structure: PyTree = None,
         compile_cheaply: bool = False,
         is_reduced: bool = False,
         derived: Derived = Derived(),
@@ -126,7 +126,7 @@ class Program:
         if any(map(is_solution, self.source.jaxpr.eqns)):
             self.program = cse(self.source)
         self.evaluate = jaxpr_as_fun(self.program)
-        self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
+        self.in_avals, self.out_avals = types_of(self.program)
         self._solved = solved
         self.dependencies = dependencies(self.program)
         self.is_fusable = is_fusable(self.program.jaxpr)
@@ -354,7 +354,7 @@ def _transpose(cotangents: Sequence[Array], *args, program: Program, sizes: Size
         axes = tuple(d for d, is_there in enumerate(mask) if not is_there)
         return ct.sum(axes) if axes else ct
 
-    cts = [next(results) if is_linear else None for is_linear in linear]
+    cts: list[Any] = [next(results) if is_linear else None for is_linear in linear]
     each = zip(cts, batch_mask, asked, strict=True)
     return [over_missing(ct, mask) if is_asked else None for ct, mask, is_asked in each]
 
@@ -402,7 +402,7 @@ def _by_xla(*args, program: Program, sizes: Sizes, batch_mask: BatchMask):
 
 
 def _lower_on_cpu(context: object, *args, program: Program, sizes: Sizes, batch_mask: BatchMask):
-    target = program.target(sizes, batch_mask)
+    target: Any = program.target(sizes, batch_mask)
 
     def by_kernel(*args, **_):
         # The kernel reads its arguments in this order: `Program.target` passes the same groups.

@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
-from .backends import native
+from . import native
 from .cache import Cache
 from .cache_key import CacheKey, explain_leaked_tracer, key_of, trace_with_snapshot
 from .compat import ClosedJaxpr, Tracer

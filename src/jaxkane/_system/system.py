@@ -152,12 +152,10 @@ class SystemMeta(type(eqx.Module)):
     the class body.
     """
 
-    def __new__(
-        mcs: type[SystemMeta], name: str, bases: tuple[type, ...], namespace: dict[str, Any], **kwargs: Any
-    ) -> Any:
+    def __new__(cls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **kwargs: Any) -> Any:
         # For a class created by `type(name, bases, members)`, Python would report equinox as its module.
         module = sys._getframe(1).f_globals.get("__name__", "__main__")
-        return super().__new__(mcs, name, bases, {"__module__": module, **namespace}, **kwargs)
+        return super().__new__(cls, name, bases, {"__module__": module, **namespace}, **kwargs)
 
     def __setattr__(cls, name: str, value: object) -> None:
         super().__setattr__(name, _prepared(cls.__name__, name, value))

@@ -19,7 +19,7 @@ from jaxtyping import PyTree
 from .._integrate.integrate import solve
 from .._integrate.settings import Settings
 from .._integrate.trajectory import Trajectory
-from .._scalarjit.backends import native as kernels
+from .._scalarjit import native as kernels
 from .._scalarjit.cache import Cache
 from .._scalarjit.cache_key import jit, version_of
 from .._scalarjit.components import Numbers

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..compat import ClosedJaxpr, types_of
-from ..graph import LIBRARY, OPERATORS, Graph, Node, NotScalarError, graph_of, needed, reads
+from .compat import ClosedJaxpr, types_of
+from .graph import LIBRARY, OPERATORS, Graph, Node, NotScalarError, graph_of, needed, reads
 
 Table = Mapping[str, Callable[..., Any]]
 Constant = Callable[[Any, str], Any]

@@ -20,9 +20,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ..._common.files import atomic_write
-from ..compat import ClosedJaxpr, types_of
-from ..graph import LIBRARY, Graph, NotScalarError, graph_of, symbol
+from .._common.files import atomic_write
+from .compat import ClosedJaxpr, types_of
+from .graph import LIBRARY, Graph, NotScalarError, graph_of, symbol
 from .llvm import Writer, mismatch, wrapper_text
 
 _MARK = b"jaxkane compiled code 1\n"

@@ -28,9 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..compat import ClosedJaxpr, jaxpr_as_fun, one_function
-from ..graph import ARITHMETIC, COMPARISONS, DTYPES, LIBRARY, LOGIC, SIMPLE, NotScalarError, graph_of, needed
-from ..jaxpr import replaced
+from .compat import ClosedJaxpr, jaxpr_as_fun, one_function
+from .graph import ARITHMETIC, COMPARISONS, DTYPES, LIBRARY, LOGIC, SIMPLE, NotScalarError, graph_of, needed
+from .jaxpr import replaced
 
 _FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(jax.lax, name) for name in ARITHMETIC | COMPARISONS | LIBRARY | SIMPLE | {"neg", "select"}},
