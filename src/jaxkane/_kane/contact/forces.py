@@ -48,7 +48,7 @@ from ..._scalarjit.scalar_function import ScalarFunction
 from ..._system.kinematics import Frame, Vector
 from ..._system.motion import Motion
 from ..._system.system import System
-from ..arguments import Row, has_multipliers
+from ..arguments import InputValues, Row, has_multipliers
 from ..constraint_residuals import configuration_tolerance
 from ..description import dtype_of, jvp
 from ..kanes_method import KaneEquations
@@ -302,10 +302,10 @@ class ContactRows:
                 rows.append([v.dot(motion.N.vector(*e)) for e in self.axes(contact, i, motion.N)])
         return rows
 
-    def axes(self, contact: Any, i: int, N: Frame) -> list[Row]:
+    def axes(self, contact: Contact | DryFriction, i: int, N: Frame) -> list[Row]:
         """The normal and the tangents of contact i, with components in N; zero if they do not exist."""
         d = self.layout.d
-        if not self.layout.has_point[i]:
+        if isinstance(contact, DryFriction) or not self.layout.has_point[i]:
             return [ZERO3] * (1 + d)
         normal = _unit_normal(contact, N)
         has_tangents = self.layout.has_friction[i]
@@ -359,7 +359,7 @@ def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True)
     return ContactTerms(gaps, v.reshape(c, r), size.reshape(c, r), C, b, X, w, laws, T, Q, a0, shift)
 
 
-def _laws(contact: Any) -> tuple[Component, Component, Component]:
+def _laws(contact: Contact | DryFriction) -> tuple[Component, Component, Component]:
     if isinstance(contact, DryFriction):
         return 0.0, component(contact.kinetic), component(contact.static)
     return component(contact.restitution), component(contact.friction), component(contact.static)
@@ -546,7 +546,7 @@ def without_gaps(terms: ContactTerms, closed: Array, q: Array) -> Array:
 
 
 def forces_in_contact(
-    system: System, layout: ContactLayout, t: Component, q: Array, u: Array, memory: Array | None, values: Any
+    system: System, layout: ContactLayout, t: Component, q: Array, u: Array, memory: Array | None, values: InputValues
 ) -> tuple[KaneEquations, Array, ContactForces, ContactTerms]:
     """Kane's equations at the projected speeds, these speeds, the contact forces and accelerations, and the terms."""
     states = ContactMemory.unpacked(layout, jnp.zeros(layout.memory_size, q.dtype) if memory is None else memory)
@@ -558,7 +558,7 @@ def forces_in_contact(
 
 
 @ScalarFunction
-def terms_at(system: System, t: Component, q: Array, u: Array, values: Any) -> ContactTerms:
+def terms_at(system: System, t: Component, q: Array, u: Array, values: InputValues) -> ContactTerms:
     """The terms of all contacts at speeds that are not projected."""
     return _terms(KaneEquations(system, t, q, u, values), layout_of(system))
 

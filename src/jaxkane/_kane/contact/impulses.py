@@ -37,6 +37,7 @@ from ..._common.lookup import checked, not_there, refuse_if
 from ..._scalarjit.cache_key import jit
 from ..._scalarjit.components import (
     Component,
+    Numbers,
     Rows,
     add,
     as_vector,
@@ -56,10 +57,10 @@ from ..._scalarjit.nan import nan_where
 from ..._scalarjit.scalar_function import ScalarFunction
 from ..._system.kinematics import Frame, Point
 from ..._system.motion import flatten_residuals
-from ..._system.prints import module_text
+from ..._system.parameters import module_text
 from ..._system.system import NamedVector, System
 from ..api import checked_arrays, finite_or_explained
-from ..arguments import Row, as_row, check_number, is_concrete
+from ..arguments import Coordinates, InputArrays, Row, Speeds, Time, as_row, check_number, is_concrete
 from ..kanes_method import KaneEquations, mass_matrix_columns
 from ..multipliers import AuxiliarySpeeds
 
@@ -96,7 +97,7 @@ class Impact(eqx.Module):
     restitution: tuple[Component, ...]
     release: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(self, *velocity_residuals: Any, restitution: Any = 0.0, release: Any = ()):
+    def __init__(self, *velocity_residuals: Any, restitution: Coefficients = 0.0, release: str | Sequence[str] = ()):
         label = "Impact(*velocity_residuals): the velocity residuals"
         counts = [len(flatten_residuals(each, label)) for each in velocity_residuals]
         self.residuals = flatten_residuals(velocity_residuals, label)
@@ -105,7 +106,7 @@ class Impact(eqx.Module):
         self.release = checked_release(release)
 
 
-def checked_restitution(value: Any, label: str = "Impact") -> Any:
+def checked_restitution(value: Coefficients, label: str = "Impact") -> Any:
     is_one = not isinstance(value, (tuple, list)) and getattr(value, "ndim", 0) != 1
     values: Any = (value,) if is_one else value
     for e in values:
@@ -115,7 +116,7 @@ def checked_restitution(value: Any, label: str = "Impact") -> Any:
     return value if is_one else tuple(value)
 
 
-def _for_each(restitution: Any, counts: Sequence[int]) -> tuple[Component, ...]:
+def _for_each(restitution: Coefficients, counts: Sequence[int]) -> tuple[Component, ...]:
     """One coefficient for each residual. `counts`: the number of residuals in each argument."""
     values = restitution if isinstance(restitution, tuple) else (restitution,) * sum(counts)
     if len(values) == len(counts) != sum(counts):  # one for each Vector
@@ -128,7 +129,7 @@ def _for_each(restitution: Any, counts: Sequence[int]) -> tuple[Component, ...]:
     return tuple(component(e) for e in values)
 
 
-def checked_release(release: Any) -> tuple[str, ...]:
+def checked_release(release: str | Sequence[str]) -> tuple[str, ...]:
     """Names of released parts, each once."""
     names = (release,) if isinstance(release, str) else release
     if not isinstance(names, (tuple, list)) or not all(isinstance(name, str) for name in names):
@@ -137,6 +138,9 @@ def checked_release(release: Any) -> tuple[str, ...]:
         )
     return tuple(dict.fromkeys(names))
 
+
+Coefficients: TypeAlias = Component | Sequence[Component]
+"""One coefficient of restitution for all residuals, or one for each."""
 
 ReadImpact: TypeAlias = Callable[[Component, Row, Row], Impact]
 """(t, q, u_all) -> the impact, with its residuals at the speeds u_all (n + k,)."""
@@ -200,7 +204,7 @@ def after_impact(kane: KaneEquations, read: ReadImpact) -> ImpactSolution:
 
 
 def impact_at(
-    system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array], read: ReadImpactOf
+    system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, read: ReadImpactOf
 ) -> ImpactSolution:
     """`after_impact` from checked arrays, for any number of speeds.
 
@@ -215,19 +219,21 @@ def impact_at(
 
 
 @ScalarFunction
-def _impact_written_out(system, t, q, u, inputs, read):
+def _impact_written_out(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, read: ReadImpactOf):
     return after_impact(KaneEquations(system, t, q, u, inputs), functools.partial(read, system))
 
 
 @ScalarFunction
-def _residuals_along(system, t, q, u, inputs, read, direction):
+def _residuals_along(
+    system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, read: ReadImpactOf, direction: Speeds
+):
     kane = KaneEquations(system, t, q, u, inputs)
-    direction = kane.with_dependent(as_row(direction, system.speeds, "direction"))
-    return as_vector(BeforeImpact(kane, functools.partial(read, system)).along(direction), q)
+    along = kane.with_dependent(as_row(direction, system.speeds, "direction"))
+    return as_vector(BeforeImpact(kane, functools.partial(read, system)).along(along), q)
 
 
 @ScalarFunction
-def _quantities(system, t, q, u, inputs, read):
+def _quantities(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, read: ReadImpactOf):
     return BeforeImpact(KaneEquations(system, t, q, u, inputs), functools.partial(read, system)).quantities()
 
 
@@ -543,11 +549,11 @@ _compiled = jit(impact_at)
 def impact(
     system: System,
     t: Component,
-    q: Any,
-    u: Any,
+    q: Numbers,
+    u: Numbers,
     residuals: Callable[..., Any],
-    restitution: Any = 0.0,
-    release: Any = (),
+    restitution: Coefficients = 0.0,
+    release: str | Sequence[str] = (),
 ) -> ImpactResult:
     """The speeds after an impact, by Kane's impulse equations. See `Impact` for the equations.
 
@@ -591,7 +597,7 @@ def impact(
     return result
 
 
-def _explain(solution: ImpactSolution, arrays: Any) -> None:
+def _explain(solution: ImpactSolution, arrays: tuple[System, Array, Array, Array, InputArrays]) -> None:
     if np.isfinite(solution.result.energy_lost):
         return
     name, C, is_affine = type(arrays[0]).__name__, np.asarray(solution.C), np.asarray(solution.is_affine)
