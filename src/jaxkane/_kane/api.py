@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._common.lookup import refuse_if
 from .._scalarjit.components import Component, Numbers, as_vector, matvec, rounding_of_pivots, stack, sub
+from .._scalarjit.nan import constant
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.motion import Force, kinetic_energy_of
 from .._system.system import System
@@ -32,7 +33,6 @@ from .arguments import (
     is_concrete,
     refuse_incomplete,
     refuse_multipliers,
-    without_derivatives,
 )
 from .checks import check_system
 from .constraint_residuals import SINGULAR_ROUNDING, check_left_out, dependent_speeds_at
@@ -271,7 +271,7 @@ def diagnosis(system: System, t: Component, q: Numbers, u: Numbers, inputs: Inpu
     The order of the checks is: the given numbers, the dependent speeds, the mass matrix, the rates of the coordinates,
     the loads.
     """
-    system, t, q, u, inputs = without_derivatives((system, t, q, u, inputs))
+    system, t, q, u, inputs = constant((system, t, q, u, inputs))
     if not is_concrete(system, t, q, u, inputs):
         return ""
     name = type(system).__name__

@@ -68,11 +68,6 @@ def is_concrete(*trees: Any) -> bool:
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
 
 
-def without_derivatives(tree: PyTree) -> PyTree:
-    """Replace arrays that are differentiated without `jit`, e.g. by `jax.grad`, by their values. Others stay traced."""
-    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x, tree)
-
-
 def is_one_number(value: object) -> bool:
     """Whether the value is one real number, concrete or traced."""
     return is_numeric(value) and not isinstance(value, (list, tuple)) and np.shape(value) == ()

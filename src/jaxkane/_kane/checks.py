@@ -28,12 +28,13 @@ from .._scalarjit.components import (
     is_zero,
     stack,
 )
+from .._scalarjit.nan import constant
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point
 from .._system.motion import Force, Load, Motion
 from .._system.parameters import in_batches
 from .._system.system import System
-from .arguments import InputArrays, is_concrete, without_derivatives
+from .arguments import InputArrays, is_concrete
 from .constraint_residuals import configuration_residual, residual_sizes, scales_by_unit, violations
 from .description import DescriptionEvaluator, at_random_point, frames_of, structure_of, turning_bodies
 from .scaling import least_norm, nearest_root
@@ -59,7 +60,7 @@ def check_system(system: System, t: Component, q: Numbers, *, bodies: bool = Tru
     """
     if in_batches(system):
         return
-    system, t, q = without_derivatives((system, t, q))
+    system, t, q = constant((system, t, q))
     # Use one type for t: a Python number and an array would be compiled as two programs.
     t = t if isinstance(t, Tracer) else np.asarray(t, jnp.result_type(float) if q is None else q.dtype)
     with concretely(), np.errstate(invalid="ignore", over="ignore"):
@@ -155,7 +156,7 @@ def _is_semidefinite(xx: Numbers, yy: Numbers, zz: Numbers, xy: Numbers, xz: Num
 
 def bodies_are_possible(system: System, t: Component, q: Numbers) -> Bool:
     """Whether `check_bodies` accepts all bodies of the system. Use this function for members of a batch."""
-    return _bodies_are_possible(*without_derivatives((system, t, q)))
+    return _bodies_are_possible(*constant((system, t, q)))
 
 
 @ScalarFunction.compile_cheaply

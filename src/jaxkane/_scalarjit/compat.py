@@ -152,16 +152,9 @@ def programs_in(equation: Equation) -> list[Any]:
 
 def dependencies(program: ClosedJaxpr) -> list[frozenset[int]]:
     """For each output of a program, the indices of the inputs on which it depends."""
-    jaxpr = program.jaxpr
-    places = {v: frozenset([i]) for i, v in enumerate(jaxpr.invars)}
     none = frozenset[int]()
-
-    def read(v: Variable) -> frozenset[int]:
-        return none if is_literal(v) else places.get(v, none)
-
-    for equation in jaxpr.eqns:
-        places.update(dict.fromkeys(equation.outvars, none.union(*map(read, equation.invars))))
-    return [*map(read, jaxpr.outvars)]
+    inputs = [frozenset([i]) for i in range(len(program.in_avals))]
+    return interpret(program, inputs, lambda e, places: [none.union(*places)] * len(e.outvars), lambda v, x: none)
 
 
 def depends_on(program: ClosedJaxpr, inputs: Iterable[int]) -> list[bool]:

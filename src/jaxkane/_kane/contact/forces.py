@@ -52,9 +52,9 @@ from ..arguments import InputValues, Row, has_multipliers
 from ..constraint_residuals import configuration_tolerance
 from ..description import dtype_of, jvp
 from ..kanes_method import KaneEquations
-from ..scaling import term_sizes
+from ..scaling import RowBasis, term_sizes
 from .declarations import Contact, DryFriction
-from .impulses import Permanent, RowBasis, inverse_root
+from .impulses import Permanent, inverse_root
 from .laws import MOST_CONTACTS, SLIDES, STICKS, force_scales, with_friction
 
 

@@ -63,6 +63,7 @@ from ..api import checked_arrays, finite_or_explained
 from ..arguments import Coordinates, InputArrays, Row, Speeds, Time, as_row, check_number, is_concrete
 from ..kanes_method import KaneEquations, mass_matrix_columns
 from ..multipliers import AuxiliarySpeeds
+from ..scaling import RowBasis
 
 
 class Impact(eqx.Module):
@@ -484,49 +485,6 @@ def _inverse_root(M: Rows, sizes: Sequence[Component] | None) -> tuple[Rows, Row
         return X, []
     Z = [[jnp.where(regular[i], 0.0, x) for i, x in enumerate(row)] for row in X]
     return [[jnp.where(regular[i], x, 0.0) for i, x in enumerate(row)] for row in X], Z
-
-
-class RowBasis(NamedTuple):
-    """A = T Q with orthonormal rows of Q, for A (m, n).
-
-    As `constraints.least_change`, but with products of scalars only. A row that is zero or depends linearly on the
-    previous ones is omitted: its row of Q (m, n) and its column of T
-    (m, m) are zero. `is_new` (m,): whether each row is used.
-    """
-
-    Q: Array
-    T: Array
-    is_new: Array
-
-    @classmethod
-    def of(cls, A: Array, redundant: float = 0.0) -> RowBasis:
-        """`redundant`: the largest part of a row, relative to the row, that is regarded as dependent."""
-        m, threshold = len(A), max(redundant, float(jnp.finfo(A.dtype).eps) ** 0.75)
-        Q, T, is_new = jnp.zeros((0, A.shape[1]), A.dtype), [], []
-        for i in range(m):
-            rest, row = A[i], jnp.zeros(i, A.dtype)
-            for _ in range(2 if i else 0):  # Gram-Schmidt twice: after one pass, it is not orthogonal within rounding
-                along = Q @ rest
-                rest, row = rest - along @ Q, row + along
-            is_used = jax.lax.stop_gradient(jnp.max(jnp.abs(rest)) > threshold * jnp.max(jnp.abs(A[i])))
-            norm = jnp.sqrt(jnp.sum(jnp.where(is_used, rest, 1.0) ** 2))  # the derivative of a norm of zero is NaN
-            Q = jnp.concatenate([Q, jnp.where(is_used, rest / norm, 0.0)[None]])
-            T.append(jnp.concatenate([row, jnp.where(is_used, norm, 0.0)[None], jnp.zeros(m - i - 1, A.dtype)]))
-            is_new.append(is_used)
-        return cls(Q, jnp.stack(T), jnp.stack(is_new))
-
-    def solve(self, b: Array) -> tuple[Array, Array]:
-        """y (m,) of T y = b, and the part of b (m,) that the omitted rows do not satisfy. Then w = Q^T y."""
-        y, missing = jnp.zeros(0, b.dtype), []
-        for i in range(len(b)):
-            remainder, is_used = b[i] - self.T[i, :i] @ y if i else b[i], self.is_new[i]
-            y = jnp.concatenate([y, jnp.where(is_used, remainder / jnp.where(is_used, self.T[i, i], 1.0), 0.0)[None]])
-            missing.append(jnp.where(is_used, 0.0, remainder))
-        return y, jnp.stack(missing)
-
-    def least_norm(self, b: Array) -> Array:
-        """The smallest solution w (n,) of A w = b, without the omitted rows."""
-        return self.solve(b)[0] @ self.Q
 
 
 class _OfFunction(eqx.Module):
