@@ -34,7 +34,7 @@ from .._system.kinematics import Frame, Point
 from .._system.motion import Force, Load, Motion
 from .._system.parameters import in_batches
 from .._system.system import System
-from .arguments import InputArrays, is_concrete
+from .arguments import InputArrays, has_multipliers, is_concrete
 from .constraint_residuals import configuration_residual, residual_sizes, scales_by_unit, violations
 from .description import DescriptionEvaluator, at_random_point, frames_of, structure_of, turning_bodies
 from .scaling import least_norm, nearest_root
@@ -477,7 +477,7 @@ class _Consistency:
         for key, x in quantities.items():
             self._check_quantity(key, x, rates[key])
         constraints = _of_kind(rates, "constraint")
-        if constraints and not hasattr(self.system, "multiplier_residuals"):
+        if constraints and not has_multipliers(self.system):
             # The sizes of the rates, from speeds that violate the velocity residuals.
             sizes = self._rates(q, start, self._read(q, start))
             # Nearly dependent residuals are satisfied to 3e-8 only, and so are the rates of the constraints.

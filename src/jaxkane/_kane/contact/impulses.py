@@ -60,7 +60,7 @@ from ..._system.motion import flatten_residuals
 from ..._system.parameters import module_text
 from ..._system.system import NamedVector, System
 from ..api import checked_arrays, finite_or_explained
-from ..arguments import Coordinates, InputArrays, Row, Speeds, Time, as_row, check_number, is_concrete
+from ..arguments import Coordinates, InputArrays, Row, Speeds, Time, as_row, check_number, has_multipliers, is_concrete
 from ..kanes_method import KaneEquations, mass_matrix_columns
 from ..multipliers import AuxiliarySpeeds
 from ..scaling import RowBasis
@@ -288,7 +288,7 @@ class Permanent(NamedTuple):
     @classmethod
     def of(cls, kane: KaneEquations) -> Permanent | None:
         system: Any = kane.system
-        if not hasattr(system, "multiplier_residuals"):
+        if not has_multipliers(system):
             return None
         residuals = functools.partial(system.multiplier_residuals, kane.t, kane.q)
         return cls(kane.jacobian(residuals), stack([residuals(kane.u_all)])[0].astype(kane.dtype))
@@ -327,7 +327,7 @@ class BeforeImpact:
         deviation = [sub(sub(x, y), z) for x, y, z in zip(r, r0, slope, strict=True)]
         size = [total(map(abs, terms)) for terms in zip(r, r0, slope, strict=True)]
         refuse_if(
-            impact.release and hasattr(kane.system, "multiplier_residuals"),
+            impact.release and has_multipliers(kane.system),
             f"{kane.name}: an impact with `release` is not supported for a system with multipliers. Use the system "
             "with dependent speeds (its attribute `inner`).",
         )
