@@ -20,7 +20,7 @@ from .._scalarjit.components import Component, Numbers, add3, as_vector, compone
 from .._scalarjit.scalar_function import ScalarFunction, tree_of
 from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
-from .._system.system import NamedVector, State, System, has_outputs, packed, unpacked
+from .._system.system import Measurements, NamedVector, State, System, has_outputs, packed, unpacked
 from .arguments import (
     Coordinates,
     InputArrays,
@@ -40,7 +40,7 @@ from .kanes_method import KaneEquations, motion_rates
 from .multipliers import Reactions
 
 
-class MeasurementContext(Inputs):
+class MeasurementContext(Inputs, Measurements):
     """The argument `now` of `state_rates` and `outputs`.
 
     `now["command"]` is the value of an input or a first-order state.

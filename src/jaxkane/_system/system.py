@@ -8,7 +8,7 @@ import functools
 import inspect
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -270,12 +270,12 @@ def unpacked(system: System, y: Float[Array, "*batch n"]) -> State:
     return State(q, u, x if system.states else None, contacts)
 
 
-class Measurements(Protocol):
-    """The argument `now` of `state_rates` and `outputs`, see `MeasurementContext`."""
+class Measurements(Mapping[str, Component]):
+    """The type of the argument `now` of `state_rates` and `outputs`, see `MeasurementContext`."""
 
     u_dot: NamedVector
 
-    def __getitem__(self, name: str, /) -> Component: ...
+    def with_values(self, values: Mapping[str, Component]) -> Self: ...
     def acceleration(self, point: Point) -> Vector: ...
     def angular_acceleration(self, frame: Frame) -> Vector: ...
     def force(self, name: str) -> Any: ...

@@ -35,6 +35,7 @@ from ..._scalarjit.compat import depends_on
 from ..._scalarjit.components import (
     ZERO3,
     Component,
+    Numbers,
     add,
     as_vector,
     component,
@@ -575,7 +576,7 @@ def gap_sizes(system: System, t: Component, q: Array, u: Array) -> tuple[Array, 
     return gaps(system, t, q, u), term_sizes(gaps, system, t, q, u)
 
 
-def closed_contacts(system: System, t: Component, q: Array) -> Array:
+def closed_contacts(system: System, t: Component, q: Numbers) -> Array:
     """Whether each contact (c,) touches or penetrates. True for each `DryFriction`, which always acts."""
     if not has_contacts(system):
         return jnp.zeros(0, bool)
