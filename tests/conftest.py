@@ -30,7 +30,7 @@ import pytest
 import touched
 
 import jaxkane as jk
-from jaxkane._scalarjit.backends import native as native_kernels
+from jaxkane._scalarjit import native as native_kernels
 
 CACHE, MOST_PROGRAMS = "JAXKANE_TEST_CACHE", 500_000_000  # bytes
 

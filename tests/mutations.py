@@ -78,7 +78,7 @@ MUTATIONS = (
              "jnp.where(t1 >= stop, stop, jnp.minimum(t1, halfway))", "jnp.where(t1 >= stop, stop, t1)",
              "integrate/test_steps.py integrate/test_dense_samples.py integrate/test_zero_order_hold.py"),
     # -- Loads, sensors
-    Mutation("Bouc-Wen: the sign of the rate instead of that of rate times extension", "loads/_laws.py",
+    Mutation("Bouc-Wen: the sign of the rate instead of that of rate times extension", "loads.py",
              "along = share * jnp.sign(v * z)", "along = share * jnp.sign(v)",
              "loads/test_elements.py"),
     Mutation("sensors: the rounding of an encoder has a derivative", "sensors.py",
@@ -136,7 +136,7 @@ MUTATIONS = (
     Mutation("riders: the product of inertia is moved with the other sign", "bicycles/_rider.py",
              "Ixz - m * x * z", "Ixz + m * x * z",
              "bicycles/test_bicycle_riders.py"),
-    Mutation("URDF: an inertia is turned backwards", "convert/_urdf_file.py",
+    Mutation("URDF: an inertia is turned backwards", "convert/_urdf.py",
              "else R @ I @ R.T", "else R.T @ I @ R",
              "convert/test_urdf.py"),
     Mutation("C: the larger of NaN and a number is the number", "export/_source.py",

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from jaxkane._integrate.audit import _quantities
 from jaxkane._kane.kanes_method import _mass_times, _motion_rates
-from jaxkane._scalarjit.backends.native import Scalars
+from jaxkane._scalarjit.native import Scalars
 from jaxkane._scalarjit.program import Program
 
 FUNCTIONS = {"rates": _motion_rates, "audit": _quantities, "column of M": _mass_times}

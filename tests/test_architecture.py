@@ -83,7 +83,7 @@ def test_no_circular_imports_including_imports_for_type_checking():
 
 def test_top_level_modules_and_package_docstrings():
     """The public names, the public modules that are one file, and rooms that say what they are."""
-    one_file = {"__init__.py", "__main__.py", "_version.py", "rotations.py", "sensors.py"}
+    one_file = {"__init__.py", "__main__.py", "_version.py", "loads.py", "rotations.py", "sensors.py"}
     assert {path.name for path in SOURCE.glob("*.py")} == one_file
     rooms = [path for path in SOURCE.rglob("*") if path.is_dir() and any(path.glob("*.py"))]
     for path in rooms:
@@ -155,7 +155,7 @@ def test_the_names_for_type_checkers_are_those_of_the_module():
 def test_every_public_name_has_a_docstring():
     rooms = (jk.loads, jk.sensors, jk.fit, jk.sweep, jk.stability, jk.catalog, jk.bicycles, jk.rotations)
     for module in (jk, *rooms, jk.symbolic, jk.export):
-        for name in dir(module):
+        for name in getattr(module, "__all__", dir(module)):
             thing = getattr(module, name)
             ours = str(getattr(thing, "__module__", "")).startswith("jaxkane")
             if ours and not name.startswith("_") and thing.__module__ != "jaxkane._scalarjit.components":

@@ -14,7 +14,7 @@ import numpy as np
 
 import jaxkane as jk
 
-from ._scalarjit.backends import native
+from ._scalarjit import native
 
 PACKAGES = ("jaxkane", "jax", "jaxlib", "llvmlite", "diffrax", "equinox", "optimistix", "optax", "numpy", "scipy")
 SETTINGS = ("JAX_", "JAXKANE_", "XLA_", "EQX_")

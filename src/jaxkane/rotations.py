@@ -8,7 +8,7 @@ Source: Kamman, Volume II, Unit 5, Examples 2, 6, 7 and Exercises 5.6, 5.8.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -49,7 +49,7 @@ def cosine_and_sine(angle: Component) -> tuple[Component, Component]:
     return jnp.cos(angle), jnp.sin(angle)
 
 
-def _frozen(rows) -> Matrix:
+def _frozen(rows: Iterable[Iterable[Component]]) -> Matrix:
     return tuple(tuple(row) for row in rows)  # type: ignore[return-value]
 
 

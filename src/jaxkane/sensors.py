@@ -15,7 +15,6 @@ contain noise; the noise of a measurement is `sigma` of a trial. Outputs are not
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,8 @@ from ._common.lookup import checked, refuse_if
 from ._scalarjit.components import Component, positive
 from ._system.kinematics import Frame, Point, Vector
 from ._system.motion import Body, point_of
-from .loads._laws import check_numbers
+from ._system.system import Measurements
+from .loads import check_numbers
 
 Named = dict[str, Component]
 
@@ -39,7 +39,7 @@ def gyroscope(frame: Frame) -> Named:
     return _along(_a_frame(frame).angular_velocity, frame)
 
 
-def accelerometer(now: Any, point: Point | Body, frame: Frame, gravity: Vector) -> Named:
+def accelerometer(now: Measurements, point: Point | Body, frame: Frame, gravity: Vector) -> Named:
     """Specific force [m/s^2] at a point, with components "x", "y", "z" in a frame.
 
         f = a - g
@@ -56,7 +56,7 @@ def accelerometer(now: Any, point: Point | Body, frame: Frame, gravity: Vector) 
     return _along(now.acceleration(point_of(point)) - gravity, frame)
 
 
-def imu(now: Any, point: Point | Body, frame: Frame, gravity: Vector) -> Named:
+def imu(now: Measurements, point: Point | Body, frame: Frame, gravity: Vector) -> Named:
     """An accelerometer and a gyroscope: "ax", "ay", "az" [m/s^2] and "gx", "gy", "gz" [rad/s].
 
     **Arguments:** as `accelerometer`.
@@ -132,7 +132,7 @@ def camera(
     return {"u": u0 + focal_length * x / depth + lost, "v": v0 + focal_length * y / depth + lost}
 
 
-def load_cell(now: Any, name: str, frame: Frame) -> Named:
+def load_cell(now: Measurements, name: str, frame: Frame) -> Named:
     """The constraint force [N] at a named point, or the constraint moment [N m] at a named frame: "x", "y", "z".
 
     Forces of `loads` are not included.
@@ -153,7 +153,9 @@ def load_cell(now: Any, name: str, frame: Frame) -> Named:
 # -- filters: (rates of their states, output)
 
 
-def low_pass(signal: Component, x: Any, time_constant: Component) -> tuple[tuple[Component], Component]:
+def low_pass(
+    signal: Component, x: Component | Sequence[Component], time_constant: Component
+) -> tuple[tuple[Component], Component]:
     """A first-order low-pass filter, for the lag of a sensor or an actuator.
 
         time_constant * x_dot = signal - x,   output x
@@ -194,7 +196,9 @@ def low_pass_second_order(
     return (x2, w * w * (signal - x1) - 2.0 * damping * w * x2), x1
 
 
-def delayed(signal: Component, x: Any, delay: Component) -> tuple[tuple[Component, ...], Component]:
+def delayed(
+    signal: Component, x: Component | Sequence[Component], delay: Component
+) -> tuple[tuple[Component, ...], Component]:
     """A delay, by Pade's approximation with one or two states. It is accurate for signals much slower than the delay.
 
         exp(-d s) = (1 - d s / 2) / (1 + d s / 2)                                   one state
@@ -220,7 +224,7 @@ def delayed(signal: Component, x: Any, delay: Component) -> tuple[tuple[Componen
     return (x[1], rate), signal - delay * x[1]
 
 
-def _states(x: Any, sizes: tuple[int, ...], name: str) -> tuple[Component, ...]:
+def _states(x: Component | Sequence[Component], sizes: tuple[int, ...], name: str) -> tuple[Component, ...]:
     states = tuple(x) if not hasattr(x, "shape") and hasattr(x, "__iter__") else (x,)
     refuse_if(
         len(states) not in sizes,

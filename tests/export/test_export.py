@@ -18,8 +18,8 @@ from operations import ODD, OPERATIONS
 
 import jaxkane as jk
 from jaxkane._kane.expression_graph import JACOBIANS, Formulas
-from jaxkane._scalarjit.backends.source import as_source
 from jaxkane._scalarjit.graph import Graph, unrolled
+from jaxkane._scalarjit.source import as_source
 from jaxkane.bicycles import (
     Arms,
     Bicycle,
@@ -525,8 +525,8 @@ def test_every_operation_in_casadi():
     """But for float32, which is refused: see below."""
     rtol = 2e-13
     ca = pytest.importorskip("casadi")
-    from jaxkane._scalarjit.backends.source import as_objects
     from jaxkane._scalarjit.graph import needed
+    from jaxkane._scalarjit.source import as_objects
     from jaxkane.export._programs import casadi_operations
 
     graph, nodes, outputs, _ = graph_of(every_in_float64, TAKEN)

@@ -11,7 +11,7 @@ import pytest
 import jaxkane as jk
 from jaxkane._integrate.integrate import solve
 from jaxkane._integrate.settings import settings_for
-from jaxkane._scalarjit.backends import native
+from jaxkane._scalarjit import native
 from jaxkane._scalarjit.scalar_function import ScalarFunction
 from jaxkane.catalog import DoublePendulum
 

@@ -702,9 +702,7 @@ def test_a_full_cache_is_thread_safe():
 def test_checking_an_unchanged_system_does_not_traverse_it(monkeypatch):
     system = Drop()
     version = version_of(system)
-    monkeypatch.setattr(
-        "jaxkane._scalarjit.captured_values.CapturedValues.walk", None
-    )  # it would be called to look anew
+    monkeypatch.setattr("jaxkane._scalarjit.digest.CapturedValues.walk", None)  # it would be called to look anew
     assert version_of(system) == version
 
 

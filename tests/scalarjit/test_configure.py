@@ -14,10 +14,10 @@ import equinox._errors as checks
 import jax
 import pytest
 
-from jaxkane._scalarjit.backends import native
-from jaxkane._scalarjit.backends.native import switched_on
+from jaxkane._scalarjit import native
 from jaxkane._scalarjit.compat import storable_checks
 from jaxkane._scalarjit.configure import _made_folder, _split_cpu, configure
+from jaxkane._scalarjit.native import switched_on
 
 KERNELS = f"no native kernels ({native.why_not()})" if native.why_not() else "native kernels"
 CLEAN = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "EQX_", "XLA_"))}
@@ -172,7 +172,7 @@ def test_configure_warns_if_called_too_late_and_rejects_zero_devices(python):
     assert "called too late: 1 float32 array exists" in late
     assert "too late for devices=2: JAX has started with 1" in devices
     assert where == "<string>"
-    assert "`devices` must be a number of CPU devices" in run.stderr
+    assert "`devices` must be an integer of at least 1" in run.stderr
 
 
 @pytest.mark.parametrize(("first", "n"), [("", 1), ("jk.configure(float64=False, cache=False, verbose=False)", 0)])
@@ -300,7 +300,7 @@ def test_concurrent_traces_restore_the_setting_of_equinox_checks(monkeypatch, tm
 
 @pytest.mark.parametrize("devices", ["2", True, 2.5, 0])
 def test_an_invalid_number_of_devices_raises(devices):
-    with pytest.raises(ValueError, match="`devices` must be a number of CPU devices, 1 or more; got"):
+    with pytest.raises(ValueError, match="`devices` must be an integer of at least 1, got"):
         _split_cpu(devices)
 
 

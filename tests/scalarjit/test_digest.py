@@ -4,8 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxkane._scalarjit.captured_values import CapturedValues
-from jaxkane._scalarjit.digest import digest
+from jaxkane._scalarjit.digest import CapturedValues, digest
 
 
 def callback_of(k):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jaxkane._scalarjit import program as programs
-from jaxkane._scalarjit.backends import xla
+from jaxkane._scalarjit import xla
 from jaxkane._scalarjit.compat import jaxpr_as_fun
 from jaxkane._scalarjit.components import add, determinant, mul, solve, sub
 from jaxkane._scalarjit.jaxpr import cse, tangent_program, transposed_program

@@ -13,9 +13,9 @@ from operations import ODD, OPERATIONS
 
 import jaxkane as jk
 from jaxkane._kane.kanes_method import _motion_rates, motion_rates
+from jaxkane._scalarjit import llvm
+from jaxkane._scalarjit import native as native_kernels
 from jaxkane._scalarjit import program as programs
-from jaxkane._scalarjit.backends import llvm
-from jaxkane._scalarjit.backends import native as native_kernels
 from jaxkane._scalarjit.graph import depth_first, graph_of, needed, reads
 from jaxkane._scalarjit.program import Program
 from jaxkane._scalarjit.scalar_function import ScalarFunction

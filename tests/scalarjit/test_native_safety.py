@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane._scalarjit.backends import compiler as objects
-from jaxkane._scalarjit.backends import llvm, native
-from jaxkane._scalarjit.backends.compiler import LLVMCompiler
+from jaxkane._scalarjit import llvm, native
+from jaxkane._scalarjit.native import LLVMCompiler
 from jaxkane._scalarjit.scalar_function import ScalarFunction
 
 pytestmark = pytest.mark.usefixtures("native")
@@ -22,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("native")
 # Eight systems, each compiled by a thread of its own, all at once, and each compared with XLA's afterwards.
 THREADS = """
 import threading, numpy as np, jax, jaxkane as jk
-from jaxkane._scalarjit.backends import native
+from jaxkane._scalarjit import native
 jax.config.update("jax_enable_x64", True)
 def system(k):
     class Arm(jk.System):
@@ -71,7 +70,7 @@ CUBE = SQUARE.replace("ret double %y", "%z = fmul double %y, %x\nret double %z")
 def value(text, folder):
     """f(3), compiled or read by a machine that has compiled nothing yet."""
     compiler = LLVMCompiler()
-    address, _ = compiler.compile(text, objects.ObjectCache(folder))
+    address, _ = compiler.compile(text, native.ObjectCache(folder))
     found = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(address)(3.0)
     return found, compiler  # whose code must live while it is called
 
@@ -126,7 +125,7 @@ def test_a_deleted_cache_folder_and_concurrent_writers(tmp_path):
         file.unlink()
     folder.rmdir()
     assert value(CUBE, folder)[0] == 27.0
-    store, code, read = objects.ObjectCache(folder), bytes(range(256)) * 4096, []
+    store, code, read = native.ObjectCache(folder), bytes(range(256)) * 4096, []
 
     def write_and_read():
         for _ in range(5):

@@ -183,7 +183,7 @@ THREADS = """
 import sys, threading
 import jax, jax.numpy as jnp, numpy as np
 jax.config.update("jax_enable_x64", True)
-from jaxkane._scalarjit.backends import native
+from jaxkane._scalarjit import native
 from jaxkane.stability._matrix_eigenvalues import eig, eigvals
 native.use(sys.argv[1] == "native")
 

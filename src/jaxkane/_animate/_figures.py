@@ -19,7 +19,7 @@ from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Body, Force, Motion, flatten_loads
 from .._system.system import System
 from ..catalog import WhippleBicycle
-from ..loads._between import ElementForce
+from ..loads import ElementForce
 from ._scene import Builder
 
 # Colours on a light and on a dark page. Any other name is passed to the browser as a CSS colour.

@@ -5,9 +5,13 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
+
+Kind: TypeAlias = Any
+"""A class, a union of classes or a tuple of them, as the second argument of `isinstance`."""
 
 _LISTED = 12  # largest number of names in a message
 
@@ -47,7 +51,7 @@ def label_of(name: str) -> str:
     return name.replace("$", r"\$")
 
 
-def checked(value: Any, kind: Any, what: str, remedy: str = "") -> Any:
+def checked(value: object, kind: Kind, what: str, remedy: str = "") -> Any:
     """The value. `what` begins the message, e.g. "The axis of a hinge must be a Vector".
 
     **Raises:** `TypeError` if the value is not an instance of `kind`.
@@ -64,7 +68,7 @@ def refuse(*rules: tuple[Any, str], error: type[Exception] = ValueError) -> None
             raise error(message)
 
 
-def refuse_if(condition: Any, message: str) -> None:
+def refuse_if(condition: object, message: str) -> None:
     """Raise `ValueError` if the condition is true."""
     refuse((condition, message))
 
@@ -82,7 +86,7 @@ def refuse_unknown(names: Iterable[str], known: Iterable[str], message: str, hav
     refuse_any(wrong, message, "; " + hint(wrong, known, have))
 
 
-def not_there(name: Any, known: Iterable[str], where: str) -> KeyError:
+def not_there(name: object, known: Iterable[str], where: str) -> KeyError:
     """The `KeyError` for a name that is not found. `where` is a phrase such as "this trajectory"."""
     return KeyError(f"There is no {name!r} in {where}; {hint(str(name), known)}")
 
@@ -123,7 +127,7 @@ def decimal_number(text: str) -> float:
     return number
 
 
-def real_number(value: Any, what: str) -> float:
+def real_number(value: npt.ArrayLike, what: str) -> float:
     """Convert one real number to a float. It may be infinite or NaN.
 
     **Raises:** `TypeError` for a tracer. `ValueError` for all other values, such as text, booleans and arrays.
@@ -140,7 +144,7 @@ def real_number(value: Any, what: str) -> float:
     return float(array)
 
 
-def positive_number(value: Any, what: str) -> float:
+def positive_number(value: npt.ArrayLike, what: str) -> float:
     """Convert one positive finite number to a float.
 
     **Raises:** `ValueError` for other numbers; otherwise as `real_number`.
@@ -150,7 +154,7 @@ def positive_number(value: Any, what: str) -> float:
     return number
 
 
-def whole_number(value: Any, least: int, what: str) -> int:
+def whole_number(value: object, least: int, what: str) -> int:
     """One integer that is not smaller than `least`.
 
     **Raises:** `ValueError` for all other values, such as booleans and floats.

@@ -14,7 +14,7 @@ import numpy as np
 from .._kane.constraint_residuals import configuration_residual, relative_condition
 from .._kane.contact.forces import forces_in_contact, layout_of
 from .._kane.kanes_method import accelerations_and_mass_matrix
-from .._kane.reactions import Reactions
+from .._kane.multipliers import Reactions
 from .._kane.right_hand_side import vector_field
 from .._kane.scaling import SMALLEST_SIZE, relative, term_sizes
 from .._scalarjit.cache_key import jit

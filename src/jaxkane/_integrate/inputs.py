@@ -20,7 +20,7 @@ from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import Tracer, on_device
 from .._scalarjit.components import Component, Inputs
 from .._scalarjit.nan import nan_derivative_where
-from .._system.prints import concrete_numbers, module_text
+from .._system.parameters import concrete_numbers, module_text
 from .._system.system import State, System, explain_value_of_traced, names_of
 
 

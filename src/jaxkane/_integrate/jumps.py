@@ -30,7 +30,7 @@ from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, as_vector, component, stack
 from .._scalarjit.nan import nan_if_not_zero
 from .._scalarjit.scalar_function import ScalarFunction
-from .._system.prints import wrapped
+from .._system.parameters import wrapped
 from .._system.system import NamedVector, State, System, call_with_states, unpacked
 from .events import Events, crossings, events_of
 

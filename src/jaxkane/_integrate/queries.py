@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from .._kane.api import InputValues, _dependent_accelerations, checked_arrays, finite_or_explained
 from .._kane.arguments import refuse_multipliers
 from .._kane.kanes_method import KaneEquations, motion_rates
-from .._kane.reactions import forces_now, multipliers_now
+from .._kane.multipliers import forces_now, multipliers_now
 from .._kane.right_hand_side import outputs_at, rates
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import as_vector

@@ -14,12 +14,12 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
+from .._kane.api import diagnosis
 from .._kane.arguments import by_names, check_is_system, is_concrete, refuse_incomplete
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import check_state
 from .._kane.contact.checks import check_contacts
 from .._kane.contact.forces import layout_of
-from .._kane.diagnosis import diagnosis
 from .._kane.right_hand_side import reads_time, values_of, vector_field
 from .._scalarjit.cache_key import captured_tracers
 from .._scalarjit.compat import Tracer, on_device

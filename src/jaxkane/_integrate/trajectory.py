@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from .._common.lookup import by_name
 from .._kane.arguments import check_is_system
 from .._scalarjit.compat import Tracer
-from .._system.prints import wrapped
+from .._system.parameters import wrapped
 from .._system.system import State, System, named_numbers, names_of
 from .jumps import JumpTable
 from .status import Status, advice, reason

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from .._common.lookup import checked, not_there, refuse_any, refuse_if, refuse_unknown
 from .._scalarjit.compat import Tracer
@@ -16,6 +16,16 @@ from .._scalarjit.components import Component, Numbers, component
 from .._system.system import System
 
 Row = tuple[Component, ...]
+
+# Arguments of compiled functions, after `checked_arrays`: all of one dtype.
+Time = Float[Array, ""]  # [s]
+Coordinates = Float[Array, " n_q"]
+Speeds = Float[Array, " n"]
+PackedState = Float[Array, " n_y"]
+InputArrays = dict[str, Float[Array, ""]]
+
+InputValues = Mapping[str, Component] | None
+"""Inputs by name, as users pass them; omitted ones are zero."""
 
 
 def as_row(values: PyTree, names: Sequence[str], label: str) -> Row:
@@ -47,7 +57,7 @@ def as_array(values: PyTree, names: Sequence[str], label: str) -> Array:
     return array
 
 
-def _is_real(array: Any) -> bool:
+def _is_real(array: Numbers) -> bool:
     if getattr(array.dtype, "kind", "") == "m" or np.ma.is_masked(array):  # np.timedelta64 has its own unit
         return False
     return jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
@@ -58,23 +68,18 @@ def is_concrete(*trees: Any) -> bool:
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
 
 
-def without_derivatives(tree: PyTree) -> PyTree:
-    """Replace arrays that are differentiated without `jit`, e.g. by `jax.grad`, by their values. Others stay traced."""
-    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x, tree)
-
-
-def is_one_number(value: Any) -> bool:
+def is_one_number(value: object) -> bool:
     """Whether the value is one real number, concrete or traced."""
     return is_numeric(value) and not isinstance(value, (list, tuple)) and np.shape(value) == ()
 
 
-def check_number(value: Any, what: str, remedy: str = "") -> None:
+def check_number(value: object, what: str, remedy: str = "") -> None:
     """**Raises:** `TypeError` if the value is not one real number, concrete or traced."""
     if not is_one_number(value):
         raise TypeError(f"{what} must be one number, got {value!r}.{remedy}")
 
 
-def is_numeric(value: Any) -> bool:
+def is_numeric(value: object) -> bool:
     """Whether the value is a real number, or an array or a sequence of real numbers, concrete or traced."""
     leaves = jax.tree.leaves(value, is_leaf=lambda x: x is None)
     if not any(isinstance(x, Tracer) for x in leaves):
@@ -85,7 +90,7 @@ def is_numeric(value: Any) -> bool:
         return False
 
 
-def check_is_system(system: Any) -> None:
+def check_is_system(system: System) -> None:
     """**Raises:** `TypeError` if the argument is not an instance of `System`. `ValueError` without coordinates or
     speeds."""
     remedy = f" Create one with {system.__name__}(...)." if isinstance(system, type) else ""
@@ -94,9 +99,14 @@ def check_is_system(system: Any) -> None:
         refuse_if(not names, f"{type(system).__name__} has no {what}. Name them in its class: {what} = (...).")
 
 
-def refuse_multipliers(system: Any) -> None:
+def has_multipliers(system: System) -> bool:
+    """Whether the constraints of a system have multipliers instead of dependent speeds."""
+    return hasattr(system, "multiplier_residuals")
+
+
+def refuse_multipliers(system: System) -> None:
     """**Raises:** `ValueError` for a system of `with_multipliers`, whose equations are more than M u_dot = f."""
-    if hasattr(system, "multiplier_residuals"):
+    if has_multipliers(system):
         raise ValueError(
             f"{type(system).__name__} has multipliers: it can be assembled, simulated and swept, but this function "
             "does not contain its constraint forces. Pass the system without multipliers (its attribute `inner`)."
@@ -144,7 +154,7 @@ def refuse_incomplete(system: System, q: Numbers, u: Numbers) -> None:
             refuse_unknown(values, names, f"{name}: {label} has no", "it has")
     missing = [c for c in system.dependent_coordinates if c not in q] if isinstance(q, Mapping) else []
     label, determined = "q", missing
-    if not missing and isinstance(u, Mapping) and u and hasattr(system, "multiplier_residuals"):
+    if not missing and isinstance(u, Mapping) and u and has_multipliers(system):
         label, determined = "u", [s for s in system.speeds if s not in u]
     after = ", which the others determine. Find the state with jaxkane.assemble(system, q, u) and "
     refuse_any(determined, f"{name}: {label} omits", f"{after}pass its state.{label}, or pass the value in {label}.")

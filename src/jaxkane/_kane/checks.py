@@ -22,17 +22,19 @@ from .._scalarjit.components import (
     Bool,
     Component,
     Numbers,
+    Rows,
     as_vector,
     is_exact,
     is_zero,
     stack,
 )
+from .._scalarjit.nan import constant
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point
 from .._system.motion import Force, Load, Motion
 from .._system.parameters import in_batches
 from .._system.system import System
-from .arguments import is_concrete, without_derivatives
+from .arguments import InputArrays, has_multipliers, is_concrete
 from .constraint_residuals import configuration_residual, residual_sizes, scales_by_unit, violations
 from .description import DescriptionEvaluator, at_random_point, frames_of, structure_of, turning_bodies
 from .scaling import least_norm, nearest_root
@@ -58,7 +60,7 @@ def check_system(system: System, t: Component, q: Numbers, *, bodies: bool = Tru
     """
     if in_batches(system):
         return
-    system, t, q = without_derivatives((system, t, q))
+    system, t, q = constant((system, t, q))
     # Use one type for t: a Python number and an array would be compiled as two programs.
     t = t if isinstance(t, Tracer) else np.asarray(t, jnp.result_type(float) if q is None else q.dtype)
     with concretely(), np.errstate(invalid="ignore", over="ignore"):
@@ -122,7 +124,7 @@ def why_no_body(mass: float, I: np.ndarray, check_inertia: bool, accepted: float
     )
 
 
-def is_possible(mass: Numbers, I: Any, check_inertia: bool, accepted: float = MEASURED) -> Any:
+def is_possible(mass: Numbers, I: Rows | np.ndarray, check_inertia: bool, accepted: float = MEASURED) -> Any:
     """Whether a mass and an inertia are physically possible. Checks of systems, batches and files all use this rule.
 
     **Arguments:**
@@ -145,7 +147,7 @@ def is_possible(mass: Numbers, I: Any, check_inertia: bool, accepted: float = ME
     return possible & (_is_semidefinite(half - xx, half - yy, half - zz, -xy, -xz, -yz) | is_rotor)
 
 
-def _is_semidefinite(xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Any:
+def _is_semidefinite(xx: Numbers, yy: Numbers, zz: Numbers, xy: Numbers, xz: Numbers, yz: Numbers) -> Any:
     # Use pivots: LAPACK is slow for the eigenvalues of many small matrices, and solves them in sequence.
     with np.errstate(all="ignore"):
         second = yy - xy * xy / xx
@@ -154,7 +156,7 @@ def _is_semidefinite(xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> An
 
 def bodies_are_possible(system: System, t: Component, q: Numbers) -> Bool:
     """Whether `check_bodies` accepts all bodies of the system. Use this function for members of a batch."""
-    return _bodies_are_possible(*without_derivatives((system, t, q)))
+    return _bodies_are_possible(*constant((system, t, q)))
 
 
 @ScalarFunction.compile_cheaply
@@ -167,12 +169,13 @@ def _bodies_are_possible(system: System, t: Component, q: Numbers) -> Bool:
 # -- contradictions in a system
 
 
-Quantities = dict[tuple[Any, ...], Any]  # (number, kind, names ...) -> numbers; the number preserves the order
+Key = tuple[Any, ...]  # number, kind, names ...; the number preserves the order
+Quantities = dict[Key, Any]
 Quantity = tuple[tuple[str, ...], list[tuple[Component, ...]]]
 
 
 @ScalarFunction
-def consistency_quantities(system: System, t: Component, q: Numbers, u: Numbers, inputs: Any) -> Quantities:
+def consistency_quantities(system: System, t: Component, q: Numbers, u: Numbers, inputs: InputArrays) -> Quantities:
     evaluator = DescriptionEvaluator(system, inputs)
     q, u, like = tuple(q[i] for i in range(len(q))), tuple(u[i] for i in range(len(u))), q
     motion = evaluator.motion(t, q, u)
@@ -416,7 +419,7 @@ class _Consistency:
         is_rounding = not largest > 1e4 * float(jnp.finfo(self.q.dtype).eps)  # e.g. a gyroscope whose centre is at rest
         self.smallest = 1.0 if is_rounding else min(1.0, float(largest))
 
-    def _differs(self, difference: Any, *sizes: Any, smallest: float = 1.0) -> bool:
+    def _differs(self, difference: np.ndarray, *sizes: Any, smallest: float = 1.0) -> bool:
         size = max([smallest, *(np.max(np.abs(x), initial=0.0) for x in sizes)])
         difference = np.max(np.abs(difference), initial=0.0)
         return bool(np.isfinite(difference) and difference > self.tolerance * size)
@@ -450,7 +453,7 @@ class _Consistency:
             key for key, z, x, s, f in each if differs(f - z - s * (x - z), f, s * x, z, smallest=self._smallest(key))
         }
 
-    def _smallest(self, key: Any) -> float:
+    def _smallest(self, key: Key) -> float:
         return self.smallest if _is_translation(key) else 1.0
 
     # Velocities are the rates of positions and orientations.
@@ -474,7 +477,7 @@ class _Consistency:
         for key, x in quantities.items():
             self._check_quantity(key, x, rates[key])
         constraints = _of_kind(rates, "constraint")
-        if constraints and not hasattr(self.system, "multiplier_residuals"):
+        if constraints and not has_multipliers(self.system):
             # The sizes of the rates, from speeds that violate the velocity residuals.
             sizes = self._rates(q, start, self._read(q, start))
             # Nearly dependent residuals are satisfied to 3e-8 only, and so are the rates of the constraints.
@@ -498,7 +501,7 @@ class _Consistency:
         violation = np.max(violations(self.system, self.t, q)[0], initial=0.0)
         return q if violation <= 0.1 * self.tolerance else np.full_like(q, np.nan)
 
-    def _check_quantity(self, key: Any, value: Any, rate: Any) -> None:
+    def _check_quantity(self, key: Key, value: np.ndarray, rate: np.ndarray) -> None:
         _, kind, part, *parent = key
         if kind == "frame":
             turning = rate[:3] @ value[:3].T  # -[omega x], for [R] from the parent's components to the frame's
@@ -518,7 +521,7 @@ class _Consistency:
                 "centre."
             )
 
-    def _compare(self, what: str, unit: str, by_position: Any, stated: Any, relative_to: str) -> None:
+    def _compare(self, what: str, unit: str, by_position: np.ndarray, stated: np.ndarray, relative_to: str) -> None:
         if self._differs(by_position - stated, stated, smallest=self.smallest if unit == "m/s" else 1.0):
             found, expected = ("(" + ", ".join(f"{a:.4g}" for a in x) + ")" for x in (by_position, stated))
             raise ValueError(
@@ -529,7 +532,7 @@ class _Consistency:
                 "that is in contact at this instant, write `center.fixed(r, wheel_frame)`."
             )
 
-    def _check_constraint(self, key: Any, rate: Any, size: Any) -> None:
+    def _check_constraint(self, key: Key, rate: np.ndarray, size: np.ndarray) -> None:
         if self._differs(rate, size, smallest=self.smallest):
             raise ValueError(
                 f"{self.name}: the configuration constraint {key[2]} (counted from 0) changes at a rate of "

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
 from .._common.lookup import as_names, refuse_any, refuse_unknown
@@ -20,23 +21,23 @@ from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component, Numbers
 from .._scalarjit.nan import nan_where
 from .._system.system import State, System, with_class
-from .api import constraint_jacobian, dependent_speeds
-from .arguments import as_array, check_is_system, check_time, is_concrete
+from .api import constraint_jacobian, dependent_speeds, diagnosis
+from .arguments import Coordinates, as_array, check_is_system, check_time, has_multipliers, is_concrete
 from .checks import check_system
 from .constraint_residuals import (
     configuration_residual,
     configuration_tolerance,
     implied_residual,
+    n_configuration_constraints,
     residual_sizes,
     scales_along,
     scales_by_unit,
     violations,
 )
 from .contact.checks import check_contacts
-from .contact.forces import ContactRows, has_multipliers, layout_of, speeds_in_contact
+from .contact.forces import ContactRows, layout_of, speeds_in_contact
 from .contact.impulses import REDUNDANT
 from .description import at_random_point, structure_of
-from .diagnosis import diagnosis
 from .kanes_method import KaneEquations
 from .scaling import SMALLEST_SIZE
 
@@ -140,11 +141,15 @@ def _reads_any(system: System, names: Sequence[str]) -> bool:
         return bool(np.any(configuration_residual.numpy_jvp((system, np.asarray(t, q.dtype), q), (None, None, along))))
 
 
+Equations = Callable[[Numbers], Numbers]
+
 _MAX_STEPS = 64
 _OTHER_GUESSES = 8
 
 
-def _root(xp: ModuleType, equations: Any, slopes: Any, start: Numbers, met: float, redundant: bool) -> tuple[Any, Any]:
+def _root(
+    xp: ModuleType, equations: Equations, slopes: Equations, start: Numbers, met: float, redundant: bool
+) -> tuple[Any, Any]:
     """The root of `equations` and the number of Newton steps. Values and unknowns are scaled to size 1.
 
     By NumPy, which takes less time than a compilation by XLA, or by JAX, with derivatives up to the third order by the
@@ -164,10 +169,10 @@ def _root(xp: ModuleType, equations: Any, slopes: Any, start: Numbers, met: floa
         A, b = xp.where(finite, A, 0.0), xp.where(finite, b, xp.zeros_like(b))
         return xp.where(finite, xp.linalg.lstsq(A, b, rcond=REDUNDANT if redundant else None)[0], xp.nan)
 
-    def solve(equations: Any, start: Numbers, slopes: Any = None) -> tuple[Any, Any]:
+    def solve(equations: Equations, start: Numbers, slopes: Equations | None = None) -> tuple[Any, Any]:
         slopes = slopes or jax.jacfwd(equations)
 
-        def step(carry: Any) -> PyTree:
+        def step(carry: tuple[Numbers, ...]) -> PyTree:
             x, last, _, n = carry
             values = equations(x)
             dx = solution(slopes(x), values)
@@ -184,7 +189,7 @@ def _root(xp: ModuleType, equations: Any, slopes: Any, start: Numbers, met: floa
             carry = step(carry)
         return carry[0], carry[3].astype(start.dtype)  # JAX 0.10 rejects the tangent of an integer
 
-    def solve_linear(f: Any, b: Numbers) -> Numbers:
+    def solve_linear(f: Equations, b: Numbers) -> Numbers:
         # The pseudo-inverse is finite for a singular matrix. NaN in one member of a batch would give NaN in the
         # derivatives of shared parameters. It is not differentiated, but the residual of the refined solution is.
         A = jax.jacfwd(f)(jnp.zeros_like(b))
@@ -206,12 +211,12 @@ def _singular(xp: ModuleType, A: Numbers) -> tuple[Any, Any]:
     return tuple(xp.linalg.svd(xp.where(xp.isfinite(A), A, 0.0), full_matrices=True)[:2])  # type: ignore[return-value]
 
 
-def _met(dtype: Any) -> float:
+def _met(dtype: DTypeLike) -> float:
     """The largest permitted residual after Newton's method, relative to its terms: 4e-10 (float32: 7e-5)."""
     return float(jnp.finfo(dtype).eps) ** 0.6
 
 
-def _flat(dtype: Any) -> float:
+def _flat(dtype: DTypeLike) -> float:
     """The largest slope that is only a rounding error, for quantities of size 1."""
     return float(jnp.finfo(dtype).eps) ** 0.9
 
@@ -226,7 +231,7 @@ class NewtonResult(NamedTuple):
     steps: Any
 
 
-def newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> NewtonResult:
+def newton(system: System, q0: Coordinates, t: Component, where: tuple[int, ...], lenient: bool) -> NewtonResult:
     """Newton's method from q0, evaluated by NumPy if no number is traced.
 
     Residuals are divided by the sizes of their terms. Coordinates are divided by the change that changes a residual by
@@ -241,12 +246,16 @@ def newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> Newt
 
 
 @jit
-def newton_compiled(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> NewtonResult:
+def newton_compiled(
+    system: System, q0: Coordinates, t: Component, where: tuple[int, ...], lenient: bool
+) -> NewtonResult:
     result = _newton(jnp, system, q0, t, where, lenient)
     return result._replace(q=nan_where(~result.converged, result.q, (system, q0, t)))
 
 
-def _newton(xp: ModuleType, system: System, q0, t, where: tuple[int, ...], lenient: bool) -> NewtonResult:
+def _newton(
+    xp: ModuleType, system: System, q0: Coordinates, t: Component, where: tuple[int, ...], lenient: bool
+) -> NewtonResult:
     places, dtype, redundant = np.array(where, int), q0.dtype, has_multipliers(system)
     met = configuration_tolerance(dtype) if redundant else _met(dtype)
     # Values that are not finite must not reach the linear solver. It would raise an exception for the whole batch.
@@ -410,9 +419,9 @@ def assemble(
     return State(q0, u0, x0)
 
 
-def _solve_configuration(system: System, q0, t, problem: AssemblyProblem):
+def _solve_configuration(system: System, q0: Coordinates, t: Component, problem: AssemblyProblem):
     t = jnp.asarray(t if isinstance(t, jax.Array) else np.asarray(t, q0.dtype), dtype=q0.dtype)
-    n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
+    n_h = n_configuration_constraints(system, t, q0)
     if n_h == 0:
         return q0
     if len(problem.moved) < n_h:  # e.g. a plane loop that is closed by a Vector, whose third component is always zero
@@ -434,7 +443,7 @@ def _solve_configuration(system: System, q0, t, problem: AssemblyProblem):
     raise NoConfiguration(_why_not(system, q0, problem, result))
 
 
-def _why_not(system: System, q0, problem: AssemblyProblem, result: NewtonResult) -> str:
+def _why_not(system: System, q0: Coordinates, problem: AssemblyProblem, result: NewtonResult) -> str:
     name = type(system).__name__
     moved = ", ".join(problem.moved)
     fixed = ", ".join(

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PyTree
 
 from .._common.lookup import refuse_any, refuse_if
@@ -28,7 +29,7 @@ from .._system.system import System
 from .arguments import as_array, check_is_system, check_time, is_concrete, refuse_incomplete
 from .description import DescriptionEvaluator, at_random_point, structure_of
 from .kanes_method import KaneEquations, unit
-from .scaling import SMALLEST_SIZE, inside_pure_functions, relative, term_sizes, without_rounding
+from .scaling import SMALLEST_SIZE, RowBasis, inside_pure_functions, relative, term_sizes, without_rounding
 
 SINGULAR_ROUNDING = 1e-12
 """The reciprocal of the largest condition number that is accepted when residuals are solved for dependent speeds."""
@@ -159,7 +160,7 @@ def has_no_implied(system: System) -> bool:
     return type(system).implied_constraints is System.implied_constraints
 
 
-def configuration_tolerance(dtype: Any) -> float:
+def configuration_tolerance(dtype: DTypeLike) -> float:
     """The largest residual, relative to its terms, with which the configuration constraints are satisfied."""
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
@@ -241,22 +242,9 @@ def least_change(G: Array, h: Array, weights: Array) -> Array:
         G W = L Q with orthonormal rows of Q,   dq = W Q^T L^-1 h
 
     A coordinate of weight zero does not change. A residual is omitted if its gradient is zero or linearly dependent on
-    the previous ones. Otherwise, its row of L would be divided by a rounding error. Derivatives are those of the
-    remaining residuals.
+    the previous ones.
     """
-    G = G * weights[None]  # (h,n_q)
-    threshold = float(jnp.finfo(G.dtype).eps) ** 0.75  # 1.8e-12 of a gradient; a Gram matrix would square it
-    Q, y = jnp.zeros_like(G), jnp.zeros_like(h)
-    for i, gradient in enumerate(G):
-        rest, value = gradient, h[i]
-        for _ in range(2):  # Gram-Schmidt twice: after one pass, it is not orthogonal within rounding
-            along = Q @ rest
-            rest, value = rest - along @ Q, value - along @ y
-        is_new = jax.lax.stop_gradient(jnp.max(jnp.abs(rest)) > threshold * jnp.max(jnp.abs(gradient)))
-        norm = jnp.linalg.norm(jnp.where(is_new, rest, 1.0))  # the derivative of a norm of zero is NaN
-        Q = Q.at[i].set(jnp.where(is_new, rest / norm, 0.0))
-        y = y.at[i].set(jnp.where(is_new, value / norm, 0.0))
-    return (y.T @ (Q * weights[None])).T
+    return (RowBasis.of(G * weights[None]).least_norm(h).T * weights).T
 
 
 def projected(system: System, t: Component, q: Array, steps: int = 3) -> Float[Array, " n_q"]:
@@ -266,7 +254,7 @@ def projected(system: System, t: Component, q: Array, steps: int = 3) -> Float[A
     return q
 
 
-def n_configuration_constraints(system: System, t: Component, q: Any) -> int:
+def n_configuration_constraints(system: System, t: Component, q: Array | jax.ShapeDtypeStruct) -> int:
     """The number of residuals of the configuration constraints. `q` may be a `jax.ShapeDtypeStruct`."""
     return jax.eval_shape(lambda q: configuration_residual(system, t, q), q).shape[0]
 

@@ -60,7 +60,7 @@ def jvp(f: Callable[..., Any], primals: Sequence[Component], tangents: Sequence[
     return jax.tree.unflatten(treedef, f_x), jax.tree.unflatten(treedef, f_dx)
 
 
-def transposed(f: Callable[..., Any], primals: Sequence[Component], cotangents: Any) -> Row:
+def transposed(f: Callable[..., Any], primals: Sequence[Component], cotangents: PyTree) -> Row:
     """`jax.vjp` of a function of components: the transposed derivative of `f` at `primals`, times `cotangents`.
 
     `cotangents` have the structure of the outputs of f. Exact outputs are constants, so their cotangents are ignored.
@@ -203,7 +203,7 @@ class EvaluatedDescription:
 
 
 @ScalarFunction
-def _quantities(system: System, components: Any) -> dict[str, Any]:
+def _quantities(system: System, components: PyTree) -> dict[str, Any]:
     inputs, t, q, u = components
     return EvaluatedDescription(DescriptionEvaluator(system, inputs), t, q, u).all_quantities()
 

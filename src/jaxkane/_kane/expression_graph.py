@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._common.lookup import refuse_any, refuse_if
 from .._scalarjit.compat import ClosedJaxpr, jaxpr_as_fun
@@ -31,7 +32,7 @@ from .api import (
     kinetic_energy,
     partial_velocities,
 )
-from .arguments import as_row, check_is_system, is_concrete, refuse_multipliers
+from .arguments import Coordinates, InputArrays, Speeds, Time, as_row, check_is_system, is_concrete, refuse_multipliers
 from .checks import check_system
 from .description import DescriptionEvaluator
 from .kanes_method import motion_rates_by_matrix
@@ -79,7 +80,9 @@ FUNCTIONS |= {
 }
 
 
-def _read(quantity: Callable[..., Any], system: System, t: Any, q: Any, u: Any, w: Any, u_dep: Any) -> tuple[Any]:
+def _read(
+    quantity: Callable[..., Any], system: System, t: Time, q: Coordinates, u: Speeds, w: InputArrays, u_dep: Speeds
+) -> tuple[Any]:
     row = as_row(q, system.coordinates, "q")
     return (as_vector(quantity(DescriptionEvaluator(system), t, row, (*u, *u_dep)), q),)
 
@@ -227,7 +230,7 @@ class Formulas:
             return tuple(jaxpr_as_fun(self.program(function))(*args))
         places = [i for i, a in enumerate(self.arguments) if a.kind in JACOBIANS[function]]
 
-        def rates_of(values):
+        def rates_of(values: Sequence[Array]):
             full = list(args)
             for i, x in zip(places, values, strict=True):
                 full[i] = x

@@ -58,7 +58,7 @@ from .._scalarjit.elimination import LinearSolution, ScalarSolve
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.motion import Load, Motion
 from .._system.system import System
-from .arguments import Row, as_row
+from .arguments import Coordinates, InputArrays, Row, Speeds, Time, as_row
 from .description import (
     DescriptionEvaluator,
     jvp,
@@ -235,7 +235,7 @@ class KaneEquations(DescriptionEvaluator):
 
     # -- Formulation by transposition: all vectors are projected onto all speeds at once. For many speeds.
 
-    def projected_onto_speeds(self, f: Callable[[Row], Any], cotangents: Any) -> Row:
+    def projected_onto_speeds(self, f: Callable[[Row], Any], cotangents: PyTree) -> Row:
         """The derivatives of `f(u)` with respect to the independent speeds, times `cotangents` (n,). Costs a few f."""
         return transposed(lambda *u: f(self.with_dependent(u)), (self._zero(),) * self.n, cotangents)
 
@@ -251,7 +251,7 @@ def _negative(row: Sequence[Component]) -> Row:
 
 
 def motion_rates(
-    system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
+    system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays
 ) -> tuple[Float[Array, " n_q"], Float[Array, " n"]]:
     """q_dot and u_dot, from checked arrays."""
     if is_written_out(len(system.speeds)):
@@ -268,7 +268,7 @@ def motion_rates(
 
 
 def motion_rates_by_matrix(
-    system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
+    system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays
 ) -> tuple[Float[Array, " n_q"], Float[Array, " n"]]:
     """As `motion_rates`, with operations that can be exported: no custom derivative and no native kernel."""
     if is_written_out(len(system.speeds)):
@@ -278,7 +278,7 @@ def motion_rates_by_matrix(
 
 
 def rates_and_equations(
-    system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
+    system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays
 ) -> tuple[Float[Array, " n_q"], Float[Array, "n n"], Float[Array, " n"]]:
     """q_dot, M and f of M u_dot = f, from checked arrays."""
     if is_written_out(len(system.speeds)):
@@ -287,7 +287,7 @@ def rates_and_equations(
     return q_dot, mass_matrix_columns(system, t, q, u, inputs), f
 
 
-def mass_matrix_columns(system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]) -> Float[Array, "n n"]:
+def mass_matrix_columns(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays) -> Float[Array, "n n"]:
     """M (n, n), by one batched program for all columns."""
 
     column = functools.partial(_mass_times, system, t, q, u, inputs)
@@ -295,7 +295,7 @@ def mass_matrix_columns(system: System, t: Array, q: Array, u: Array, inputs: di
 
 
 def accelerations_and_mass_matrix(
-    system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
+    system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """u_dot and M, from checked arrays."""
     if is_written_out(len(system.speeds)):
@@ -303,53 +303,52 @@ def accelerations_and_mass_matrix(
     return motion_rates(system, t, q, u, inputs)[1], mass_matrix_columns(system, t, q, u, inputs)
 
 
-def _equations_at(system, t, q, u, inputs, u_dot, r):
+def _equations_at(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, u_dot: Speeds, r: Speeds):
     kane = KaneEquations(system, t, q, u, inputs)
-    u_dot, r = (as_row(x, system.speeds, "u_dot") for x in (u_dot, r))
-    solution = solve_positive(kane.mass_matrix(kane.partial_velocities()), r)
-    return as_vector(kane.q_dot, q), as_vector(kane.forcing_by_transposition(u_dot), q), as_vector(solution, q)
+    accelerations, right = (as_row(x, system.speeds, "u_dot") for x in (u_dot, r))
+    solution = solve_positive(kane.mass_matrix(kane.partial_velocities()), right)
+    return as_vector(kane.q_dot, q), as_vector(kane.forcing_by_transposition(accelerations), q), as_vector(solution, q)
 
 
 @functools.partial(LinearSolution, equations=_equations_at)
-def _motion_rates(system, t, q, u, inputs):
+def _motion_rates(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays):
     kane = KaneEquations(system, t, q, u, inputs)
     return as_vector(kane.q_dot, q), as_vector(solve_positive(*kane.equations_by_partial_velocities()), q)
 
 
 @ScalarFunction
-def _equations_written_out(system, t, q, u, inputs):
+def _equations_written_out(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays):
     kane = KaneEquations(system, t, q, u, inputs)
     M, f = kane.equations_by_partial_velocities()
     return as_vector(kane.q_dot, q), stack(M).astype(q.dtype), as_vector(f, q)
 
 
 @ScalarFunction
-def _accelerations_and_mass_matrix(system, t, q, u, inputs):
+def _accelerations_and_mass_matrix(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays):
     M, f = KaneEquations(system, t, q, u, inputs).equations_by_partial_velocities()
     return as_vector(solve_positive(M, f), q), stack(M).astype(q.dtype)
 
 
 @ScalarFunction
-def rates_and_forcing(system, t, q, u, inputs):
+def rates_and_forcing(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays):
     kane = KaneEquations(system, t, q, u, inputs)
     return as_vector(kane.q_dot, q), as_vector(kane.forcing_by_transposition(), q)
 
 
 @ScalarFunction
-def _mass_times(system, t, q, u, inputs, direction):
+def _mass_times(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, direction: Speeds):
     # M times a direction of the independent speeds: its momenta, projected onto all speeds. Order b.
     kane = KaneEquations(system, t, q, u, inputs)
-    direction = kane.with_dependent(as_row(direction, system.speeds, "direction"))
-    along = kane.along_speeds(kane.momenta, direction)
+    along = kane.along_speeds(kane.momenta, kane.with_dependent(as_row(direction, system.speeds, "direction")))
     return as_vector(kane.projected_onto_speeds(lambda u: kane.velocities(u)[0], along), q)
 
 
-def _accelerations_by_lapack(system, t, q, u, inputs, f):
+def _accelerations_by_lapack(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, f: Speeds):
     return solve_positive_array(mass_matrix_columns(system, t, q, u, inputs), f)
 
 
 @functools.partial(ScalarSolve, by_lapack=_accelerations_by_lapack)
-def _accelerations_under(system, t, q, u, inputs, u_dot):
+def _accelerations_under(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, u_dot: Speeds):
     # M u_dot = f. Twice the kinetic energy is u^T M u = sum_i v_i . m_i v_i + omega_i . I_i omega_i
     kane = KaneEquations(system, t, q, u, inputs)
     direction = kane.with_dependent(as_row(u_dot, system.speeds, "u_dot"))

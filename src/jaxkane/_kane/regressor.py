@@ -15,12 +15,12 @@ from jaxtyping import Array, Float, PyTree
 from .._common.lookup import as_names, refuse_any, refuse_unknown
 from .._scalarjit.cache import Cache
 from .._scalarjit.compat import concretely, depends_on
-from .._scalarjit.components import ZERO3, Component, Numbers, add, add3, as_vector, is_zero, mul, stack
+from .._scalarjit.components import ZERO3, Component, Numbers, Rows, add, add3, as_vector, is_zero, mul, stack
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Point, Vector
 from .._system.motion import UNNAMED, Body, Force, Motion, parallel_axis
 from .._system.system import System
-from .arguments import Row
+from .arguments import Coordinates, InputArrays, InputValues, Row, Speeds, Time
 from .description import DescriptionEvaluator, EvaluatedDescription, at_random_point, dtype_of, jvp, structure_of
 from .kanes_method import KaneEquations
 
@@ -121,7 +121,7 @@ def _bodies_of(system: System) -> tuple[tuple[BodyParameters, ...], tuple[int, .
     leaves, structure = jax.tree.flatten(system)
     motions: list[Motion] = []
 
-    def masses_and_spins(leaves: Any, t: Component, q: Numbers, u: Numbers) -> tuple[list[Any], list[Any]]:
+    def masses_and_spins(leaves: list[Numbers], t: Component, q: Numbers, u: Numbers) -> tuple[list[Any], list[Any]]:
         motion = DescriptionEvaluator(jax.tree.unflatten(structure, leaves)).motion(t, tuple(q), tuple(u))
         motions[:] = [motion]
         bodies = [body for body in motion.bodies if not is_zero(body.mass)]
@@ -208,7 +208,7 @@ class _EvaluatedOrigins(EvaluatedDescription):
 
 
 @ScalarFunction
-def _quantities_of_origins(model: RegressorModel, components: Any) -> dict[str, Any]:
+def _quantities_of_origins(model: RegressorModel, components: PyTree) -> dict[str, Any]:
     inputs, t, q, u = components
     return _EvaluatedOrigins(DescriptionEvaluator(model.system, inputs), model.bodies, t, q, u).all_quantities()
 
@@ -216,7 +216,7 @@ def _quantities_of_origins(model: RegressorModel, components: Any) -> dict[str, 
 class _OriginKinematics(KaneEquations):
     """Kane's equations at a state. `velocities` and `momenta` return the velocities of the bodies' origins."""
 
-    def __init__(self, model: RegressorModel, t: Component, q: Numbers, u: Numbers, inputs: Any):
+    def __init__(self, model: RegressorModel, t: Component, q: Numbers, u: Numbers, inputs: InputValues):
         self.model = model
         super().__init__(model.system, t, q, u, inputs)
 
@@ -260,7 +260,9 @@ class _OriginKinematics(KaneEquations):
 
 
 @ScalarFunction
-def regressor_kinematics(model: RegressorModel, t, q, u, inputs, u_dot) -> RegressorKinematics:
+def regressor_kinematics(
+    model: RegressorModel, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, u_dot: Speeds
+) -> RegressorKinematics:
     """Kinematics of the bodies of a model, at accelerations `u_dot` (n,) of the independent speeds."""
     kane = _OriginKinematics(model, t, q, u, inputs)
     row = tuple(u_dot[i] for i in range(kane.n))
@@ -282,7 +284,7 @@ def regressor_kinematics(model: RegressorModel, t, q, u, inputs, u_dot) -> Regre
         g.append(tuple(mul(x, reciprocal) for x in dF))
     n, b = kane.n, len(model.bodies)
 
-    def array(rows: Any, *shape: int) -> Array:
+    def array(rows: Rows, *shape: int) -> Array:
         return stack(rows).astype(q.dtype).reshape(b, *shape, 3) if b else jnp.zeros((0, *shape, 3), q.dtype)
 
     V, W = (jnp.swapaxes(array([x for row in rows for x in row], n), 1, 2) for rows in (V, W))  # (b,3,n)
@@ -313,7 +315,7 @@ def regressor_columns(kinematics: RegressorKinematics, bodies: Sequence[BodyPara
 
 
 @ScalarFunction
-def parameter_values(model: RegressorModel, t, q, u) -> Float[Array, " p"]:
+def parameter_values(model: RegressorModel, t: Time, q: Coordinates, u: Speeds) -> Float[Array, " p"]:
     """The parameters of the bodies, in the order of the columns. They do not depend on time. `u` has shape (n + k,)."""
     rows = [tuple(x[i] for i in range(x.shape[0])) for x in (q, u)]
     motion = DescriptionEvaluator(model.system).motion(t, *rows)
@@ -344,7 +346,9 @@ def _times(x: Float[Array, "b 3"]) -> Float[Array, "b 3 6"]:
 
 
 @ScalarFunction
-def unbalanced(system: System, t, q, u, inputs, u_dot) -> Float[Array, " n"]:
+def unbalanced(
+    system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, u_dot: Speeds
+) -> Float[Array, " n"]:
     """-(F_r + F*_r) (n,) at accelerations `u_dot`. It is zero at the accelerations of the motion."""
     kane = KaneEquations(system, t, q, u, inputs)
     row = tuple(u_dot[i] for i in range(kane.n))

@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, PyTree
 
 from .._common.lookup import checked, not_there, refuse_any, refuse_unknown
@@ -19,16 +20,27 @@ from .._scalarjit.components import Component, Numbers, add3, as_vector, compone
 from .._scalarjit.scalar_function import ScalarFunction, tree_of
 from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
-from .._system.system import NamedVector, State, System, has_outputs, packed, unpacked
-from .arguments import Inputs, Row, as_row, inputs_of
+from .._system.system import Measurements, NamedVector, State, System, has_outputs, packed, unpacked
+from .arguments import (
+    Coordinates,
+    InputArrays,
+    Inputs,
+    PackedState,
+    Row,
+    Speeds,
+    Time,
+    as_row,
+    has_multipliers,
+    inputs_of,
+)
 from .constraint_residuals import configuration_residual
-from .contact.forces import forces_in_contact, has_multipliers, layout_of
+from .contact.forces import forces_in_contact, layout_of
 from .description import jvp
 from .kanes_method import KaneEquations, motion_rates
-from .reactions import Reactions
+from .multipliers import Reactions
 
 
-class MeasurementContext(Inputs):
+class MeasurementContext(Inputs, Measurements):
     """The argument `now` of `state_rates` and `outputs`.
 
     `now["command"]` is the value of an input or a first-order state.
@@ -148,7 +160,7 @@ def _outputs(system: System, t: Component, q: Row, u: Row, motion: Motion, now: 
     return outputs
 
 
-def _flat(label: str, outputs: Any) -> dict[str, Component]:
+def _flat(label: str, outputs: object) -> dict[str, Component]:
     hint = " Does it end without a `return`?" if outputs is None else ""
     flat: dict[str, Component] = {}
     for name, value in checked(outputs, Mapping, f"{label} must return a dict of numbers by name", hint).items():
@@ -164,7 +176,7 @@ def _flat(label: str, outputs: Any) -> dict[str, Component]:
     return flat
 
 
-def outputs_at(system: System, t: Array, q: Array, u: Array, inputs: Mapping[str, Array]) -> dict[str, Array]:
+def outputs_at(system: System, t: Time, q: Coordinates, u: Speeds, inputs: Mapping[str, Array]) -> dict[str, Array]:
     """Outputs by name, from checked arrays. `inputs` also contains the first-order states."""
     if not has_outputs(system):
         return {}
@@ -173,7 +185,7 @@ def outputs_at(system: System, t: Array, q: Array, u: Array, inputs: Mapping[str
 
 
 def outputs_in_contact(
-    system: System, t: Array, y: Array, inputs: Mapping[str, Array]
+    system: System, t: Time, y: PackedState, inputs: Mapping[str, Array]
 ) -> tuple[Array, dict[str, Array]]:
     """The projected speeds (n,), and outputs by name with the contact forces, at a state with contact states."""
     state = unpacked(system, y)
@@ -184,7 +196,7 @@ def outputs_in_contact(
 
 
 @ScalarFunction
-def _contact_forces(system, t, y, values):
+def _contact_forces(system: System, t: Time, y: PackedState, values: InputArrays):
     state, layout = unpacked(system, y), layout_of(system)
     _, u, (forces, u_dot), _ = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
     named = {}
@@ -199,7 +211,7 @@ def _contact_forces(system, t, y, values):
 
 
 @ScalarFunction
-def _outputs_at(system, t, q, u, inputs, u_dot):
+def _outputs_at(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, u_dot: Speeds):
     kane = KaneEquations(system, t, q, u, inputs)
     outputs = evaluate_with_accelerations(kane, as_row(u_dot, system.speeds, "u_dot"), _outputs)
     return {name: as_vector([x], q)[0] for name, x in outputs.items()}
@@ -232,7 +244,7 @@ def named_row(rates: Numbers, names: Sequence[str], label: str) -> Row:
     return as_row(rates, names, label)
 
 
-def rates(system: System, t: Array, q: Array, u: Array, values: dict[str, Array]) -> State:
+def rates(system: System, t: Time, q: Coordinates, u: Speeds, values: InputArrays) -> State:
     """The right-hand side: time derivatives of coordinates, independent speeds and first-order states.
 
     The arguments are checked arrays. `values` contains inputs and first-order states by name.
@@ -253,7 +265,9 @@ def rates_by_numpy(
     return unpacked(system, _vector_field.numpy(*args))
 
 
-def vector_field(system: System, t: Array, y: Array, inputs: Mapping[str, Any], forward: bool = False) -> Array:
+def vector_field(
+    system: System, t: Time, y: PackedState, inputs: Mapping[str, Any], forward: bool = False
+) -> PackedState:
     """The right-hand side for a solver: the packed rates (n_q + n_u + n_x,) of a packed state, so a step uses one
     array.
 
@@ -276,12 +290,12 @@ def vector_field(system: System, t: Array, y: Array, inputs: Mapping[str, Any], 
     return packed(State(q_dot, u_dot, x_dot))
 
 
-def rates_are_native(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) -> bool:
+def rates_are_native(system: System, t: Time, y: PackedState, inputs: Mapping[str, Any]) -> bool:
     """Whether `vector_field` runs as one native kernel for these arguments."""
     return is_written_out(len(tree_of(system).speeds)) and _vector_field.is_native(system, t, y, dict(inputs))
 
 
-def reads_time(system: System, dtype: Any) -> bool:
+def reads_time(system: System, dtype: DTypeLike) -> bool:
     """Whether the right-hand side or the outputs depend on time. True if they are not programs of scalars."""
     q, u, x = (jnp.zeros(len(names), dtype) for names in (system.coordinates, system.speeds, system.states))
     t, place = jnp.zeros((), dtype), len(jax.tree.leaves(system))
@@ -308,7 +322,7 @@ def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dic
 
 
 @ScalarFunction
-def _vector_field(system, t, y, inputs):
+def _vector_field(system: System, t: Time, y: PackedState, inputs: InputArrays):
     state = unpacked(system, y)
     values = values_of(system, state.x, inputs)
     memory, x_dot, still = state.contacts, None, None
@@ -325,7 +339,7 @@ def _vector_field(system, t, y, inputs):
 
 
 @ScalarFunction
-def first_order_rates(system, t, q, u, inputs, u_dot):
+def first_order_rates(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, u_dot: Speeds):
     """Rates x_dot (n_x,) of the first-order states, at the accelerations u_dot (n,)."""
     kane = KaneEquations(system, t, q, u, inputs)
     return as_vector(evaluate_with_accelerations(kane, as_row(u_dot, system.speeds, "u_dot"), _state_rates), q)

@@ -7,14 +7,15 @@ then accepts an open loop at micrometres and rejects a closed loop at kilometres
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jax.typing import DTypeLike
+from jaxtyping import Array, PyTree
 
-from .._scalarjit.compat import evaluated, interpret, operation_of
+from .._scalarjit.compat import Equation, Variable, evaluated, interpret, operation_of
 from .._scalarjit.components import Numbers
 from .._scalarjit.jaxpr import is_inexact, opened, program_of
 
@@ -65,11 +66,11 @@ def term_sizes(f: Callable[..., Any], *args: Any, sizes: Sequence[Any] | None = 
     return jax.tree.unflatten(jax.tree.structure(shape), [size for _, size in results])
 
 
-def _sized_constant(_: Any, x: Numbers) -> tuple[Any, Any]:
+def _sized_constant(_: Variable, x: Numbers) -> tuple[Any, Any]:
     return x, jnp.abs(x)
 
 
-def _sized(equation: Any, operands: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+def _sized(equation: Equation, operands: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
     """The results of an equation and their sizes, from its operands and their sizes."""
     inner = opened(equation)
     if inner is not None:
@@ -97,7 +98,7 @@ def inside_pure_functions(f: Callable[..., Any], n: int) -> set[int]:
     program = program_of(f, *[jax.ShapeDtypeStruct((), jnp.result_type(float))] * n)
     found: set[int] = set()
 
-    def depends_on(equation: Any, operands: list[frozenset[int]]) -> list[frozenset[int]]:
+    def depends_on(equation: Equation, operands: list[frozenset[int]]) -> list[frozenset[int]]:
         inner = opened(equation)
         if inner is not None:
             return interpret(inner, operands, depends_on, lambda *_: frozenset())
@@ -141,7 +142,7 @@ def equilibrated(A: Numbers) -> tuple[Any, Any, Any]:
 
 
 def nearest_root(
-    f: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], q: np.ndarray, scales: Any = 1.0
+    f: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], q: np.ndarray, scales: Numbers = 1.0
 ) -> np.ndarray:
     """The nearest q (n,) with f = 0, by the Gauss-Newton method with NumPy; NaN if it does not converge.
 
@@ -175,7 +176,7 @@ def singular_values(A: Numbers) -> Numbers:
     return s / xp.where(s[:1] > 0, s[:1], 1.0)
 
 
-def rank_tolerance(dtype: Any) -> float:
+def rank_tolerance(dtype: DTypeLike) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.6
 
 
@@ -188,3 +189,48 @@ def least_norm(A: Numbers, b: Numbers, tolerance: float | None = None) -> Number
     _, rows, columns = equilibrated(A if xp is np else jax.lax.stop_gradient(A))
     tolerance = rank_tolerance(A.dtype) if tolerance is None else tolerance
     return xp.linalg.pinv(A / rows[:, None] / columns[None], tolerance) @ (b / rows) / columns
+
+
+class RowBasis(NamedTuple):
+    """A = T Q with orthonormal rows of Q, for A (m, n). Its operations can be part of a program of scalars.
+
+    A row that is zero or depends linearly on the previous ones is omitted, because it would be divided by a rounding
+    error: its row of Q (m, n) and its column of T (m, m) are zero. `is_new` (m,): whether each row is used. Derivatives
+    are those of the used rows.
+    """
+
+    Q: Array
+    T: Array
+    is_new: Array
+
+    @classmethod
+    def of(cls, A: Array, redundant: float = 0.0) -> RowBasis:
+        """`redundant`: the largest part of a row, relative to the row, that is regarded as dependent."""
+        m = len(A)
+        # 1.8e-12 of a row; a Gram matrix would square it
+        threshold = max(redundant, float(jnp.finfo(A.dtype).eps) ** 0.75)
+        Q, T, is_new = jnp.zeros((0, A.shape[1]), A.dtype), [], []
+        for i in range(m):
+            rest, row = A[i], jnp.zeros(i, A.dtype)
+            for _ in range(2 if i else 0):  # Gram-Schmidt twice: after one pass, it is not orthogonal within rounding
+                along = Q @ rest
+                rest, row = rest - along @ Q, row + along
+            is_used = jax.lax.stop_gradient(jnp.max(jnp.abs(rest)) > threshold * jnp.max(jnp.abs(A[i])))
+            norm = jnp.sqrt(jnp.sum(jnp.where(is_used, rest, 1.0) ** 2))  # the derivative of a norm of zero is NaN
+            Q = jnp.concatenate([Q, jnp.where(is_used, rest / norm, 0.0)[None]])
+            T.append(jnp.concatenate([row, jnp.where(is_used, norm, 0.0)[None], jnp.zeros(m - i - 1, A.dtype)]))
+            is_new.append(is_used)
+        return cls(Q, jnp.stack(T), jnp.stack(is_new))
+
+    def solve(self, b: Array) -> tuple[Array, Array]:
+        """y of T y = b, for b (m,) or (m, k), and the part of b that omitted rows do not satisfy. Then w = Q^T y."""
+        y, missing = jnp.zeros((0, *b.shape[1:]), b.dtype), []
+        for i in range(len(b)):
+            remainder, is_used = b[i] - self.T[i, :i] @ y if i else b[i], self.is_new[i]
+            y = jnp.concatenate([y, jnp.where(is_used, remainder / jnp.where(is_used, self.T[i, i], 1.0), 0.0)[None]])
+            missing.append(jnp.where(is_used, 0.0, remainder))
+        return y, jnp.stack(missing)
+
+    def least_norm(self, b: Array) -> Array:
+        """The smallest solution w (n,) or (n, k) of A w = b, without the omitted rows."""
+        return (self.solve(b)[0].T @ self.Q).T

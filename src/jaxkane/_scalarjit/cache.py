@@ -49,7 +49,7 @@ class Cache:
         result = self.known(key)
         return self.keep(key, make(), owners) if result is MISSING else result
 
-    def known(self, key: Hashable, default: Any = MISSING) -> Any:
+    def known(self, key: Hashable, default: object = MISSING) -> Any:
         with self._lock:
             self._drop_ended()
             if key not in self._entries:
@@ -58,7 +58,7 @@ class Cache:
             self._entries[key] = result, references, next(_uses)  # as the last one
             return result
 
-    def keep(self, key: Hashable, result: Any, owners: Iterable[Any] = ()) -> Any:
+    def keep(self, key: Hashable, result: object, owners: Iterable[Any] = ()) -> Any:
         """Keep a result until one of its `owners` ceases to exist. The `id` of an owner may be part of the key, because
         another object can have this `id` only afterwards."""
         if self.programs:
@@ -105,7 +105,7 @@ class Cache:
         return [*dropped]  # the programs are freed outside of the lock
 
 
-def owners_of(x: Any) -> list[Any]:
+def owners_of(x: object) -> list[Any]:
     """The object itself, as the owner of a result. Empty if the object does not support weak references."""
     try:
         weakref.ref(x)

@@ -4,7 +4,7 @@ A key contains
 
 1. the structure, shapes and dtypes of the arguments, and their static values,
 2. the settings of JAX on which a trace depends: precision, promotion, checks for NaN,
-3. a digest of the values that the code in the arguments uses (`captured_values`; see `docs/caching.md`).
+3. a digest of the values that the code in the arguments uses (`CapturedValues`; see `docs/caching.md`).
 
 A check takes some microseconds. The digest is computed again only if a value has changed. If a value changes back, the
 earlier program is used again. Mutations during tracing do not invalidate the trace. Programs are kept in `Cache`,
@@ -29,8 +29,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .cache import Cache, owners_of
-from .captured_values import NUMBERS, CapturedValues, is_of_library
 from .compat import Tracer, filter_jit_uncached, is_under_way, settings, storable_checks
+from .digest import NUMBERS, CapturedValues, is_of_library
 
 _count = itertools.count()
 _forgotten = b"0"
@@ -44,7 +44,7 @@ class _Tracing(threading.local):
 _tracing = _Tracing()
 
 
-def _captured_by(root: Any) -> CapturedValues:
+def _captured_by(root: object) -> CapturedValues:
     values = _tracing.captured.get(id(root))
     if values is not None:
         return values
@@ -55,11 +55,11 @@ def _captured_by(root: Any) -> CapturedValues:
     return values
 
 
-def _stored(root: Any) -> CapturedValues | None:
+def _stored(root: object) -> CapturedValues | None:
     return _captured.known(id(root), (None, None))[0]
 
 
-def _store(root: Any, values: CapturedValues) -> None:
+def _store(root: object, values: CapturedValues) -> None:
     if not values.tracers:
         owners = owners_of(root)
         _captured.keep(id(root), (values, None if owners else root), owners)
@@ -68,7 +68,7 @@ def _store(root: Any, values: CapturedValues) -> None:
 _nothing_to_read: set[type] = {*NUMBERS, np.ndarray, np.dtype}
 
 
-def _roots(value: Any, roots: list[Any]) -> list[Any]:
+def _roots(value: object, roots: list[Any]) -> list[Any]:
     """Classes, functions and objects in a tree of arguments whose code, or contents, a program depends on."""
     kind = type(value)
     parts: Any = ()
@@ -184,7 +184,7 @@ class _Compiled:
     function refers to this object only by a weak reference, and has arrays as its only arguments.
     """
 
-    def __init__(self, f: Callable[..., Any], structure: Any, fixed: list[Callable[[], Any] | None]) -> None:
+    def __init__(self, f: Callable[..., Any], structure: PyTree, fixed: list[Callable[[], Any] | None]) -> None:
         self.f, self.structure, self.fixed = f, structure, fixed
         itself = weakref.ref(self)
 
@@ -200,7 +200,7 @@ class _Compiled:
         return trace_with_snapshot(self.f)(*args, **kwargs)
 
 
-def _static(x: Any) -> tuple[Hashable, Callable[[], Any], list[Any]]:
+def _static(x: object) -> tuple[Hashable, Callable[[], Any], list[Any]]:
     """For a static leaf of the arguments: its part of the key, a function that returns it, and its owners. Programs are
     freed with their owners."""
     if isinstance(x, types.MethodType) and owners_of(x.__self__):
@@ -211,7 +211,7 @@ def _static(x: Any) -> tuple[Hashable, Callable[[], Any], list[Any]]:
     return (type(x), x), lambda: x, []
 
 
-def _key_with_functions(args: Any) -> tuple[list[Any], Any, list[Any], Hashable, list[Any]]:
+def _key_with_functions(args: PyTree) -> tuple[list[Any], Any, list[Any], Hashable, list[Any]]:
     """The arrays of arguments that may contain functions, their structure, the static leaves (see `_static`; None for
     arrays), the key of their programs, and the owners of the key."""
     leaves, structure = jax.tree.flatten(args)
@@ -222,7 +222,7 @@ def _key_with_functions(args: Any) -> tuple[list[Any], Any, list[Any], Hashable,
     return arrays, structure, static, key, [owner for x in static if x for owner in x[2]]
 
 
-def kept(cache: Cache, args: Any, make: Callable[[], Any]) -> Any:
+def kept(cache: Cache, args: PyTree, make: Callable[[], Any]) -> Any:
     """A result that depends on the code and the types of `args`, but not on numbers; computed once and kept in
     `cache`."""
     *_, key, owners = _key_with_functions(args)

@@ -21,7 +21,9 @@ from typing import Any, NamedTuple, TypeAlias
 import equinox as eqx
 import jax
 import numpy as np
+import numpy.typing as npt
 from jax._src.xla_bridge import backends_are_initialized
+from jax.core import ShapedArray as ShapedArray
 from jax.core import Tracer as Tracer
 from jax.core import eval_context
 from jax.experimental.compilation_cache.compilation_cache import reset_cache as reset_cache
@@ -73,7 +75,7 @@ def is_literal(v: Variable) -> bool:
 
 
 def interpret(
-    program: Any,
+    program: ClosedJaxpr,
     inputs: Sequence[Any],
     rule: Callable[[Any, list[Any]], Iterable[Any]],
     constant: Callable[[Any, Any], Any] = lambda v, x: x,
@@ -148,26 +150,19 @@ def programs_in(equation: Equation) -> list[Any]:
     return [x if isinstance(x, ClosedJaxpr) else ClosedJaxpr(x, ()) for x in programs]
 
 
-def dependencies(program: Any) -> list[frozenset[int]]:
+def dependencies(program: ClosedJaxpr) -> list[frozenset[int]]:
     """For each output of a program, the indices of the inputs on which it depends."""
-    jaxpr = program.jaxpr
-    places = {v: frozenset([i]) for i, v in enumerate(jaxpr.invars)}
     none = frozenset[int]()
-
-    def read(v: Variable) -> frozenset[int]:
-        return none if is_literal(v) else places.get(v, none)
-
-    for equation in jaxpr.eqns:
-        places.update(dict.fromkeys(equation.outvars, none.union(*map(read, equation.invars))))
-    return [*map(read, jaxpr.outvars)]
+    inputs = [frozenset([i]) for i in range(len(program.in_avals))]
+    return interpret(program, inputs, lambda e, places: [none.union(*places)] * len(e.outvars), lambda v, x: none)
 
 
-def depends_on(program: Any, inputs: Iterable[int]) -> list[bool]:
+def depends_on(program: ClosedJaxpr, inputs: Iterable[int]) -> list[bool]:
     """Which outputs of a program depend on any of the inputs with these indices."""
     return [not places.isdisjoint(inputs) for places in dependencies(program)]
 
 
-def types_of(program: Any) -> tuple[list[Any], list[Any]]:
+def types_of(program: ClosedJaxpr) -> tuple[list[Any], list[Any]]:
     """Shapes and dtypes of a program's inputs and outputs. JAX 0.12 declares some types without either."""
     return [*program.in_avals], [*program.out_avals]
 
@@ -209,7 +204,7 @@ def new_primitive(
 
 
 def _partially_evaluated(
-    primitive: Any, separate_calls: Callable[..., Any], trace: Any, *inputs: Any, **params: Any
+    primitive: Primitive, separate_calls: Callable[..., Any], trace: Any, *inputs: Any, **params: Any
 ) -> Sequence[Any]:
     """The rule of JAX's partial evaluation, which computes known values at once and keeps the others for later.
 
@@ -240,12 +235,12 @@ def as_lowering(f: Callable[..., Any]) -> Callable[..., Any]:
     return mlir.lower_fun(f, multiple_results=True)
 
 
-def is_no_tangent(tangent: Any) -> bool:
+def is_no_tangent(tangent: object) -> bool:
     """Whether a tangent is JAX's symbolic zero, which is stronger than an array of zeros."""
     return type(tangent) is ad.Zero
 
 
-def no_tangent(x: Any) -> Any:
+def no_tangent(x: ShapedArray) -> Any:
     """JAX's symbolic zero tangent for an abstract value; booleans and integers have this tangent."""
     return ad.Zero(x.to_tangent_aval())
 
@@ -263,7 +258,7 @@ def concretely() -> contextlib.AbstractContextManager[Any]:
     return eval_context()
 
 
-def on_device(x: Any, dtype: Any = None) -> jax.Array:
+def on_device(x: npt.ArrayLike, dtype: npt.DTypeLike | None = None) -> jax.Array:
     """A NumPy array as an array of JAX. `jax.numpy.asarray` would compile a program for each shape (JAX 0.12)."""
     return jax.device_put(np.asarray(x, dtype))
 

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PyTree
 
 from .compat import ClosedJaxpr, Equation, Tracer, Variable, evaluated, is_literal
@@ -33,6 +34,9 @@ Component: TypeAlias = Any
 
 Numbers: TypeAlias = Any
 """An array of numbers of JAX or NumPy, also traced. These have the same operators, but no common type to declare."""
+
+ComponentsLike: TypeAlias = Sequence[Component] | np.ndarray | Array
+"""Several numbers: a sequence of components, or an array."""
 
 Bool: TypeAlias = Any
 """A bool, or an array of bools, also traced."""
@@ -110,7 +114,7 @@ def sub(a: Component, b: Component) -> Component:
 def mul(a: Component, b: Component) -> Component:
     for x, y in ((a, b), (b, a)):
         if isinstance(x, float):
-            if x == 0.0:
+            if x == 0.0:  # a term that does not exist: zero also if the other factor is NaN or infinite
                 return 0.0
             if x == 1.0:
                 return y
@@ -200,12 +204,12 @@ def _written_out(
 
 
 @jax.jit
-def _solved_by_lapack(matrix, rights):
+def _solved_by_lapack(matrix: Float[Array, "n n"], rights: Float[Array, "n k"]):
     return jnp.linalg.solve(matrix, rights)
 
 
 @jax.jit
-def _det_by_lapack(matrix):
+def _det_by_lapack(matrix: Float[Array, "n n"]):
     return jnp.linalg.det(matrix)
 
 
@@ -215,9 +219,12 @@ Block = tuple[list[int], list[int]]
 def _blocks(A: Rows) -> list[Block] | None:
     """Rows and columns of diagonal blocks, if rows and columns of A can be ordered so that all entries above the blocks
     are exact zeros. None if a block is too large to be written out, or if the zeros of A make it singular."""
+    from scipy.sparse import csgraph, csr_array  # here, because the import of the library must not load SciPy
+
     reads = np.array([[not is_zero(a) for a in row] for row in A])
-    column_of = _matched(reads)
-    if column_of is None:
+    # A different column with a nonzero entry for each row.
+    column_of = csgraph.maximum_bipartite_matching(csr_array(reads), perm_type="column")
+    if -1 in column_of:
         return None
     # Row i depends on row j if it uses the unknown of j. Rows that depend on each other form one block.
     follows = reads[:, column_of] | np.eye(len(A), dtype=bool)
@@ -228,24 +235,6 @@ def _blocks(A: Rows) -> list[Block] | None:
     if max(map(len, order)) > ELIMINATE_UP_TO:
         return None
     return [([int(i) for i in rows], sorted(int(column_of[i]) for i in rows)) for rows in order]
-
-
-def _matched(reads: np.ndarray) -> list[int] | None:
-    """A different column with a nonzero entry for each row (a matching); None if this is not possible."""
-    owner: dict[int, int] = {}
-
-    def find(row: int, tried: set[int]) -> bool:
-        for column in map(int, np.flatnonzero(reads[row])):
-            if column not in tried:
-                tried.add(column)
-                if column not in owner or find(owner[column], tried):
-                    owner[column] = row
-                    return True
-        return False
-
-    if not all(find(row, set()) for row in range(len(reads))):
-        return None
-    return sorted(owner, key=owner.__getitem__)
 
 
 def _solutions_and_det(
@@ -297,7 +286,7 @@ def _eliminated(A: Rows, rights: Sequence[Sequence[Component]]) -> tuple[list[tu
     return solutions, det
 
 
-def _chosen(condition: Any, a: Component, b: Component) -> Component:
+def _chosen(condition: Bool, a: Component, b: Component) -> Component:
     """`a` if the condition is true, else `b`."""
     if isinstance(condition, (bool, np.bool_)):
         return a if condition else b
@@ -320,7 +309,7 @@ def is_written_out(n: int) -> bool:
     return n <= _UNROLL_UP_TO
 
 
-def solve_positive_array(M, b):
+def solve_positive_array(M: Float[Array, "n n"], b: Float[Array, " n"]):
     """The solution x (n,) of M x = b for a symmetric positive definite array M (n, n), by LAPACK. NaN if M is singular
     within rounding."""
     factor = jsl.cho_factor(M)
@@ -328,7 +317,7 @@ def solve_positive_array(M, b):
     return jnp.where(is_regular, jsl.cho_solve(factor, b), jnp.nan)
 
 
-def rounding_of_pivots(dtype: Any) -> float:
+def rounding_of_pivots(dtype: DTypeLike) -> float:
     """Pivots of L D L^T are regarded as zero if they are below this factor times the diagonal entry of M. The criterion
     does not depend on units or on the size of masses."""
     return 100 * float(jnp.finfo(dtype).eps)
@@ -383,6 +372,7 @@ def stack(rows: Rows):
     flat = [a for row in rows for a in row]
     if not flat:
         return jnp.zeros((len(rows), width))
+    # Exact numbers do not count: as arrays of float64 they would promote a float32 model.
     dtype = jnp.result_type(*([a for a in flat if not is_exact(a)] or [float]))
     return jnp.stack([jnp.asarray(a, dtype=dtype) for a in flat]).reshape(len(rows), width)
 

@@ -13,7 +13,8 @@ import jax
 import numpy as np
 
 from .._common.files import remove_broken_programs
-from .backends import native as kernels
+from .._common.lookup import whole_number
+from . import native as kernels
 from .compat import backends_are_initialized, reset_cache
 
 
@@ -125,10 +126,9 @@ def warn_of_float32() -> None:
 
 
 def _split_cpu(devices: int) -> None:
-    if not isinstance(devices, (int, np.integer)) or isinstance(devices, bool) or devices < 1:
-        raise ValueError(f"configure: `devices` must be a number of CPU devices, 1 or more; got {devices!r}.")
+    devices = whole_number(devices, 1, "configure: `devices`")
     if not backends_are_initialized():
-        jax.config.update("jax_num_cpu_devices", int(devices))
+        jax.config.update("jax_num_cpu_devices", devices)
         return
     there = len(jax.local_devices(backend="cpu"))
     if there != devices:

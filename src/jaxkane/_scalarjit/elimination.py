@@ -20,12 +20,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from .backends.native import Scalars
 from .cache_key import CacheKey, version_of
-from .compat import ClosedJaxpr, settings, types_of
+from .compat import ClosedJaxpr, ShapedArray, settings, types_of
 from .components import Numbers, rounding_of_pivots
 from .graph import Graph, NotScalarError, graph_of
 from .jaxpr import Solved, cse, is_fusable, specs_of
+from .native import Scalars
 from .program import ArgumentRoles, Derived, Program
 from .scalar_function import ScalarFunction, jaxpr_at
 
@@ -48,7 +48,7 @@ class LinearSolution(ScalarFunction):
         super().__init__(f)
         self.equations = equations
 
-    def _solved(self, key: CacheKey, x: Any) -> Solved | None:
+    def _solved(self, key: CacheKey, x: ShapedArray) -> Solved | None:
         args = jax.tree.unflatten(key.structure, specs_of(key.types))
         if (version_of(*args), settings()) != (key.version, key.settings):
             return None  # values that the code reads have changed: these are not the equations that were solved

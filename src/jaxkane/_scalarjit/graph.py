@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterable, Sequence, Set
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from jax.lax import RoundingMethod
 
-from .compat import ClosedJaxpr, Equation, interpret, types_of
+from .compat import ClosedJaxpr, Equation, Variable, interpret, types_of
 
 OPERATORS: dict[str, Callable[..., Any]] = {
     "add": operator.add,
@@ -77,7 +78,7 @@ class Graph:
             self.nodes.append(node)
         return self._numbers[node]
 
-    def constant(self, value: Any, dtype: str) -> int:
+    def constant(self, value: float | bool, dtype: str) -> int:
         # by its digits, because -0.0 == 0.0 and nan != nan
         return self.add("constant", (float(value).hex() if dtype != "bool" else bool(value),), dtype)
 
@@ -148,7 +149,7 @@ def unrolled(program: ClosedJaxpr, inputs: Sequence[np.ndarray], graph: Graph) -
     return interpret(program, inputs, rule, functools.partial(as_constants, graph=graph))
 
 
-def as_constants(v: Any, x: Any, graph: Graph) -> np.ndarray:
+def as_constants(v: Variable, x: npt.ArrayLike, graph: Graph) -> np.ndarray:
     """The value x of the variable or literal v. A literal may be a Python float in a program of float32."""
     x = np.asarray(x)
     x = x.astype(v.aval.dtype) if x.dtype.kind == "f" else x
@@ -233,7 +234,7 @@ def _operation(equation: Equation, xs: list[np.ndarray], graph: Graph) -> Sequen
     def each(operation: str, *ys: np.ndarray, dtype: str = dtype) -> np.ndarray:
         return _each(lambda *numbers: graph.apply(operation, numbers, dtype), *ys)
 
-    def number(value: Any, dtype: str = dtype) -> np.ndarray:
+    def number(value: float | bool, dtype: str = dtype) -> np.ndarray:
         return np.array(graph.constant(value, dtype), np.int64)
 
     if name == "convert_element_type" and dtype in DTYPES and x_dtype not in DTYPES:
@@ -277,7 +278,9 @@ def _broadcast(x: np.ndarray, dimensions: Sequence[int], shape: tuple[int, ...])
     return np.broadcast_to(x.reshape([sizes.get(d, 1) for d in range(len(shape))]), shape)
 
 
-def _padded(x: np.ndarray, value: np.ndarray, padding: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _padded(
+    x: np.ndarray, value: np.ndarray, padding: Sequence[tuple[int, int, int]], shape: tuple[int, ...]
+) -> np.ndarray:
     out = np.full(shape, value, dtype=x.dtype)
     places = [low + (1 + step) * np.arange(n) for n, (low, _, step) in zip(x.shape, padding)]
     kept = [(0 <= at) & (at < n) for at, n in zip(places, shape)]  # negative padding removes elements

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jaxtyping import Array, PyTree
 
 from .cache import Cache
@@ -18,6 +19,7 @@ from .compat import (
     ClosedJaxpr,
     Equation,
     Jaxpr,
+    ShapedArray,
     Variable,
     dce_jaxpr,
     interpret,
@@ -120,7 +122,7 @@ class _UniqueEquations:
                 self._known[key] = outputs
         return self._known[key]
 
-    def constant(self, variable: Variable, value: Any) -> Any:
+    def constant(self, variable: Variable, value: npt.ArrayLike) -> Any:
         if is_literal(variable):
             return variable
         key = ("const", id(value))
@@ -195,7 +197,7 @@ def specs_of(avals: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
     return [jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in avals]
 
 
-def is_inexact(aval: Any) -> bool:
+def is_inexact(aval: Array | ShapedArray) -> bool:
     """Whether numbers of this kind can be differentiated."""
     return jnp.issubdtype(aval.dtype, jnp.inexact)
 
@@ -282,7 +284,7 @@ def tangent_program(
     jaxpr: Any = program.jaxpr
     unique, tangents = _UniqueEquations(), {jaxpr.invars[i]: new_variable(jaxpr.invars[i]) for i in differentiated}
 
-    def constant(v: Variable, x: Any) -> tuple[Any, None]:
+    def constant(v: Variable, x: npt.ArrayLike) -> tuple[Any, None]:
         return unique.constant(v, x), None
 
     def rule(equation: Equation, pairs: list[Any]) -> Sequence[Any]:
@@ -368,25 +370,22 @@ def jacobian(
     ]
 
 
-def _outputs(equation: Equation, values: dict[Any, np.ndarray], graph: Any) -> list[np.ndarray]:
+def _outputs(equation: Equation, values: dict[Any, np.ndarray], graph: Graph) -> list[np.ndarray]:
     return applied(equation, [_read(v, values, graph) for v in equation.invars], graph)
 
 
-def _read(v: Variable, values: dict[Any, np.ndarray], graph: Any) -> np.ndarray:
+def _read(v: Variable, values: dict[Any, np.ndarray], graph: Graph) -> np.ndarray:
     return as_constants(v, v.val, graph) if is_literal(v) else values[v]
 
 
 NOTHING = -1  # instead of a node number: the derivative is zero
 
 
-class _SparseGraph:
-    """A graph for operations on derivatives, of which some are `NOTHING`."""
+class _SparseGraph(Graph):
+    """A graph for operations on derivatives, of which some are `NOTHING`. It adds its nodes to another graph."""
 
     def __init__(self, graph: Graph):
-        self.graph = graph
-
-    def constant(self, value: Any, dtype: str) -> int:
-        return self.graph.constant(value, dtype)
+        self.nodes, self._numbers = graph.nodes, graph._numbers
 
     def apply(self, operation: str, operands: tuple[int, ...], dtype: str) -> int:
         if NOTHING in operands:
@@ -394,11 +393,11 @@ class _SparseGraph:
                 case ("add", (a, b)):
                     return b if a == NOTHING else a
                 case ("sub", (a, b)):
-                    return a if b == NOTHING else self.graph.apply("neg", (b,), dtype)
+                    return a if b == NOTHING else super().apply("neg", (b,), dtype)
                 case (("mul" | "neg" | "convert"), _) | ("div", (-1, _)) | ("select", (_, -1, -1)):
                     return NOTHING
-            operands = tuple(self.graph.constant(0.0, dtype) if i == NOTHING else i for i in operands)
-        return self.graph.apply(operation, operands, dtype)
+            operands = tuple(self.constant(0.0, dtype) if i == NOTHING else i for i in operands)
+        return super().apply(operation, operands, dtype)
 
 
 _PIECEWISE_LINEAR = frozenset("add sub neg select max min abs convert rem".split())

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, PyTree
 
+from .compat import Tracer
+
 
 def nan_where(missing: Bool[Array, " *leading"], values: PyTree, origin: PyTree) -> PyTree:
     """`values`, with NaN where they are missing; derivatives of any order are NaN there too.
@@ -55,8 +57,8 @@ def parts_of(values: PyTree) -> list[Array]:
 
 
 def constant(values: PyTree) -> PyTree:
-    """The same arrays without derivatives."""
-    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, values)
+    """The same values without derivatives. Values of arrays that are differentiated without `jit` become concrete."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x, values)
 
 
 def derivative_free_where_not_finite(f: Callable[..., Any], *arguments: Any) -> PyTree:

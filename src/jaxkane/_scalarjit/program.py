@@ -3,7 +3,7 @@
 A right-hand side written in scalars is thousands of tiny operations. XLA splits them into many kernels and repeats
 operations in each kernel: a few times for the value, hundreds of times for derivatives. Here the function is one
 primitive of JAX (`program_p`), whose derivatives, transposes and batches are also programs of this kind. Each is traced
-once and compiled as one function, by LLVM (`backends.native`) or by XLA (`backends.xla`). Measured with XLA on the
+once and compiled as one function, by LLVM (`native`) or by XLA (`xla`). Measured with XLA on the
 nonlinear bicycle (float64, one thread, jax 0.10.2): 8.6 -> 0.9 us for an evaluation inside a loop, 3000 -> 4.5 us for
 its directional derivative, 2450 -> 17 us for its reverse derivative.
 """
@@ -19,11 +19,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, PyTree
 
-from .backends import native
-from .backends.native import BatchMask, Scalars
-from .backends.numpy import NumPyProgram
-from .backends.xla import Windows, as_one_function, chunks_of, one_chunk_at_a_time, pays_as_windows
+from . import native
 from .compat import (
     ClosedJaxpr,
     as_lowering,
@@ -34,6 +32,7 @@ from .compat import (
     jaxpr_as_fun,
     new_primitive,
     no_tangent,
+    types_of,
 )
 from .graph import NotScalarError
 from .jaxpr import (
@@ -49,6 +48,9 @@ from .jaxpr import (
     tangent_program,
     transposed_program,
 )
+from .native import BatchMask, Scalars, Sizes
+from .source import NumPyProgram
+from .xla import Windows, as_one_function, chunks_of, one_chunk_at_a_time, pays_as_windows
 
 _FEW = 8  # numbers: for XLA, this many separate arguments cost as much as making an array of them
 
@@ -109,7 +111,7 @@ class Program:
         roles: ArgumentRoles = ArgumentRoles(),
         *,
         label: str = "A function",
-        structure: Any = None,
+        structure: PyTree = None,
         compile_cheaply: bool = False,
         is_reduced: bool = False,
         derived: Derived = Derived(),
@@ -124,7 +126,7 @@ class Program:
         if any(map(is_solution, self.source.jaxpr.eqns)):
             self.program = cse(self.source)
         self.evaluate = jaxpr_as_fun(self.program)
-        self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
+        self.in_avals, self.out_avals = types_of(self.program)
         self._solved = solved
         self.dependencies = dependencies(self.program)
         self.is_fusable = is_fusable(self.program.jaxpr)
@@ -279,16 +281,16 @@ def _if_scalar(kind: Callable[[ClosedJaxpr], Any], program: ClosedJaxpr) -> Any:
 # outputs have those of `Program.out_batch_mask`.
 
 
-def _abstract(*_, program, sizes, batch_mask):
+def _abstract(*_, program: Program, sizes: Sizes, batch_mask: BatchMask):
     masks = zip(program.out_avals, program.out_batch_mask(batch_mask), strict=True)
     return [a.update(shape=(*_present(sizes, mask), *a.shape)) for a, mask in masks]
 
 
-def _present(sizes, mask):
+def _present(sizes: Sizes, mask: tuple[bool, ...]):
     return tuple(n for n, is_there in zip(sizes, mask, strict=True) if is_there)
 
 
-def _separate_calls(*, program, sizes, batch_mask):
+def _separate_calls(*, program: Program, sizes: Sizes, batch_mask: BatchMask):
     """The calls of which a call consists: for each, the number of its inputs, and its parameters. A program of values
     and tangents consists of the program of the values and the one of the tangents."""
     whole = {"program": program, "sizes": sizes, "batch_mask": batch_mask}
@@ -302,7 +304,7 @@ def _separate_calls(*, program, sizes, batch_mask):
     return [(n, of_values), (len(batch_mask), whole | {"program": values.tangent(differentiated)})]
 
 
-def _jvp(primals, tangents, *, program, sizes, batch_mask):
+def _jvp(primals: Sequence[Array], tangents: Sequence[Array], *, program: Program, sizes: Sizes, batch_mask: BatchMask):
     # The tangent of an argument that is not read has no effect. Without it, fewer different derivatives are compiled.
     differentiated = tuple(
         reads and is_inexact(x) and not is_no_tangent(dx)
@@ -324,13 +326,13 @@ def _jvp(primals, tangents, *, program, sizes, batch_mask):
     return outputs, [next(each) if has else no_tangent(aval) for has, aval in zip(has_tangent, shapes, strict=True)]
 
 
-def _transpose(cotangents, *args, program, sizes, batch_mask):
+def _transpose(cotangents: Sequence[Array], *args, program: Program, sizes: Sizes, batch_mask: BatchMask):
     asked = linear = tuple(map(is_undefined_primal, args))
     if all(i in program.roles.linear for i, is_asked in enumerate(asked) if is_asked):
         # Use one transpose, whichever tangents are constant: a loop first needs some of the cotangents, later all.
         linear = tuple(i in program.roles.linear for i in range(len(args)))
 
-    def at_one_place(ct, mask):
+    def at_one_place(ct: Array, mask: tuple[bool, ...]):
         for d, (n, is_there) in enumerate(zip(sizes, mask, strict=True)):
             if not is_there:  # the cotangent of a value that all members share counts once
                 ct = jnp.expand_dims(ct, d)
@@ -348,16 +350,16 @@ def _transpose(cotangents, *args, program, sizes, batch_mask):
         )
     )
 
-    def over_missing(ct, mask):
+    def over_missing(ct: Array, mask: tuple[bool, ...]):
         axes = tuple(d for d, is_there in enumerate(mask) if not is_there)
         return ct.sum(axes) if axes else ct
 
-    cts = [next(results) if is_linear else None for is_linear in linear]
+    cts: list[Any] = [next(results) if is_linear else None for is_linear in linear]
     each = zip(cts, batch_mask, asked, strict=True)
     return [over_missing(ct, mask) if is_asked else None for ct, mask, is_asked in each]
 
 
-def _batch(args, axes, *, program, sizes, batch_mask):
+def _batch(args: Sequence[Array], axes: Sequence[int | None], *, program: Program, sizes: Sizes, batch_mask: BatchMask):
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
     args = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True)]
     is_batched, tangents = tuple(axis is not None for axis in axes), program.roles.tangents
@@ -374,17 +376,17 @@ def _batch(args, axes, *, program, sizes, batch_mask):
     return outputs, [0 if mask[0] else None for mask in program.out_batch_mask(batch_mask)]
 
 
-def _inlined(*args, program, sizes, batch_mask):
+def _inlined(*args, program: Program, sizes: Sizes, batch_mask: BatchMask):
     return (program.batched(sizes, batch_mask) if sizes else program).evaluate(*args)
 
 
-def _on_gpu(*args, program, sizes, batch_mask):
+def _on_gpu(*args, program: Program, sizes: Sizes, batch_mask: BatchMask):
     if program.is_fusable and 0 not in sizes and program.windows and not program.windows.is_long:
         return program.windows(args, sizes, batch_mask, program.out_batch_mask(batch_mask))
     return _inlined(*args, program=program, sizes=sizes, batch_mask=batch_mask)
 
 
-def _by_xla(*args, program, sizes, batch_mask):
+def _by_xla(*args, program: Program, sizes: Sizes, batch_mask: BatchMask):
     out_batch_mask = program.out_batch_mask(batch_mask)
     if in_chunks := chunks_of(sizes):
         bind = functools.partial(program_p.bind, program=program, sizes=in_chunks, batch_mask=batch_mask)
@@ -399,8 +401,8 @@ def _by_xla(*args, program, sizes, batch_mask):
     return as_one_function(program.program, args)
 
 
-def _lower_on_cpu(context, *args, program, sizes, batch_mask):
-    target = program.target(sizes, batch_mask)
+def _lower_on_cpu(context: object, *args, program: Program, sizes: Sizes, batch_mask: BatchMask):
+    target: Any = program.target(sizes, batch_mask)
 
     def by_kernel(*args, **_):
         # The kernel reads its arguments in this order: `Program.target` passes the same groups.

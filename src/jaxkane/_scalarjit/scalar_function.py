@@ -13,9 +13,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
-from .backends import native
+from . import native
 from .cache import Cache
 from .cache_key import CacheKey, explain_leaked_tracer, key_of, trace_with_snapshot
 from .compat import ClosedJaxpr, Tracer
@@ -39,10 +40,10 @@ class Packed(eqx.Module):
     structure: Any = eqx.field(static=True)
 
     @classmethod
-    def of(cls, tree: PyTree, dtype: Any) -> PyTree:
+    def of(cls, tree: PyTree, dtype: DTypeLike) -> PyTree:
         """The packed tree, or the tree itself if it has no such scalars."""
 
-        def is_scalar(x: Any) -> bool:
+        def is_scalar(x: PyTree) -> bool:
             return eqx.is_array(x) and x.shape == () and x.dtype == dtype
 
         numbers, others = eqx.partition(tree, is_scalar)
@@ -50,7 +51,7 @@ class Packed(eqx.Module):
         return cls(jnp.stack(leaves), others, structure) if leaves else tree
 
 
-def tree_of(x: Any) -> PyTree:
+def tree_of(x: PyTree) -> PyTree:
     """The tree of a `Packed`; any other value unchanged."""
     if not isinstance(x, Packed):
         return x
@@ -183,7 +184,7 @@ class ScalarFunction:
 
         return jax.device_get(jax.vmap(slope, in_axes=-1, out_axes=-1)(*given))
 
-    def replay(self, quantity: str, arrays: PyTree, components: Any, memory: dict[Any, Any]) -> PyTree:
+    def replay(self, quantity: str, arrays: PyTree, components: PyTree, memory: dict[Any, Any]) -> PyTree:
         """One of the named quantities that `f(arrays, components)` returns, a dict of trees of components. Exact zeros
         are preserved.
 
@@ -238,7 +239,7 @@ def _jaxpr_of(f: Callable[..., Any], specs: Sequence[Any]) -> tuple[ClosedJaxpr,
     return program, out
 
 
-def _label(system: Any) -> str:
+def _label(system: object) -> str:
     if isinstance(system, Packed):
         system = system.others
     return "A function" if hasattr(system, "dtype") else type(system).__name__

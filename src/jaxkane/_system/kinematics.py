@@ -38,7 +38,7 @@ from .._scalarjit.components import (
     stack,
 )
 from ..rotations import Matrix
-from .prints import text_of
+from .parameters import text_of
 
 
 class AuxiliarySpeed(NamedTuple):
@@ -202,7 +202,7 @@ class Vector:
         return self if abs(length - 1.0) < 1e-15 else self / length
 
 
-def check_vector(value: Any, verb: str) -> Vector:
+def check_vector(value: object, verb: str) -> Vector:
     return checked(value, Vector, f"{verb} needs a Vector such as 3.0 * N.x")
 
 
@@ -386,7 +386,7 @@ class Frame:
         return self._oriented(rotations.euler_parameters_matrix(e), ZERO3, name)
 
     def rotate_by(
-        self, orientation: Callable[..., Any], t: Component, q: Numbers, q_dot: Any, name: str | None = None
+        self, orientation: Callable[..., Any], t: Component, q: Numbers, q_dot: PyTree, name: str | None = None
     ) -> Frame:
         """A frame whose orientation is a function. Its angular velocity is computed by differentiation.
 
@@ -420,9 +420,9 @@ class Frame:
         return stack([Vector(other, unit).components_in(self) for unit in rotations.IDENTITY]).T
 
 
-def _value_and_rate(function, t, q, q_dot):
+def _value_and_rate(function: Callable[[Component, PyTree], Array], t: Component, q: PyTree, q_dot: PyTree):
 
-    def as_floats(tree: Any) -> PyTree:
+    def as_floats(tree: PyTree) -> PyTree:
         tree = jnp.asarray(tree) if hasattr(tree, "__jax_array__") else tree
         return jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(float, x)), tree)
 
@@ -516,7 +516,7 @@ class Point:
         position: Callable[..., Any],
         t: Component,
         q: Numbers,
-        q_dot: Any,
+        q_dot: PyTree,
         frame: Frame | None = None,
         name: str | None = None,
     ) -> Point:

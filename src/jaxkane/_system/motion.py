@@ -5,15 +5,22 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeAlias
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
-from .._common.lookup import checked, not_there, refuse_if
+from .._common.lookup import Kind, checked, not_there, refuse_if
 from .._scalarjit.components import Component, Triple, add, component, dot, is_zero, mul, sub
 from .kinematics import Frame, Point, Vector
-from .prints import concrete_numbers, text_of, wrapped
+from .parameters import concrete_numbers, text_of, wrapped
+
+Inertia: TypeAlias = Component | Sequence[Component] | Sequence[Sequence[Component]] | Array
+"""Three principal moments, a matrix (3, 3), or 0.0."""
+
+Loads: TypeAlias = "Load | Iterable[Loads]"
+Residuals: TypeAlias = "Component | Vector | Iterable[Residuals]"
 
 UNNAMED = "body"  # the default name of bodies
 
@@ -45,7 +52,7 @@ class Body:
     def __init__(
         self,
         mass: Component,
-        inertia: Any,
+        inertia: Inertia,
         center: Point,
         frame: Frame | None = None,
         angular_velocity: Vector | None = None,
@@ -113,7 +120,7 @@ def point_of(part: Point | Body) -> Point:
     return checked(part.center if isinstance(part, Body) else part, Point, "Pass a Point or a Body")
 
 
-def _inertia(value: Any, name: str) -> tuple[Triple, Triple, Triple]:
+def _inertia(value: Inertia, name: str) -> tuple[Triple, Triple, Triple]:
     if isinstance(value, str) or value is None:
         raise TypeError(f"{name}: the inertia must be three principal moments or a (3, 3) matrix, got {value!r}.")
     rows: Any = (0.0, 0.0, 0.0) if isinstance(value, (int, float)) and value == 0 else value
@@ -203,7 +210,7 @@ class Torque:
 Load = Force | Torque
 
 
-def flatten_loads(loads: Any, method: str = "`loads`") -> tuple[Load, ...]:
+def flatten_loads(loads: Loads, method: str = "`loads`") -> tuple[Load, ...]:
     """Flatten nested tuples and lists of loads."""
     if isinstance(loads, (Force, Torque)):
         return (loads,)
@@ -232,7 +239,7 @@ class GroupedResiduals(list[Component]):
         super().__init__(x for group in self.groups for x in group.components)
 
 
-def residual_groups(residuals: Any, label: str) -> Iterator[SomeComponents]:
+def residual_groups(residuals: Residuals, label: str) -> Iterator[SomeComponents]:
     """Flatten residuals: numbers, arrays, Vectors (three components each), and nested tuples and lists of these."""
     if isinstance(residuals, GroupedResiduals):
         yield from residuals.groups
@@ -251,7 +258,7 @@ def residual_groups(residuals: Any, label: str) -> Iterator[SomeComponents]:
             raise TypeError(f"{label} must be a list of numbers and Vectors, got {residuals!r}.{hint}") from None
 
 
-def flatten_residuals(residuals: Any, label: str) -> tuple[Component, ...]:
+def flatten_residuals(residuals: Residuals, label: str) -> tuple[Component, ...]:
     """The residuals of all groups in one list."""
     return tuple(x for group in residual_groups(residuals, label) for x in group.components)
 
@@ -375,7 +382,7 @@ class Motion:
         return self._named[name]
 
 
-def _as_tuple(values: Any, one: Any) -> tuple[Any, ...]:
+def _as_tuple(values: Iterable[Any] | Any, one: Kind) -> tuple[Any, ...]:
     return (values,) if isinstance(values, one) else tuple(values)
 
 

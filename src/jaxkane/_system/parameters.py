@@ -1,4 +1,5 @@
-"""Physical parameters of systems: float arrays in SI units and radians."""
+"""Physical parameters of systems: float arrays in SI units and radians; and the text of public objects, with numbers by
+name and units. Batched and traced values print their shapes."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import dataclasses
 import functools
 import math
 import operator
+import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -13,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from .._common.lookup import checked, refuse_if
 from .._scalarjit.compat import Tracer
@@ -20,7 +23,7 @@ from .._scalarjit.components import Numbers
 
 
 def parameter(
-    default: Any = dataclasses.MISSING,
+    default: Numbers = dataclasses.MISSING,
     *,
     positive: bool = False,
     within: tuple[float, float] = (-math.inf, math.inf),
@@ -52,7 +55,7 @@ def parameter(
     return eqx.field(converter=to_float, metadata=metadata, default_factory=lambda: default)
 
 
-def learned(default: Any = dataclasses.MISSING) -> Any:
+def learned(default: object = dataclasses.MISSING) -> Any:
     """Declare a function with parameters, such as a small neural network, as a field of a `System`.
 
         friction: Any = jk.learned(eqx.nn.MLP("scalar", "scalar", 8, 1, jnp.tanh, key=jax.random.key(0)))
@@ -76,13 +79,13 @@ class Learned(eqx.Module):
     arrays: Any
     rest: Any = eqx.field(static=True)
 
-    def __init__(self, function: Any):
+    def __init__(self, function: object):
         if isinstance(function, Learned):
             self.arrays, self.rest = function.arrays, function.rest
             return
         checked(function, Callable, "jk.learned() needs a function with parameters, such as an equinox module")
         arrays, rest = eqx.partition(function, eqx.is_array_like)
-        leaves, structure = jax.tree.flatten(rest)
+        leaves, structure = jax.tree.flatten(rest)  # static fields are compared and hashed, and a tree has no hash
         # It may have been created in float32, before `jk.configure()`.
         floats, others = eqx.partition(
             jax.tree.map(to_float, arrays), lambda x: jnp.isrealobj(x) and eqx.is_inexact_array(x)
@@ -122,7 +125,7 @@ class ParameterInfo:
         """Whether some finite values are rejected."""
         return self.positive or self.within != (-math.inf, math.inf)
 
-    def allows(self, x: Any) -> Numbers:
+    def allows(self, x: Numbers) -> Numbers:
         """Which values of an array are allowed. Values that are not finite are not allowed."""
         lower, upper = self.within
         conditions = [x > 0] if self.positive else []
@@ -151,7 +154,7 @@ def names_of_leaf(path: tuple[Any, ...]) -> tuple[str, ...]:
     return tuple(leaf_name(path[:n]) for n in range(1, len(path) + 1))
 
 
-def _steps(part: Any, path: tuple[Any, ...]) -> Iterator[tuple[Any, ParameterInfo]]:
+def _steps(part: PyTree, path: tuple[Any, ...]) -> Iterator[tuple[Any, ParameterInfo]]:
     """The objects along the path to a leaf, and the declaration of the field that contains it."""
     info = ANY
     for key in path:
@@ -166,24 +169,24 @@ def _steps(part: Any, path: tuple[Any, ...]) -> Iterator[tuple[Any, ParameterInf
         yield part, info
 
 
-def declared(system: Any, path: tuple[Any, ...]) -> ParameterInfo:
+def declared(system: PyTree, path: tuple[Any, ...]) -> ParameterInfo:
     """The declaration of the field that contains this leaf."""
     return [ANY, *(info for _, info in _steps(system, path))][-1]
 
 
-def learned_part(system: Any, path: tuple[Any, ...]) -> str:
+def learned_part(system: PyTree, path: tuple[Any, ...]) -> str:
     """The name of the learned function that contains this leaf, or ""."""
     lengths = [n for n, (part, _) in enumerate(_steps(system, path), 1) if isinstance(part, Learned)]
     return leaf_name(path[: lengths[0]]) if lengths else ""
 
 
-def parameters_in(system: Any) -> list[tuple[str, Any, ParameterInfo]]:
+def parameters_in(system: PyTree) -> list[tuple[str, Any, ParameterInfo]]:
     """Name, value and declaration of each parameter, including those of parts. Omits parameters that are None."""
     leaves = [(path, x, declared(system, path)) for path, x in jax.tree_util.tree_leaves_with_path(system)]
     return [(leaf_name(path), x, info) for path, x, info in leaves if info is not ANY]
 
 
-def in_batches(system: Any) -> list[str]:
+def in_batches(system: PyTree) -> list[str]:
     """Names of the parameters of a system, or of a part, that have more leading axes than declared."""
     return [
         leaf_name(path)
@@ -192,14 +195,14 @@ def in_batches(system: Any) -> list[str]:
     ]
 
 
-def with_parameters(system: Any, values: Mapping[str, Any]) -> Any:
+def with_parameters(system: PyTree, values: Mapping[str, Any]) -> Any:
     """The system with other values of some parameters, by the names of `parameters_in`. Every part is constructed and
     checked again."""
     paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(system)] if values else []
     return _replaced(system, {path: values[name] for path in paths if (name := leaf_name(path)) in values})
 
 
-def _replaced(part: Any, values: Mapping[tuple[Any, ...], Any]) -> Any:
+def _replaced(part: PyTree, values: Mapping[tuple[Any, ...], Any]) -> Any:
     if not values or () in values:
         return values.get((), part)
     inner: dict[Any, dict[tuple[Any, ...], Any]] = {}
@@ -215,7 +218,7 @@ def _replaced(part: Any, values: Mapping[tuple[Any, ...], Any]) -> Any:
     return kind(items)
 
 
-def to_float(value: Any) -> Numbers:
+def to_float(value: PyTree) -> Numbers:
     # Keep values that are not numbers. `System.__check_init__` raises an exception with their name.
     if isinstance(value, np.ma.MaskedArray):
         refuse_if(np.ma.is_masked(value), "Some values are masked. Fill or remove them.")
@@ -255,7 +258,7 @@ def check_fields(system: eqx.Module) -> None:
             )
 
 
-def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:
+def check_parameter(label: str, value: object, info: ParameterInfo) -> None:
     """Raise an exception for values that are not finite floats. Batches are judged by the status of their members."""
     if isinstance(value, Tracer):
         return
@@ -291,3 +294,84 @@ _LIKELY = {
     "s": " In milliseconds?",
 }
 """For each unit, the probable mistake if a number is too large."""
+
+
+_WIDTH = 100  # of a line
+_MOST_NUMBERS = 100  # of an array; a larger one prints its shape
+_TIE = "\N{NO-BREAK SPACE}"  # lines are not broken between a number and its unit
+
+
+def concrete_numbers(value: object) -> np.ndarray | None:
+    """The numbers of an array, or None for a traced or deleted one, and for other objects."""
+    if not isinstance(value, (jax.Array, np.ndarray, np.number, bool, int, float, complex)):
+        return None
+    try:
+        return np.asarray(value)
+    except (TypeError, RuntimeError):  # traced; deleted, or on the devices of other processes
+        return None
+
+
+def text_of(value: object, unit: str = "", ndim: int | None = None) -> str:
+    """A value as text, such as "0.3 rad" and "[1, 2] kg", with spaces at which `wrapped` does not break a line.
+
+    **Arguments:**
+
+    - `value`: a number, an array, a module, a container of these, or any other object.
+    - `unit`: its unit.
+    - `ndim`: the declared number of axes. An array with more axes is a batch.
+    """
+    numbers = concrete_numbers(value)
+    if numbers is not None:
+        is_batch = ndim is not None and numbers.ndim > ndim
+        if is_batch or numbers.size > _MOST_NUMBERS:
+            return eqx.tree_pformat(value)
+        return _tied(f"{_nested(numbers.tolist())} {unit}".rstrip())
+    if isinstance(value, jax.Array):
+        return eqx.tree_pformat(value)
+    if isinstance(value, Learned) and type(value.function).__repr__ is module_text:
+        return _one_line(value.function)
+    if isinstance(value, eqx.Module) and type(value).__repr__ in (module_text, eqx.Module.__repr__):
+        return _one_line(value)
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{name}: {text_of(x)}" for name, x in value.items()) + "}"
+    if isinstance(value, (tuple, list)) and type(value) in (tuple, list):
+        start, end = "()" if isinstance(value, tuple) else "[]"
+        return start + ", ".join(map(text_of, value)) + "," * (isinstance(value, tuple) and len(value) == 1) + end
+    return _tied(repr(value).replace("\n", " "))
+
+
+def module_text(self: Any, ndim: int | None = None) -> str:
+    """The `__repr__` of a module: its fields by name, with the units of its parameters. Empty fields are omitted.
+
+    `ndim`: as of `text_of`, for the arrays that are not declared as parameters.
+    """
+    return wrapped(_one_line(self, ndim))
+
+
+def wrapped(text: str) -> str:
+    """Break a line after commas."""
+    lines = textwrap.wrap(text, _WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+    return "\n".join(lines).replace(_TIE, " ")
+
+
+def _one_line(module: eqx.Module, ndim: int | None = None) -> str:
+    infos = parameter_info(module)
+    items = []
+    for field in dataclasses.fields(module):
+        value = getattr(module, field.name, None)  # missing while the module is constructed
+        is_empty = value is None or (isinstance(value, (tuple, list, dict, str)) and not value)
+        if field.repr and not is_empty:
+            info = infos.get(field.name)
+            text = text_of(value, ndim=ndim) if info is None else text_of(value, info.unit, len(info.shape))
+            items.append(f"{field.name}={text}")
+    return f"{type(module).__name__}({', '.join(items)})"
+
+
+def _nested(x: object) -> str:
+    if isinstance(x, list):
+        return f"[{', '.join(map(_nested, x))}]"
+    return f"{x + 0.0:.6g}" if isinstance(x, (float, complex)) else str(x)  # -0.0 + 0.0 is 0.0
+
+
+def _tied(text: str) -> str:
+    return text if len(text) > _WIDTH // 2 else text.replace(" ", _TIE)

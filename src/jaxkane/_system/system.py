@@ -8,7 +8,7 @@ import functools
 import inspect
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 from .._common.lookup import checked, not_there, refuse_any, refuse_if, refuse_unknown
 from .._scalarjit.cache_key import leaked_tracer
 from .._scalarjit.components import Component, Numbers
+from .kinematics import Frame, Point, Vector
 from .motion import Motion, motion_number
-from .parameters import check_fields, check_parameter, parameter_info, to_float
-from .prints import concrete_numbers, module_text, text_of
+from .parameters import check_fields, check_parameter, concrete_numbers, module_text, parameter_info, text_of, to_float
 
 
 class NamedVector(Sequence[Component]):
@@ -42,17 +42,17 @@ class NamedVector(Sequence[Component]):
     def __len__(self) -> int:
         return len(self._items)
 
-    def __getitem__(self, key: Any) -> Any:
+    def __getitem__(self, key: int | str | slice | Sequence[int | str]) -> Any:
         if isinstance(key, slice):
             start, stop = (self._place(end) if isinstance(end, str) else end for end in (key.start, key.stop))
             places = slice(start, stop + 1 if isinstance(key.stop, str) else stop, key.step)  # type: ignore[operator]
             return NamedVector(self._items[places], self.names[places])
-        if isinstance(key, (tuple, list)):
+        if isinstance(key, Sequence) and not isinstance(key, str):
             places = [self._place(k) for k in key]
             return NamedVector([self._items[i] for i in places], [self.names[i] for i in places if self.names])
         return self._items[self._place(key)]
 
-    def _place(self, key: Any) -> int:
+    def _place(self, key: int | str) -> int:
         if isinstance(key, str):
             if key not in self.names:
                 raise not_there(key, self.names, "these values")
@@ -92,7 +92,7 @@ class NamedVector(Sequence[Component]):
 
 
 def _elementwise(name: str) -> Callable[..., Array]:
-    def operator(self: NamedVector, other: Any) -> Array:
+    def operator(self: NamedVector, other: Numbers) -> Array:
         try:
             array = jnp.asarray(other)
         except (TypeError, ValueError):
@@ -119,7 +119,7 @@ METHODS += ("state_rates", "outputs")
 NAMES = ("coordinates", "speeds", "dependent_speeds", "auxiliary_speeds", "dependent_coordinates", "inputs", "states")
 
 
-def _prepared(system: str, name: str, value: Any) -> Any:
+def _prepared(system: str, name: str, value: object) -> Any:
     """Prepare a class attribute: check names and units, and wrap methods so that they can read values by name."""
     if hasattr(value, "__get__") and not callable(value):  # a property is evaluated on an instance
         return value
@@ -130,14 +130,15 @@ def _prepared(system: str, name: str, value: Any) -> Any:
     return _named(value, name) if name in METHODS and callable(value) else value
 
 
-def _checked_units(system: str, units: Any) -> Mapping[str, str]:
+def _checked_units(system: str, units: object) -> Mapping[str, str]:
     what = f'{system}.units must be a dict of strings by name, such as {{"angle": "rad"}}'
-    for name, unit in checked(units, Mapping, what).items():
+    declared: Mapping[str, str] = checked(units, Mapping, what)
+    for name, unit in declared.items():
         checked(checked(name, str, what) and unit, str, f"{what}: {name!r}")
-    return units
+    return declared
 
 
-def _checked_names(system: str, kind: str, names: Any) -> tuple[str, ...]:
+def _checked_names(system: str, kind: str, names: object) -> tuple[str, ...]:
     if not isinstance(names, (tuple, list)) or not all(isinstance(name, str) and name for name in names):
         remedy = {str: f" Write ({names!r},).", dataclasses.Field: " Rename the field."}.get(type(names), "")
         raise TypeError(f"{system}.{kind} must be a tuple of names, such as ('angle',); got {names!r}.{remedy}")
@@ -151,12 +152,12 @@ class SystemMeta(type(eqx.Module)):
     the class body.
     """
 
-    def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **kwargs: Any) -> Any:
+    def __new__(cls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **kwargs: Any) -> Any:
         # For a class created by `type(name, bases, members)`, Python would report equinox as its module.
         module = sys._getframe(1).f_globals.get("__name__", "__main__")
-        return super().__new__(mcs, name, bases, {"__module__": module, **namespace}, **kwargs)
+        return super().__new__(cls, name, bases, {"__module__": module, **namespace}, **kwargs)
 
-    def __setattr__(cls, name: str, value: Any) -> None:
+    def __setattr__(cls, name: str, value: object) -> None:
         super().__setattr__(name, _prepared(cls.__name__, name, value))
 
 
@@ -211,7 +212,7 @@ def _named(method: Callable[..., Any], name: str) -> Callable[..., Any]:
     return call
 
 
-def _values(values: Any, names: Sequence[str], label: str, n_optional: int = 0) -> NamedVector:
+def _values(values: Sequence[Component], names: Sequence[str], label: str, n_optional: int = 0) -> NamedVector:
     if isinstance(values, NamedVector) and values.names == tuple(names):
         return values
     items = list(values)
@@ -267,6 +268,17 @@ def unpacked(system: System, y: Float[Array, "*batch n"]) -> State:
     if type(system).contacts is not System.contacts and y.shape[-1] > n_y + len(system.states):
         x, contacts = jnp.split(x, [len(system.states)], axis=-1)
     return State(q, u, x if system.states else None, contacts)
+
+
+class Measurements(Mapping[str, Component]):
+    """The type of the argument `now` of `state_rates` and `outputs`, see `MeasurementContext`."""
+
+    u_dot: NamedVector
+
+    def with_values(self, values: Mapping[str, Component]) -> Self: ...
+    def acceleration(self, point: Point) -> Vector: ...
+    def angular_acceleration(self, frame: Frame) -> Vector: ...
+    def force(self, name: str) -> Any: ...
 
 
 class System(eqx.Module, metaclass=SystemMeta):
@@ -344,7 +356,7 @@ class System(eqx.Module, metaclass=SystemMeta):
         return ""
 
     def state_rates(
-        self, t: Component, q: Numbers, u: Numbers, x: Any, motion: Motion, now: Any
+        self, t: Component, q: Numbers, u: Numbers, x: Numbers, motion: Motion, now: Measurements
     ) -> Sequence[Component] | Mapping[str, Component]:
         """Return the rates of the first-order states, in the order of `states` or in a dict by name.
 
@@ -363,7 +375,7 @@ class System(eqx.Module, metaclass=SystemMeta):
             "motion, now), one rate for each."
         )
 
-    def outputs(self, t: Component, q: Numbers, u: Numbers, motion: Motion, now: Any) -> Mapping[str, Any]:
+    def outputs(self, t: Component, q: Numbers, u: Numbers, motion: Motion, now: Measurements) -> Mapping[str, Any]:
         """Return the outputs by name. Names of nested dicts are joined by a dot.
 
             def outputs(self, t, q, u, motion, now):
@@ -406,7 +418,7 @@ class System(eqx.Module, metaclass=SystemMeta):
         return {}
 
 
-def call_with_states(f: Callable[..., Any], t: Component, q: Any, u: Any, x: Any) -> Any:
+def call_with_states(f: Callable[..., Any], t: Component, q: Numbers, u: Numbers, x: Numbers) -> Any:
     """f(t, q, u), or f(t, q, u, x) if the function has a fourth argument for the first-order states."""
     parameters = inspect.signature(f).parameters.values()
     positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
@@ -483,7 +495,12 @@ def units_of(system: System) -> dict[str, str]:
     return units
 
 
-def named_numbers(names: Sequence[Sequence[str]], rows: Sequence[Any], more: Mapping[str, Any], units: Any) -> str:
+def named_numbers(
+    names: Sequence[Sequence[str]],
+    rows: Sequence[Any],
+    more: Mapping[str, Any],
+    units: Mapping[str, str] | Iterable[tuple[str, str]],
+) -> str:
     """Numbers by name: "roll=0.1 rad, roll_rate=2 rad/s". Empty if some of them are traced or batched.
 
     **Arguments:**

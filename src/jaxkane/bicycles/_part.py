@@ -11,8 +11,7 @@ import equinox as eqx
 from .._scalarjit.components import Component
 from .._system.kinematics import Point, Vector
 from .._system.motion import Motion
-from .._system.parameters import check_parameter, parameter_info
-from .._system.prints import module_text
+from .._system.parameters import check_parameter, module_text, parameter_info
 from .._system.system import NamedVector
 
 BicycleLike: TypeAlias = Any

@@ -25,7 +25,7 @@ from .._kane.constraint_residuals import configuration_residual
 from .._kane.right_hand_side import outputs_at, values_of, vector_field
 from .._scalarjit.cache_key import jit
 from .._scalarjit.compat import on_device
-from .._system.prints import wrapped
+from .._system.parameters import wrapped
 from .._system.system import State, System, has_outputs, names_of, units_of, unpacked
 from ._mesh import ControlPolynomial, coefficients_of, interpolated, place_in_mesh, with_controls, without_events
 from ._problem import Problem

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from ._reading import (
     unused_names,
     without_dots,
 )
+
+MjModel: TypeAlias = Any
+"""A compiled model of MuJoCo, which is an optional dependency."""
 
 
 def from_mjcf(
@@ -100,7 +103,7 @@ def _compiled(mujoco: ModuleType, model: Path) -> Any:
 class _ModelReader:
     """Reads a compiled model into links, sites, actuators and loops of a mechanism, and lists omitted elements."""
 
-    def __init__(self, mujoco: ModuleType, model: Any, name: str | None, stops: Selection, friction: Selection):
+    def __init__(self, mujoco: ModuleType, model: MjModel, name: str | None, stops: Selection, friction: Selection):
         self.m, self.kinds = model, mujoco
         own = bytes(model.names[:200]).split(b"\0", 1)[0].decode("utf-8", "replace")
         own = "" if own == "MuJoCo Model" else own  # the name of a file without a name
@@ -361,17 +364,17 @@ class _ModelReader:
 _PLURALS = {"body": "bodies"}
 
 
-def _floats(values: Any) -> tuple[float, ...]:
+def _floats(values: Sequence[float] | np.ndarray) -> tuple[float, ...]:
     return tuple(float(x) for x in values)
 
 
-def _euler(quaternion: Any) -> tuple[float, ...]:
+def _euler(quaternion: Sequence[float] | np.ndarray) -> tuple[float, ...]:
     """Euler parameters, scalar last; MuJoCo has the scalar first."""
     w, x, y, z = _floats(quaternion)
     return (x, y, z, w)
 
 
-def _inertia(moments: Any, quaternion: Any) -> list[list[float]]:
+def _inertia(moments: Sequence[float] | np.ndarray, quaternion: Sequence[float] | np.ndarray) -> list[list[float]]:
     """Inertia along the body's axes, from principal moments in rotated axes. Entries within rounding of zero are
     zero."""
     R = np.array(rotations.euler_parameters_matrix(_euler(quaternion))).T

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from .._common.lookup import as_names, refuse_any, refuse_if, refuse_unknown
 from .._kane.description import jvp
 from .._kane.right_hand_side import parameters_read
-from .._scalarjit.components import ZERO3, Component, Scalar, dot, is_exact, is_zero, sub
+from .._scalarjit.components import ZERO3, Component, Numbers, Scalar, dot, is_exact, is_zero, sub
 from .._system.kinematics import Frame, Point, Vector, inertial
 from .._system.motion import Body, Force, Motion, Torque
 from .._system.parameters import parameter
@@ -24,6 +24,7 @@ from ._sympy_model import (
     ExtractedModel,
     ExtractedVector,
     Extractor,
+    SymPyObject,
     function,
     imported,
     model_data,
@@ -33,10 +34,10 @@ from ._sympy_model import (
 
 
 def from_sympy(
-    model: Any,
+    model: SymPyObject,
     parameters: Mapping[Any, Any],
     *,
-    origin: Any = None,
+    origin: SymPyObject = None,
     dependent: Sequence[str] = (),
     prescribed: Mapping[Any, Any] | None = None,
     name: str = "SympyModel",
@@ -139,23 +140,23 @@ class SympySystem(System):
         for field in dataclasses.fields(self):
             setattr(self, field.name, values[field.name])
 
-    def _read(self, q: Any, u: Any, t: Component) -> list[Any]:
+    def _read(self, q: Sequence[Component], u: Sequence[Component], t: Component) -> list[Any]:
         model = self._model
         missing = len(model.u) + len(model.u_dep) + len(model.u_aux) - len(u)
         numbers = [getattr(self, str(x)) for x in model.constants]
         return _functions_of(model)[0](t, *q, *u, *(0.0,) * missing, *_given(model, t), *numbers)
 
-    def q_dot(self, t, q, u):
+    def q_dot(self, t: Component, q: Sequence[Component], u: Sequence[Component]):
         values = self._read(q, u, t)
         return [values[i] for i in self._model.rates]
 
-    def configuration_constraints(self, t, q):
+    def configuration_constraints(self, t: Component, q: Sequence[Component]):
         if not self._model.configuration:
             return ()
         values = self._read(q, (), t)
         return [values[i] for i in self._model.configuration]
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: Sequence[Component], u: Sequence[Component]):
         model, values = self._model, self._read(q, u, t)
         N, _ = inertial()
         frames = [N]
@@ -195,7 +196,14 @@ class SympySystem(System):
         motion.along_speeds = [carrier(speed * N.x) for speed, _ in zip(u, model.forces)]
         return motion
 
-    def loads(self, t, q, u, motion: Any, inputs):
+    def loads(
+        self,
+        t: Component,
+        q: Sequence[Component],
+        u: Sequence[Component],
+        motion: Motion,
+        inputs: Mapping[str, Component],
+    ):
         model = self._model
         if not isinstance(motion, _SympyMotion):
             motion = self.motion(t, q, u)
@@ -220,7 +228,7 @@ class SympySystem(System):
         loads += [Torque(force * motion.N.x, body) for force, body in zip(along, motion.along_speeds, strict=True)]
         return loads
 
-    def _inertia_velocities(self, values: Sequence[Any], u: Any) -> list[Component]:
+    def _inertia_velocities(self, values: Sequence[Any], u: Sequence[Component]) -> list[Component]:
         """w = C^T u of M = C C^T: the velocities of particles of mass 1 with this inertia.
 
         Kane's method gives C dw/dt for these n particles. With forces along the speeds this becomes the left side of
@@ -237,7 +245,7 @@ def _rows(values: Sequence[Any], rows: Sequence[Sequence[int]]) -> list[list[Com
     return [[_exact(values[i]) for i in row] for row in rows]
 
 
-def _exact(x: Any) -> Component:
+def _exact(x: Numbers) -> Component:
     return x if isinstance(x, jax.Array) else float(x)
 
 
@@ -267,7 +275,7 @@ def _given(model: ExtractedModel, t: Component) -> list[Any]:
     return values
 
 
-def _rate(motion: Callable[[Any], Any], t: Any) -> Any:
+def _rate(motion: Callable[[Any], Any], t: Component) -> Any:
     return jax.jvp(lambda t: jnp.asarray(motion(t)), (t,), (jnp.ones_like(t),))[1]
 
 

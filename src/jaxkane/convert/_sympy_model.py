@@ -48,7 +48,7 @@ class ModelData(NamedTuple):
 
 
 def model_data(
-    sympy: ModuleType, model: Any, dependent: tuple[str, ...], name: str, prescribed: tuple[Any, ...] = ()
+    sympy: ModuleType, model: SymPyObject, dependent: tuple[str, ...], name: str, prescribed: tuple[Any, ...] = ()
 ) -> ModelData:
     mechanics = sympy.physics.mechanics
     kinds = tuple(getattr(mechanics, kind, ()) for kind in ("KanesMethod", "System", "LagrangesMethod"))
@@ -75,7 +75,7 @@ def model_data(
     return _of_kane(kane, name, model.fixed_point)
 
 
-def _of_kane(kane: Any, name: str, origin: Any = None) -> ModelData:
+def _of_kane(kane: SymPyObject, name: str, origin: SymPyObject = None) -> ModelData:
     refuse_if(
         not kane.bodies,
         f"{name}: this KanesMethod has no bodies. Pass KanesMethod(..., bodies=bodies, forcelist=loads), or call "
@@ -101,7 +101,7 @@ def _of_kane(kane: Any, name: str, origin: Any = None) -> ModelData:
 
 
 def _of_lagrange(
-    sympy: ModuleType, lagrange: Any, dependent: tuple[str, ...], name: str, prescribed: tuple[Any, ...]
+    sympy: ModuleType, lagrange: SymPyObject, dependent: tuple[str, ...], name: str, prescribed: tuple[Any, ...]
 ) -> ModelData:
     bodies = list(lagrange._bodies or ())
     refuse_if(
@@ -149,7 +149,7 @@ def _of_lagrange(
 
 
 def inertia_of(
-    sympy: ModuleType, lagrange: Any, speeds: dict[Any, Any], name: str, prescribed: tuple[Any, ...] = ()
+    sympy: ModuleType, lagrange: SymPyObject, speeds: dict[Any, Any], name: str, prescribed: tuple[Any, ...] = ()
 ) -> tuple[Triangle, Triangle, Sequence[Any]]:
     """M, dM/dt, and the forces of the momentum form of a `LagrangesMethod` without bodies.
 
@@ -198,7 +198,7 @@ def _without(sympy: ModuleType, entry: SymPyObject, speeds: list[Any], name: str
     return entry
 
 
-def _of_loads(sympy: ModuleType, lagrange: Any, rate: Any, name: str) -> Any:
+def _of_loads(sympy: ModuleType, lagrange: SymPyObject, rate: SymPyObject, name: str) -> Any:
     """The generalized force along one rate: F . dv/du + T . domega/du, summed."""
     mechanics, N, total = sympy.physics.mechanics, lagrange.inertial, sympy.S.Zero
     known = {*lagrange.q, *lagrange._qdots}
@@ -276,7 +276,7 @@ class ExtractedModel(NamedTuple):
 class Extractor:
     """Extracts the expressions of a model, each once."""
 
-    def __init__(self, sympy: ModuleType, data: ModelData, origin: Any, prescribed: Mapping[Any, Any]):
+    def __init__(self, sympy: ModuleType, data: ModelData, origin: SymPyObject, prescribed: Mapping[Any, Any]):
         self.sympy, self.data, self.origin = sympy, data, origin
         self.prescribed = prescribed
         self.replaced: set[Any] = set()  # prescribed functions that occur
@@ -323,7 +323,7 @@ class Extractor:
             **parts,
         )
 
-    def _place(self, expression: Any, among: dict[Any, int] | None = None) -> int:
+    def _place(self, expression: SymPyObject, among: dict[Any, int] | None = None) -> int:
         """The index of an expression, in which rates of coordinates are replaced by speeds."""
         among = self.of_motion if among is None else among
         expression = self.sympy.physics.mechanics.msubs(self.sympy.sympify(expression), self.data.rates)
@@ -362,7 +362,7 @@ class Extractor:
                 x not in self.replaced, f"{data.name}: `prescribed` contains {x}, which is not part of the model."
             )
 
-    def _vector(self, vector: Any, among: dict[Any, int] | None = None) -> ExtractedVector:
+    def _vector(self, vector: SymPyObject, among: dict[Any, int] | None = None) -> ExtractedVector:
         parts = [] if vector == 0 else vector.args
         return tuple((self._frame(frame), tuple(self._place(x, among) for x in column)) for column, frame in parts)  # type: ignore
 
@@ -382,13 +382,13 @@ class Extractor:
     def _velocity(self, point: SymPyObject) -> SymPyObject:
         return self._evaluated(lambda: point.vel(self.data.N), point, "no velocity in the inertial frame")
 
-    def _evaluated(self, quantity: SymPyObject, part: Any, fault: str) -> SymPyObject:
+    def _evaluated(self, quantity: SymPyObject, part: SymPyObject, fault: str) -> SymPyObject:
         try:
             return quantity()
         except ValueError as error:
             raise ValueError(f"{self.data.name}: {part} has {fault}: {error}") from error
 
-    def _rests(self, part: Any) -> bool:
+    def _rests(self, part: SymPyObject) -> bool:
         point, frame = (getattr(part, name, None) for name in ("masscenter", "frame"))
         if hasattr(part, "pos_from"):
             point = part
@@ -406,7 +406,7 @@ class Extractor:
             self.extracted_points.append(ExtractedPoint(point.name, self._vector(velocity), position))
         return self.points[point]
 
-    def _body(self, body: Any) -> ExtractedBody:
+    def _body(self, body: SymPyObject) -> ExtractedBody:
         if not hasattr(body, "central_inertia"):  # a Particle
             return ExtractedBody(body.name, self._place(body.mass), (), 0, self._point(body.point), ())
         inertia = body.central_inertia
@@ -418,7 +418,7 @@ class Extractor:
         point, mass = self._point(body.masscenter), self._place(body.mass)
         return ExtractedBody(body.name, mass, places, self._frame(frame), point, self._vector(self._omega(body.frame)))
 
-    def _load(self, load: Any) -> ExtractedLoad:
+    def _load(self, load: SymPyObject) -> ExtractedLoad:
         part, vector = load
         part = getattr(part, "masscenter", part) if hasattr(part, "central_inertia") else part
         if isinstance(part, self.sympy.physics.mechanics.ReferenceFrame):
@@ -488,7 +488,7 @@ def name_of(x: SymPyObject) -> str:
     return str(getattr(x, "func", x)) if getattr(x, "args", ()) else str(x)
 
 
-def _listed(things: Any) -> str:
+def _listed(things: Iterable[Any]) -> str:
     return ", ".join(sorted(map(str, things)))
 
 

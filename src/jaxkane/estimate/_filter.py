@@ -41,8 +41,7 @@ from .._kane.constraint_residuals import (
 )
 from .._kane.right_hand_side import output_names, outputs_at, values_of, vector_field
 from .._scalarjit.cache_key import jit
-from .._system.parameters import parameters_in, with_parameters
-from .._system.prints import concrete_numbers, module_text, text_of, wrapped
+from .._system.parameters import concrete_numbers, module_text, parameters_in, text_of, with_parameters, wrapped
 from .._system.system import State, System, named_numbers, packed, units_of, unpacked
 from ._process_noise import MODES, Disturbance, checked_noise, checked_numbers
 from ._square_root import moments, root

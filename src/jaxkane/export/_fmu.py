@@ -24,9 +24,9 @@ import numpy as np
 
 from .._common.files import write_file
 from .._common.lookup import real_number, refuse_unknown
-from .._kane.arguments import check_is_system, is_concrete
+from .._kane.arguments import check_is_system, has_multipliers, is_concrete
 from .._kane.consistent_state import assemble
-from .._kane.contact.forces import has_contacts, has_multipliers, layout_of
+from .._kane.contact.forces import has_contacts, layout_of
 from .._scalarjit.components import is_written_out
 from .._system.parameters import in_batches
 from .._system.system import State, System

@@ -14,8 +14,8 @@ import numpy as np
 from .._common.files import write_file
 from .._integrate.jumps import warn_of_jumps
 from .._kane.expression_graph import Formulas
-from .._scalarjit.backends.source import as_objects
 from .._scalarjit.graph import OPERATORS, NotScalarError, needed
+from .._scalarjit.source import as_objects
 from .._system.system import System
 from ._source import function_names, in_ascii
 

@@ -20,12 +20,13 @@ from .._common.files import write_file
 from .._common.lookup import refuse_unknown
 from .._integrate.jumps import warn_of_jumps
 from .._kane.expression_graph import JACOBIANS, OFFERED, Formulas
-from .._scalarjit.backends.numpy import NUMPY_NAMES
-from .._scalarjit.backends.source import (
+from .._scalarjit.graph import DTYPES, LIBRARY, needed
+from .._scalarjit.source import (
     ARITHMETIC,
     COMPARED,
     COMPARISONS,
     LOOSE,
+    NUMPY_NAMES,
     SIGNED,
     SUM,
     TIGHT,
@@ -34,7 +35,6 @@ from .._scalarjit.backends.source import (
     as_source,
     call,
 )
-from .._scalarjit.graph import DTYPES, LIBRARY, needed
 from .._system.system import System, unit_of, units_of
 from .._version import __version__
 

@@ -10,16 +10,17 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 
 from .. import rotations
 from .._common.lookup import refuse_if
 from .._scalarjit.compat import Tracer
-from .._scalarjit.components import Component, Triple, is_zero, mul, sub
+from .._scalarjit.components import Component, ComponentsLike, Triple, is_zero, mul, sub
 from .._system.kinematics import Frame, Point
 from .._system.motion import Force, Load, ReflectedInertia, Torque
 
 
-def unit_vector(axis: Any, name: str) -> Triple:
+def unit_vector(axis: ComponentsLike, name: str) -> Triple:
     """A direction as three floats of length 1. Components within rounding of zero or one are made exact."""
     a = exact_numbers(axis, f"The axis of {name!r}")
     length = float(np.linalg.norm(a)) if a.shape == (3,) else 0.0
@@ -27,7 +28,7 @@ def unit_vector(axis: Any, name: str) -> Triple:
     return tuple(exact(x) for x in a / length)  # type: ignore[return-value]
 
 
-def exact_numbers(values: Any, what: str) -> np.ndarray:
+def exact_numbers(values: npt.ArrayLike, what: str) -> np.ndarray:
     """Numbers of a structure, which are constants of compiled programs and cannot be differentiated.
 
     **Raises:** `TypeError` for traced values; `ValueError` for values that are not finite numbers.
@@ -55,13 +56,13 @@ def exact(x: float) -> float:
     return nearest if abs(x - nearest) < 1e-15 else float(x)
 
 
-def is_structural_zero(value: Any) -> bool:
+def is_structural_zero(value: object) -> bool:
     """Whether a value is a zero that was written as a number. Such a zero is structure and costs nothing; a JAX array
     is a parameter."""
     return not isinstance(value, jax.Array) and np.ndim(value) == 0 and not isinstance(value, str) and value == 0
 
 
-def components(name: str, values: Any) -> dict[str, Any]:
+def components(name: str, values: ComponentsLike) -> dict[str, Any]:
     """Three numbers as parameters `name.x`, `name.y`, `name.z`."""
     refuse_if(not hasattr(values, "__len__") or len(values) != 3, f"{name} must have three components, got {values!r}.")
     return {f"{name}.{end}": x for end, x in zip("xyz", values, strict=True) if not is_structural_zero(x)}
@@ -136,12 +137,12 @@ class Hinge(JointType):
     coordinates = (("", "rad"),)
     speeds = (("_rate", "rad/s"),)
 
-    def kinematics(self, F, P, q, u, anchor):
+    def kinematics(self, F: Frame, P: Point, q: Sequence[Component], u: Sequence[Component], anchor: Triple):
         angle = sub(q[0], self.reference)
         G = F.rotate(F.vector(*self.axis), angle, u[0], f"{self.name} joint")
         return JointKinematics(F, P, G, _about(P, F, G, anchor))
 
-    def loads(self, at, forces):
+    def loads(self, at: JointKinematics, forces: Sequence[Component]):
         return (Torque(forces[0] * at.child_frame.vector(*self.axis), at.child_frame, at.parent_frame),)
 
 
@@ -149,11 +150,11 @@ class Slide(JointType):
     coordinates = (("", "m"),)
     speeds = (("_rate", "m/s"),)
 
-    def kinematics(self, F, P, q, u, anchor):
+    def kinematics(self, F: Frame, P: Point, q: Sequence[Component], u: Sequence[Component], anchor: Triple):
         axis = F.vector(*self.axis)
         return JointKinematics(F, P, F, P.moving(sub(q[0], self.reference) * axis, u[0] * axis, F))
 
-    def loads(self, at, forces):
+    def loads(self, at: JointKinematics, forces: Sequence[Component]):
         push = forces[0] * at.parent_frame.vector(*self.axis)
         # The reaction acts on the parent's material point at the slider, which does not move with the slider.
         rail = at.parent_point.fixed(at.child_point.position_from(at.parent_point), at.parent_frame)
@@ -168,20 +169,20 @@ class Ball(JointType):
     coordinates = _EULER
     speeds = _OMEGA
 
-    def kinematics(self, F, P, q, u, anchor):
+    def kinematics(self, F: Frame, P: Point, q: Sequence[Component], u: Sequence[Component], anchor: Triple):
         G = F.rotate_euler(q, u, f"{self.name} joint")
         return JointKinematics(F, P, G, _about(P, F, G, anchor))
 
-    def rates(self, q, u):
+    def rates(self, q: Sequence[Component], u: Sequence[Component]):
         return rotations.euler_parameter_rates(q, u)
 
-    def norm(self, q):
+    def norm(self, q: Sequence[Component]):
         return (rotations.euler_parameter_norm(q),)
 
-    def displacement(self, q, rest):
+    def displacement(self, q: Sequence[Component], rest: Sequence[Component]):
         return _rotation_vector(q)
 
-    def loads(self, at, forces):
+    def loads(self, at: JointKinematics, forces: Sequence[Component]):
         return (Torque(at.child_frame.vector(*forces), at.child_frame, at.parent_frame),)
 
 
@@ -189,20 +190,20 @@ class Free(JointType):
     coordinates = (("_x", "m"), ("_y", "m"), ("_z", "m"), *_EULER)
     speeds = (("_vx", "m/s"), ("_vy", "m/s"), ("_vz", "m/s"), *_OMEGA)
 
-    def kinematics(self, F, P, q, u, anchor):
+    def kinematics(self, F: Frame, P: Point, q: Sequence[Component], u: Sequence[Component], anchor: Triple):
         G = F.rotate_euler(q[3:], u[3:], f"{self.name} joint")
         return JointKinematics(F, P, G, P.moving(F.vector(*q[:3]), F.vector(*u[:3]), F))
 
-    def rates(self, q, u):
+    def rates(self, q: Sequence[Component], u: Sequence[Component]):
         return (*u[:3], *rotations.euler_parameter_rates(q[3:], u[3:]))
 
-    def norm(self, q):
+    def norm(self, q: Sequence[Component]):
         return (rotations.euler_parameter_norm(q[3:]),)
 
-    def displacement(self, q, rest):
+    def displacement(self, q: Sequence[Component], rest: Sequence[Component]):
         return (*(sub(x, r) for x, r in zip(q[:3], rest, strict=True)), *_rotation_vector(q[3:]))
 
-    def loads(self, at, forces):
+    def loads(self, at: JointKinematics, forces: Sequence[Component]):
         return (
             Force(at.parent_frame.vector(*forces[:3]), at.child_point),
             Torque(at.child_frame.vector(*forces[3:]), at.child_frame),
@@ -247,9 +248,9 @@ class Joint(NamedTuple):
 
 def hinge(
     name: str,
-    axis: Any = (0.0, 0.0, 1.0),
+    axis: ComponentsLike = (0.0, 0.0, 1.0),
     *,
-    anchor: Any = (0.0, 0.0, 0.0),
+    anchor: ComponentsLike = (0.0, 0.0, 0.0),
     damping: Component = 0.0,
     stiffness: Component = 0.0,
     rest: Component = 0.0,
@@ -280,7 +281,7 @@ def hinge(
 
 def slide(
     name: str,
-    axis: Any = (0.0, 0.0, 1.0),
+    axis: ComponentsLike = (0.0, 0.0, 1.0),
     *,
     damping: Component = 0.0,
     stiffness: Component = 0.0,
@@ -300,7 +301,12 @@ def slide(
 
 
 def _with_axis(
-    kind: type[JointType], name: str, axis: Any, reference: float, stops: Any, values: Mapping[str, Any]
+    kind: type[JointType],
+    name: str,
+    axis: ComponentsLike,
+    reference: float,
+    stops: Stops,
+    values: Mapping[str, Any],
 ) -> Joint:
     has_stops, limits = _limits(stops, name)
     origin = float(exact_numbers(reference, f"The reference of {name!r}"))
@@ -308,7 +314,7 @@ def _with_axis(
     return Joint((joint,), {**values, **limits})
 
 
-def _limits(stops: Any, name: str) -> tuple[tuple[bool, bool], dict[str, Any]]:
+def _limits(stops: Stops, name: str) -> tuple[tuple[bool, bool], dict[str, Any]]:
     """Which limits a joint has, and their parameters.
 
     **Raises:** `ValueError` if they are not two numbers in increasing order, or None.
@@ -317,7 +323,7 @@ def _limits(stops: Any, name: str) -> tuple[tuple[bool, bool], dict[str, Any]]:
     limits = {end: x for end, x in (("lower", lower), ("upper", upper)) if x is not None}
     is_concrete = not any(isinstance(x, Tracer) for x in limits.values())
     if any(np.ndim(x) or isinstance(x, str) for x in limits.values()) or (
-        is_concrete and len(limits) == 2 and not float(lower) < float(upper)
+        is_concrete and len(limits) == 2 and not float(limits["lower"]) < float(limits["upper"])
     ):
         raise ValueError(f"The stops of {name!r} must be a lower and a larger upper limit, or None; got {stops!r}.")
     return (lower is not None, upper is not None), _numbers(name, **limits)
@@ -326,7 +332,7 @@ def _limits(stops: Any, name: str) -> tuple[tuple[bool, bool], dict[str, Any]]:
 def ball(
     name: str,
     *,
-    anchor: Any = (0.0, 0.0, 0.0),
+    anchor: ComponentsLike = (0.0, 0.0, 0.0),
     damping: Component = 0.0,
     stiffness: Component = 0.0,
     armature: Component = 0.0,
@@ -350,7 +356,7 @@ def free(
     *,
     damping: Component = 0.0,
     stiffness: Component = 0.0,
-    rest: Any = (0.0,) * 3,
+    rest: ComponentsLike = (0.0,) * 3,
     armature: Component = 0.0,
 ) -> Joint:
     """A free link on the ground: position `name_x`, `name_y`, `name_z` of its origin in the inertial frame [m] and
@@ -371,7 +377,7 @@ def fixed() -> Joint:
     return Joint((), {})
 
 
-def universal(name: str, axes: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **options: Any) -> Joint:
+def universal(name: str, axes: Sequence[ComponentsLike] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **options: Any) -> Joint:
     """Two hinges about two axes, `name_1` on the parent and `name_2` on the link; `options` of `hinge`, for both."""
     refuse_if(
         len(axes) != 2,
@@ -380,7 +386,7 @@ def universal(name: str, axes: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **optio
     return _chain([hinge(f"{name}_{i + 1}", axis, **options) for i, axis in enumerate(axes)])
 
 
-def planar(name: str, axes: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **options: Any) -> Joint:
+def planar(name: str, axes: Sequence[ComponentsLike] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **options: Any) -> Joint:
     """Two sliders `name_x` and `name_y` along two axes, and a hinge `name_angle` about the normal of their plane.
 
     `options`, e.g. `damping`, are for all three, in SI units.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -13,6 +13,7 @@ from .. import rotations
 from .._common.lookup import checked, refuse_any, refuse_if, refuse_unknown
 from .._kane.contact.laws import MOST_CONTACTS
 from .._scalarjit.compat import Tracer
+from .._scalarjit.components import Component, ComponentsLike
 from ..rotations import Matrix
 from ._joints import Hinge, Joint, JointType, Slide, components, exact, exact_numbers, is_structural_zero
 from ._loops import with_dependent
@@ -28,6 +29,9 @@ from ._mechanism import (
     Structure,
     class_of,
 )
+
+Orientation: TypeAlias = Any
+"""Euler parameters, a sequence with its angles, a rotation matrix, or None for no rotation; see `Link`."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,11 +61,11 @@ class Link:
     name: str
     parent: str | None = None
     joints: Joint | Sequence[Joint] = ()
-    position: Any = (0.0, 0.0, 0.0)
-    orientation: Any = None
-    mass: Any = None
-    center: Any = (0.0, 0.0, 0.0)
-    inertia: Any = (0.0, 0.0, 0.0)
+    position: ComponentsLike = (0.0, 0.0, 0.0)
+    orientation: Orientation = None
+    mass: Component | None = None
+    center: ComponentsLike = (0.0, 0.0, 0.0)
+    inertia: ComponentsLike | Sequence[ComponentsLike] = (0.0, 0.0, 0.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -74,8 +78,8 @@ class Site:
 
     name: str
     link: str | None
-    position: Any = (0.0, 0.0, 0.0)
-    orientation: Any = None
+    position: ComponentsLike = (0.0, 0.0, 0.0)
+    orientation: Orientation = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -96,11 +100,11 @@ class Actuator:
 
     name: str
     joint: str
-    gear: Any = 1.0
-    gain: Any = 1.0
-    offset: Any = 0.0
-    position_gain: Any = 0.0
-    velocity_gain: Any = 0.0
+    gear: Component | ComponentsLike = 1.0
+    gain: Component = 1.0
+    offset: Component = 0.0
+    position_gain: Component = 0.0
+    velocity_gain: Component = 0.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -132,7 +136,7 @@ class Coupling:
 def mechanism(
     links: Sequence[Link],
     *,
-    gravity: Any = (0.0, 0.0, -9.81),
+    gravity: ComponentsLike = (0.0, 0.0, -9.81),
     actuators: Sequence[Actuator] = (),
     sites: Sequence[Site] = (),
     loops: Sequence[Loop | Coupling] = (),
@@ -224,7 +228,7 @@ def _poses(structure: Structure, poses: Mapping[str, Mapping[str, float]]) -> tu
     return tuple((label, tuple(float(pose[name]) for name in names)) for label, pose in poses.items())
 
 
-def _checked(part: Any, kind: type) -> Any:
+def _checked(part: object, kind: type) -> Any:
     return checked(part, kind, f"mechanism needs a {kind.__name__}")
 
 
@@ -248,7 +252,7 @@ def _in_order(links: list[Link]) -> list[Link]:
     return list(ordered.values())
 
 
-def _check_name(name: Any, what: str) -> None:
+def _check_name(name: object, what: str) -> None:
     if not isinstance(name, str) or not name or "." in name:
         raise ValueError(
             f"The name of a {what} must be a string without a dot, because dots separate the parts of a parameter's "
@@ -256,7 +260,7 @@ def _check_name(name: Any, what: str) -> None:
         )
 
 
-def _check_known(label: str, name: Any, known: Iterable[str], where: str) -> None:
+def _check_known(label: str, name: str, known: Iterable[str], where: str) -> None:
     refuse_unknown([name], known, f"{label} is not among {where}:")
 
 
@@ -336,7 +340,9 @@ def _actuator(actuator: Actuator, joints: Mapping[str, JointType], values: dict[
     return ActuatorStructure(actuator.name, joint.name, gear)
 
 
-def _loop(loop: Any, structure: Structure, joints: Mapping[str, JointType]) -> LoopStructure | CouplingStructure:
+def _loop(
+    loop: Loop | Coupling, structure: Structure, joints: Mapping[str, JointType]
+) -> LoopStructure | CouplingStructure:
     if isinstance(loop, Loop):
         sites = [site.name for site in structure.sites]
         for end in (loop.first, loop.second):
@@ -406,7 +412,7 @@ def _field(name: str, joints: Mapping[str, JointType]) -> Field:
     return name, positive, (_OF_SLIDERS if isinstance(joint, Slide) else _OF_HINGES)[kind]
 
 
-def _matrix(orientation: Any, name: str) -> Matrix | None:
+def _matrix(orientation: Orientation, name: str) -> Matrix | None:
     """[R] (components in the parent -> components here) as exact floats; None for no rotation.
 
     **Raises:** `ValueError` if it is not a rotation.

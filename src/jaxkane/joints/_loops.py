@@ -12,6 +12,7 @@ import scipy.linalg
 
 from .._common.lookup import as_names, checked, real_number, refuse_any, refuse_if, refuse_unknown
 from .._scalarjit.compat import Tracer
+from .._scalarjit.components import Numbers
 from ._joints import JointType
 from ._mechanism import Field, LinkStructure, LoopStructure, Structure, class_of, loop_residuals, polynomial
 
@@ -252,7 +253,7 @@ class _Trial:
     def __init__(self, structure: Structure, fields: tuple[Field, ...], values: dict[str, Any]):
         rng = np.random.default_rng(0)
 
-        def number(x: Any) -> float:
+        def number(x: Numbers) -> float:
             try:
                 return float(np.ravel(np.asarray(x))[0])
             except Exception:  # a traced value is not available

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from .._common.lookup import not_there, refuse_any, refuse_unknown
 from .._kane.contact.declarations import Contact, DryFriction
@@ -34,6 +35,8 @@ from .._system.parameters import parameter, parameter_info
 from .._system.system import NamedVector, System
 from ..rotations import Matrix
 from ._joints import JointKinematics, JointType
+
+Named = Mapping[str, Component] | NamedVector
 
 MOMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
 
@@ -128,7 +131,7 @@ def _flat(named: NamedParameters) -> tuple[list[tuple[Any, Any]], tuple[Any, ...
     return [(jax.tree_util.DictKey(name), named[name]) for name in names], (named.of, named.structure, *names)
 
 
-def _from_flat(static: tuple[Any, ...], values: Any) -> NamedParameters:
+def _from_flat(static: tuple[Any, ...], values: Iterable[PyTree]) -> NamedParameters:
     of, structure, *names = static
     return NamedParameters(of, structure, zip(names, values, strict=True))
 
@@ -208,10 +211,10 @@ class Mechanism(System):
         kind: Any = type(self)
         return _equipped(kind, outputs, tuple(extra))(**values, **extra)
 
-    def q_dot(self, t, q, u):
+    def q_dot(self, t: Component, q: Named, u: Named):
         return [rate for joint in self.structure.joints for rate in joint.rates(*_own(joint, q, u))]
 
-    def _tree(self, q: Any, u: Any) -> tuple[dict[str | None, tuple[Frame, Point]], dict[str, JointKinematics]]:
+    def _tree(self, q: Named, u: Named) -> tuple[dict[str | None, tuple[Frame, Point]], dict[str, JointKinematics]]:
         """The frame and the origin of each link (None: the ground), and the kinematics of the joints."""
         carried: dict[str | None, tuple[Frame, Point]] = {None: inertial()}
         joints: dict[str, JointKinematics] = {}
@@ -226,7 +229,9 @@ class Mechanism(System):
             carried[link.name] = F, P
         return carried, joints
 
-    def sites_at(self, q: Any, u: Any, carried: Any = None) -> dict[str, tuple[Frame, Point]]:
+    def sites_at(
+        self, q: Named, u: Named, carried: dict[str | None, tuple[Frame, Point]] | None = None
+    ) -> dict[str, tuple[Frame, Point]]:
         """The frames and points of the sites. `carried`: those of the links, if known."""
         carried, sites = self._tree(q, u)[0] if carried is None else carried, {}
         for site in self.structure.sites:
@@ -235,7 +240,7 @@ class Mechanism(System):
             sites[site.name] = _turned(F, site.orientation, site.name), point
         return sites
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: Named, u: Named):
         carried, joints = self._tree(q, u)
         N, bodies, points = carried[None][0], [], {}
         for link in self.structure.links:
@@ -258,7 +263,7 @@ class Mechanism(System):
         motion.joints, motion.sites = joints, sites
         return motion
 
-    def loads(self, t, q, u, motion: Any, inputs):
+    def loads(self, t: Component, q: Named, u: Named, motion: MechanismMotion, inputs: Mapping[str, Component]):
         gravity = motion.N.vector(*_triple(self, "gravity"))
         falls = not all(is_zero(x) for x in gravity.components)
         weighed = [body for body in motion.bodies if falls and not is_zero(body.mass)]  # rotors have no weight
@@ -269,7 +274,7 @@ class Mechanism(System):
                 loads += joint.loads(motion.joints[joint.name], forces)
         return loads
 
-    def configuration_constraints(self, t, q):
+    def configuration_constraints(self, t: Component, q: Named):
 
         own = [[q[name] for name in joint.names(joint.coordinates)] for joint in self.structure.joints]
         norms = [x for joint, values in zip(self.structure.joints, own, strict=True) for x in joint.norm(values)]
@@ -278,7 +283,7 @@ class Mechanism(System):
         loops = self._loops_at_rest(t, q, independent=True)
         return GroupedResiduals([*loops.groups, *(SomeComponents((x,), (x,)) for x in norms)])
 
-    def implied_constraints(self, t, q):
+    def implied_constraints(self, t: Component, q: Named):
         structure = self.structure
         all_independent = all(len(loop.independent) + len(loop.dropped) == loop.size for loop in structure.loops)
         if all_independent and all(coupling.is_independent for coupling in structure.couplings):
@@ -298,7 +303,7 @@ class Mechanism(System):
                 contacts[f"{joint.name} friction"] = DryFriction(u[f"{joint.name}_rate"], friction)
         return contacts
 
-    def _loops_at_rest(self, t: Component, q: NamedVector, independent: bool) -> GroupedResiduals:
+    def _loops_at_rest(self, t: Component, q: Named, independent: bool) -> GroupedResiduals:
         rest = dict.fromkeys((*self.speeds, *self.dependent_speeds), 0.0)
         return loop_residuals(self, self.sites_at(q, rest), q, rest, independent)[0]
 
@@ -315,12 +320,12 @@ def _triple(mechanism: Mechanism, name: str) -> Triple:
     return _read(mechanism, f"{name}.x"), _read(mechanism, f"{name}.y"), _read(mechanism, f"{name}.z")
 
 
-def _own(joint: JointType, q: Any, u: Any) -> tuple[list[Component], list[Component]]:
+def _own(joint: JointType, q: Named, u: Named) -> tuple[list[Component], list[Component]]:
     return [q[name] for name in joint.names(joint.coordinates)], [u[name] for name in joint.names(joint.speeds)]
 
 
 def _forces(
-    mechanism: Mechanism, joint: JointType, q: list[Component], u: list[Component], inputs: Any
+    mechanism: Mechanism, joint: JointType, q: list[Component], u: list[Component], inputs: Mapping[str, Component]
 ) -> list[Component]:
     """Forces along the joint's speeds [N or N m], by its spring, damper and actuators."""
     damping, stiffness = _read(mechanism, f"damping.{joint.name}"), _read(mechanism, f"stiffness.{joint.name}")

@@ -12,7 +12,7 @@ from .._kane.api import equations_of_motion
 from .._kane.arguments import is_concrete, is_one_number
 from .._scalarjit.components import Component
 from .._scalarjit.nan import nan_where
-from .._system.prints import text_of, wrapped
+from .._system.parameters import text_of, wrapped
 from .._system.system import State
 from ..catalog import WhippleBicycle
 from ._steady import SteadyMotion, jacobian, steady_turn

@@ -16,7 +16,7 @@ from .._kane.constraint_residuals import coordinate_units
 from .._kane.contact.forces import closed_contacts
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Numbers
-from .._system.prints import text_of, wrapped
+from .._system.parameters import text_of, wrapped
 from .._system.system import System, names_of, unit_of, units_of
 from ._steady import SteadyEquations, SteadyMotion, as_motion, jacobian, quantity, row_sizes
 

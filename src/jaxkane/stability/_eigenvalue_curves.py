@@ -18,8 +18,7 @@ from .._kane.arguments import check_is_system, is_concrete, is_numeric
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Numbers
 from .._scalarjit.nan import nan_where
-from .._system.parameters import parameter_info
-from .._system.prints import wrapped
+from .._system.parameters import parameter_info, wrapped
 from .._system.system import State, System, unit_of, units_of
 from ..catalog import WhippleBicycle
 from ._bicycle import straight_ahead

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import as_names, refuse_unknown
 from .._integrate.trajectory import refuse_other_system
-from .._kane.api import dependent_speeds
+from .._kane.api import dependent_speeds, diagnosis
 from .._kane.arguments import (
     as_array,
     check_is_system,
@@ -28,14 +28,12 @@ from .._kane.arguments import (
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import SINGULAR_ROUNDING, configuration_residual
 from .._kane.contact.forces import has_contacts
-from .._kane.diagnosis import diagnosis
 from .._kane.right_hand_side import has_outputs, output_names, outputs_at, rates, values_of
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Component, Numbers, solve, stack
 from .._scalarjit.nan import nan_where
 from .._scalarjit.scalar_function import ScalarFunction
-from .._system.parameters import parameters_in
-from .._system.prints import concrete_numbers, text_of, wrapped
+from .._system.parameters import concrete_numbers, parameters_in, text_of, wrapped
 from .._system.system import NamedVector, State, System, call_with_states
 from ._matrix_eigenvalues import Eig, eig, eigenvalues_text, eigvals
 from ._steady import (

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from .._scalarjit.backends import native
+from .._scalarjit import native
 from .._scalarjit.components import Numbers
 from .._scalarjit.nan import nan_if_moved
 from .._scalarjit.scalar_function import ScalarFunction

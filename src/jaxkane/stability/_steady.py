@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._common.lookup import as_names, by_name, refuse_unknown
-from .._kane.api import dependent_speeds
+from .._kane.api import dependent_speeds, diagnosis
 from .._kane.arguments import (
     as_array,
     check_is_system,
@@ -27,7 +27,6 @@ from .._kane.arguments import (
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import configuration_residual
 from .._kane.contact.forces import closed_contacts, refuse_closed_contacts
-from .._kane.diagnosis import diagnosis
 from .._kane.kanes_method import rates_and_forcing
 from .._kane.right_hand_side import first_order_rates, rates, rates_by_numpy, values_of
 from .._kane.scaling import least_norm, rank_tolerance, relative, singular_values, without_rounding
@@ -36,7 +35,7 @@ from .._scalarjit.cache_key import jit, version_of
 from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component, Numbers
 from .._scalarjit.nan import nan_where
-from .._system.prints import text_of, wrapped
+from .._system.parameters import text_of, wrapped
 from .._system.system import State, System, named_numbers, names_of, units_of
 from ._sizes import coordinate_sizes, sizes_of
 

@@ -19,12 +19,11 @@ from jaxtyping import PyTree
 from .._integrate.integrate import solve
 from .._integrate.settings import Settings
 from .._integrate.trajectory import Trajectory
-from .._scalarjit.backends import native as kernels
+from .._scalarjit import native as kernels
 from .._scalarjit.cache import Cache
 from .._scalarjit.cache_key import jit, version_of
-from .._scalarjit.captured_values import CapturedValues
 from .._scalarjit.components import Numbers
-from .._scalarjit.digest import digest
+from .._scalarjit.digest import CapturedValues, digest
 from .._system.system import State, explain_value_of_traced
 from ._members import start_of, system_and_signals
 

@@ -18,9 +18,9 @@ from jaxtyping import PyTree
 
 from .._common.files import SCRATCH, atomic_write, differences, remove_abandoned
 from .._integrate.settings import Settings
-from .._scalarjit.backends.native import is_on
 from .._scalarjit.components import Numbers
 from .._scalarjit.digest import digest
+from .._scalarjit.native import is_on
 from .._system.system import State, System
 from ._chunks import versions
 from ._members import Table

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from .._kane.expression_graph import Formulas
-from .._scalarjit.backends.source import count_operations, uses
 from .._scalarjit.graph import needed, reads
+from .._scalarjit.source import count_operations, uses
 from .._system.system import System
 from ._sympy import (
     Expression,

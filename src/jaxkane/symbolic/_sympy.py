@@ -15,8 +15,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from .._kane.expression_graph import Formulas
-from .._scalarjit.backends.source import as_objects
 from .._scalarjit.graph import OPERATORS, NotScalarError, needed
+from .._scalarjit.source import as_objects
 
 Expression: TypeAlias = Any
 """An expression or a matrix of SymPy, which is an optional dependency."""

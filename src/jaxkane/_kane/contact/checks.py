@@ -8,10 +8,11 @@ from jaxtyping import Array
 from ..._common.lookup import refuse_if
 from ..._scalarjit.compat import concretely
 from ..._scalarjit.components import Component, Numbers, as_vector
+from ..._scalarjit.nan import constant
 from ..._scalarjit.scalar_function import ScalarFunction
 from ..._system.parameters import in_batches
 from ..._system.system import System
-from ..arguments import is_concrete, without_derivatives
+from ..arguments import is_concrete
 from ..constraint_residuals import configuration_residual
 from ..description import at_random_point
 from ..kanes_method import KaneEquations
@@ -44,7 +45,7 @@ def check_contacts(system: System, t: Component, q: Numbers, *, may_penetrate: b
     if not has_contacts(system) or in_batches(system):
         return
     layout, rng = layout_of(system), np.random.default_rng(0)
-    given = without_derivatives((system, t, q))
+    given = constant((system, t, q))
     with concretely(), np.errstate(all="ignore"):
         system, t, q = at_random_point(given, rng)
         t = np.asarray(t, q.dtype)

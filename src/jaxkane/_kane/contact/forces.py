@@ -35,6 +35,7 @@ from ..._scalarjit.compat import depends_on
 from ..._scalarjit.components import (
     ZERO3,
     Component,
+    Numbers,
     add,
     as_vector,
     component,
@@ -48,13 +49,13 @@ from ..._scalarjit.scalar_function import ScalarFunction
 from ..._system.kinematics import Frame, Vector
 from ..._system.motion import Motion
 from ..._system.system import System
-from ..arguments import Row
+from ..arguments import InputValues, Row, has_multipliers
 from ..constraint_residuals import configuration_tolerance
 from ..description import dtype_of, jvp
 from ..kanes_method import KaneEquations
-from ..scaling import term_sizes
+from ..scaling import RowBasis, term_sizes
 from .declarations import Contact, DryFriction
-from .impulses import Permanent, RowBasis, inverse_root
+from .impulses import Permanent, inverse_root
 from .laws import MOST_CONTACTS, SLIDES, STICKS, force_scales, with_friction
 
 
@@ -100,11 +101,6 @@ NO_CONTACTS = ContactLayout((), (), (), False, (), ())
 
 def has_contacts(system: System) -> bool:
     return type(system).contacts is not System.contacts
-
-
-def has_multipliers(system: System) -> bool:
-    """Whether the constraints of a system have multipliers instead of dependent speeds."""
-    return hasattr(system, "multiplier_residuals")
 
 
 def layout_of(system: System) -> ContactLayout:
@@ -307,10 +303,10 @@ class ContactRows:
                 rows.append([v.dot(motion.N.vector(*e)) for e in self.axes(contact, i, motion.N)])
         return rows
 
-    def axes(self, contact: Any, i: int, N: Frame) -> list[Row]:
+    def axes(self, contact: Contact | DryFriction, i: int, N: Frame) -> list[Row]:
         """The normal and the tangents of contact i, with components in N; zero if they do not exist."""
         d = self.layout.d
-        if not self.layout.has_point[i]:
+        if isinstance(contact, DryFriction) or not self.layout.has_point[i]:
             return [ZERO3] * (1 + d)
         normal = _unit_normal(contact, N)
         has_tangents = self.layout.has_friction[i]
@@ -364,7 +360,7 @@ def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True)
     return ContactTerms(gaps, v.reshape(c, r), size.reshape(c, r), C, b, X, w, laws, T, Q, a0, shift)
 
 
-def _laws(contact: Any) -> tuple[Component, Component, Component]:
+def _laws(contact: Contact | DryFriction) -> tuple[Component, Component, Component]:
     if isinstance(contact, DryFriction):
         return 0.0, component(contact.kinetic), component(contact.static)
     return component(contact.restitution), component(contact.friction), component(contact.static)
@@ -551,7 +547,7 @@ def without_gaps(terms: ContactTerms, closed: Array, q: Array) -> Array:
 
 
 def forces_in_contact(
-    system: System, layout: ContactLayout, t: Component, q: Array, u: Array, memory: Array | None, values: Any
+    system: System, layout: ContactLayout, t: Component, q: Array, u: Array, memory: Array | None, values: InputValues
 ) -> tuple[KaneEquations, Array, ContactForces, ContactTerms]:
     """Kane's equations at the projected speeds, these speeds, the contact forces and accelerations, and the terms."""
     states = ContactMemory.unpacked(layout, jnp.zeros(layout.memory_size, q.dtype) if memory is None else memory)
@@ -563,7 +559,7 @@ def forces_in_contact(
 
 
 @ScalarFunction
-def terms_at(system: System, t: Component, q: Array, u: Array, values: Any) -> ContactTerms:
+def terms_at(system: System, t: Component, q: Array, u: Array, values: InputValues) -> ContactTerms:
     """The terms of all contacts at speeds that are not projected."""
     return _terms(KaneEquations(system, t, q, u, values), layout_of(system))
 
@@ -580,7 +576,7 @@ def gap_sizes(system: System, t: Component, q: Array, u: Array) -> tuple[Array, 
     return gaps(system, t, q, u), term_sizes(gaps, system, t, q, u)
 
 
-def closed_contacts(system: System, t: Component, q: Array) -> Array:
+def closed_contacts(system: System, t: Component, q: Numbers) -> Array:
     """Whether each contact (c,) touches or penetrates. True for each `DryFriction`, which always acts."""
     if not has_contacts(system):
         return jnp.zeros(0, bool)

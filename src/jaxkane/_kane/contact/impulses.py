@@ -37,6 +37,7 @@ from ..._common.lookup import checked, not_there, refuse_if
 from ..._scalarjit.cache_key import jit
 from ..._scalarjit.components import (
     Component,
+    Numbers,
     Rows,
     add,
     as_vector,
@@ -56,12 +57,13 @@ from ..._scalarjit.nan import nan_where
 from ..._scalarjit.scalar_function import ScalarFunction
 from ..._system.kinematics import Frame, Point
 from ..._system.motion import flatten_residuals
-from ..._system.prints import module_text
+from ..._system.parameters import module_text
 from ..._system.system import NamedVector, System
 from ..api import checked_arrays, finite_or_explained
-from ..arguments import Row, as_row, check_number, is_concrete
+from ..arguments import Coordinates, InputArrays, Row, Speeds, Time, as_row, check_number, has_multipliers, is_concrete
 from ..kanes_method import KaneEquations, mass_matrix_columns
-from ..reactions import AuxiliarySpeeds
+from ..multipliers import AuxiliarySpeeds
+from ..scaling import RowBasis
 
 
 class Impact(eqx.Module):
@@ -96,7 +98,7 @@ class Impact(eqx.Module):
     restitution: tuple[Component, ...]
     release: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(self, *velocity_residuals: Any, restitution: Any = 0.0, release: Any = ()):
+    def __init__(self, *velocity_residuals: Any, restitution: Coefficients = 0.0, release: str | Sequence[str] = ()):
         label = "Impact(*velocity_residuals): the velocity residuals"
         counts = [len(flatten_residuals(each, label)) for each in velocity_residuals]
         self.residuals = flatten_residuals(velocity_residuals, label)
@@ -105,7 +107,7 @@ class Impact(eqx.Module):
         self.release = checked_release(release)
 
 
-def checked_restitution(value: Any, label: str = "Impact") -> Any:
+def checked_restitution(value: Coefficients, label: str = "Impact") -> Any:
     is_one = not isinstance(value, (tuple, list)) and getattr(value, "ndim", 0) != 1
     values: Any = (value,) if is_one else value
     for e in values:
@@ -115,7 +117,7 @@ def checked_restitution(value: Any, label: str = "Impact") -> Any:
     return value if is_one else tuple(value)
 
 
-def _for_each(restitution: Any, counts: Sequence[int]) -> tuple[Component, ...]:
+def _for_each(restitution: Coefficients, counts: Sequence[int]) -> tuple[Component, ...]:
     """One coefficient for each residual. `counts`: the number of residuals in each argument."""
     values = restitution if isinstance(restitution, tuple) else (restitution,) * sum(counts)
     if len(values) == len(counts) != sum(counts):  # one for each Vector
@@ -128,7 +130,7 @@ def _for_each(restitution: Any, counts: Sequence[int]) -> tuple[Component, ...]:
     return tuple(component(e) for e in values)
 
 
-def checked_release(release: Any) -> tuple[str, ...]:
+def checked_release(release: str | Sequence[str]) -> tuple[str, ...]:
     """Names of released parts, each once."""
     names = (release,) if isinstance(release, str) else release
     if not isinstance(names, (tuple, list)) or not all(isinstance(name, str) for name in names):
@@ -137,6 +139,9 @@ def checked_release(release: Any) -> tuple[str, ...]:
         )
     return tuple(dict.fromkeys(names))
 
+
+Coefficients: TypeAlias = Component | Sequence[Component]
+"""One coefficient of restitution for all residuals, or one for each."""
 
 ReadImpact: TypeAlias = Callable[[Component, Row, Row], Impact]
 """(t, q, u_all) -> the impact, with its residuals at the speeds u_all (n + k,)."""
@@ -200,7 +205,7 @@ def after_impact(kane: KaneEquations, read: ReadImpact) -> ImpactSolution:
 
 
 def impact_at(
-    system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array], read: ReadImpactOf
+    system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, read: ReadImpactOf
 ) -> ImpactSolution:
     """`after_impact` from checked arrays, for any number of speeds.
 
@@ -215,19 +220,21 @@ def impact_at(
 
 
 @ScalarFunction
-def _impact_written_out(system, t, q, u, inputs, read):
+def _impact_written_out(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, read: ReadImpactOf):
     return after_impact(KaneEquations(system, t, q, u, inputs), functools.partial(read, system))
 
 
 @ScalarFunction
-def _residuals_along(system, t, q, u, inputs, read, direction):
+def _residuals_along(
+    system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, read: ReadImpactOf, direction: Speeds
+):
     kane = KaneEquations(system, t, q, u, inputs)
-    direction = kane.with_dependent(as_row(direction, system.speeds, "direction"))
-    return as_vector(BeforeImpact(kane, functools.partial(read, system)).along(direction), q)
+    along = kane.with_dependent(as_row(direction, system.speeds, "direction"))
+    return as_vector(BeforeImpact(kane, functools.partial(read, system)).along(along), q)
 
 
 @ScalarFunction
-def _quantities(system, t, q, u, inputs, read):
+def _quantities(system: System, t: Time, q: Coordinates, u: Speeds, inputs: InputArrays, read: ReadImpactOf):
     return BeforeImpact(KaneEquations(system, t, q, u, inputs), functools.partial(read, system)).quantities()
 
 
@@ -281,7 +288,7 @@ class Permanent(NamedTuple):
     @classmethod
     def of(cls, kane: KaneEquations) -> Permanent | None:
         system: Any = kane.system
-        if not hasattr(system, "multiplier_residuals"):
+        if not has_multipliers(system):
             return None
         residuals = functools.partial(system.multiplier_residuals, kane.t, kane.q)
         return cls(kane.jacobian(residuals), stack([residuals(kane.u_all)])[0].astype(kane.dtype))
@@ -320,7 +327,7 @@ class BeforeImpact:
         deviation = [sub(sub(x, y), z) for x, y, z in zip(r, r0, slope, strict=True)]
         size = [total(map(abs, terms)) for terms in zip(r, r0, slope, strict=True)]
         refuse_if(
-            impact.release and hasattr(kane.system, "multiplier_residuals"),
+            impact.release and has_multipliers(kane.system),
             f"{kane.name}: an impact with `release` is not supported for a system with multipliers. Use the system "
             "with dependent speeds (its attribute `inner`).",
         )
@@ -480,49 +487,6 @@ def _inverse_root(M: Rows, sizes: Sequence[Component] | None) -> tuple[Rows, Row
     return [[jnp.where(regular[i], x, 0.0) for i, x in enumerate(row)] for row in X], Z
 
 
-class RowBasis(NamedTuple):
-    """A = T Q with orthonormal rows of Q, for A (m, n).
-
-    As `constraints.least_change`, but with products of scalars only. A row that is zero or depends linearly on the
-    previous ones is omitted: its row of Q (m, n) and its column of T
-    (m, m) are zero. `is_new` (m,): whether each row is used.
-    """
-
-    Q: Array
-    T: Array
-    is_new: Array
-
-    @classmethod
-    def of(cls, A: Array, redundant: float = 0.0) -> RowBasis:
-        """`redundant`: the largest part of a row, relative to the row, that is regarded as dependent."""
-        m, threshold = len(A), max(redundant, float(jnp.finfo(A.dtype).eps) ** 0.75)
-        Q, T, is_new = jnp.zeros((0, A.shape[1]), A.dtype), [], []
-        for i in range(m):
-            rest, row = A[i], jnp.zeros(i, A.dtype)
-            for _ in range(2 if i else 0):  # Gram-Schmidt twice: after one pass, it is not orthogonal within rounding
-                along = Q @ rest
-                rest, row = rest - along @ Q, row + along
-            is_used = jax.lax.stop_gradient(jnp.max(jnp.abs(rest)) > threshold * jnp.max(jnp.abs(A[i])))
-            norm = jnp.sqrt(jnp.sum(jnp.where(is_used, rest, 1.0) ** 2))  # the derivative of a norm of zero is NaN
-            Q = jnp.concatenate([Q, jnp.where(is_used, rest / norm, 0.0)[None]])
-            T.append(jnp.concatenate([row, jnp.where(is_used, norm, 0.0)[None], jnp.zeros(m - i - 1, A.dtype)]))
-            is_new.append(is_used)
-        return cls(Q, jnp.stack(T), jnp.stack(is_new))
-
-    def solve(self, b: Array) -> tuple[Array, Array]:
-        """y (m,) of T y = b, and the part of b (m,) that the omitted rows do not satisfy. Then w = Q^T y."""
-        y, missing = jnp.zeros(0, b.dtype), []
-        for i in range(len(b)):
-            remainder, is_used = b[i] - self.T[i, :i] @ y if i else b[i], self.is_new[i]
-            y = jnp.concatenate([y, jnp.where(is_used, remainder / jnp.where(is_used, self.T[i, i], 1.0), 0.0)[None]])
-            missing.append(jnp.where(is_used, 0.0, remainder))
-        return y, jnp.stack(missing)
-
-    def least_norm(self, b: Array) -> Array:
-        """The smallest solution w (n,) of A w = b, without the omitted rows."""
-        return self.solve(b)[0] @ self.Q
-
-
 class _OfFunction(eqx.Module):
     function: Callable[..., Any]
     restitution: Any
@@ -543,11 +507,11 @@ _compiled = jit(impact_at)
 def impact(
     system: System,
     t: Component,
-    q: Any,
-    u: Any,
+    q: Numbers,
+    u: Numbers,
     residuals: Callable[..., Any],
-    restitution: Any = 0.0,
-    release: Any = (),
+    restitution: Coefficients = 0.0,
+    release: str | Sequence[str] = (),
 ) -> ImpactResult:
     """The speeds after an impact, by Kane's impulse equations. See `Impact` for the equations.
 
@@ -591,7 +555,7 @@ def impact(
     return result
 
 
-def _explain(solution: ImpactSolution, arrays: Any) -> None:
+def _explain(solution: ImpactSolution, arrays: tuple[System, Array, Array, Array, InputArrays]) -> None:
     if np.isfinite(solution.result.energy_lost):
         return
     name, C, is_affine = type(arrays[0]).__name__, np.asarray(solution.C), np.asarray(solution.is_affine)

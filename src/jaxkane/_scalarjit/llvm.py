@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from ..graph import LIBRARY, Graph, NotScalarError, depth_first, needed, symbol
+from .graph import LIBRARY, Graph, NotScalarError, depth_first, needed, symbol
 
 # Byte offsets in the structures of xla/ffi/api/c_api.h, major version 0, with addresses of eight bytes.
 LAYOUT = types.SimpleNamespace(

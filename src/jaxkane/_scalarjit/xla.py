@@ -28,9 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..compat import ClosedJaxpr, jaxpr_as_fun, one_function
-from ..graph import ARITHMETIC, COMPARISONS, DTYPES, LIBRARY, LOGIC, SIMPLE, NotScalarError, graph_of, needed
-from ..jaxpr import replaced
+from .compat import ClosedJaxpr, jaxpr_as_fun, one_function
+from .graph import ARITHMETIC, COMPARISONS, DTYPES, LIBRARY, LOGIC, SIMPLE, NotScalarError, graph_of, needed
+from .jaxpr import replaced
 
 _FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(jax.lax, name) for name in ARITHMETIC | COMPARISONS | LIBRARY | SIMPLE | {"neg", "select"}},
@@ -110,7 +110,7 @@ class Windows:
     def is_long(self) -> bool:
         return len(self.order) > _LONG
 
-    def _combined(self, _: Any, elements: Sequence[Any]) -> tuple[Any, ...]:
+    def _combined(self, _: object, elements: Sequence[Any]) -> tuple[Any, ...]:
         values = {k: x for (k, *_), x in zip(self.elements, elements, strict=True)}
         for k in self.order:
             operation, operands, dtype = self.graph.nodes[k]
@@ -155,7 +155,7 @@ def one_chunk_at_a_time(
     """
     n = next(x.shape[0] for x, is_in in zip(args, in_batch, strict=True) if is_in)
 
-    def chunk(i: Any, outputs: list[Any]) -> list[Any]:
+    def chunk(i: Array, outputs: list[Any]) -> list[Any]:
         start = jnp.minimum(i * size, n - size)
         slices = [jax.lax.dynamic_slice_in_dim(x, start, size) if b else x for x, b in zip(args, in_batch, strict=True)]
         put = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=start, axis=0)
