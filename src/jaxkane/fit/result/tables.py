@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..._common.files import differences
 from ..._common.lookup import refuse_unknown
@@ -23,11 +24,11 @@ from ..._scalarjit.compat import on_device
 from ..._system.system import System
 from ..problem.declarations import leaf_names
 from ..problem.model import Prediction, Simulation
+from ..problem.parameters import Parameters
 from ..problem.problem import Problem
 from ..problem.trial import trial_names
-from ..solve.blocks import Blocks
 from ..solve.checkpoints import described, read_state, tree_of, write_state
-from ..solve.linearization import Linearization
+from ..solve.linearization import Blocks, Linearization
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -125,7 +126,39 @@ def _true_values(fit: Any, truth: Mapping[str, float] | System | None) -> dict[s
     return {name: float(jnp.ravel(leaves[leaf])[place]) for name, (leaf, place, _) in targets.items()}
 
 
-class Export:
+class Estimates:
+    """What the results of all fits have: names, values and formal errors of the parameters."""
+
+    problem: Problem
+    covariance: Any
+
+    @property
+    def parameters(self) -> Parameters:
+        return self.problem.parameters
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.parameters.names
+
+    @property
+    def start(self) -> dict[str, float]:
+        return self._by_name(self.parameters.start)
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        return self._by_name(np.sqrt(self.covariance.diagonal()))
+
+    @property
+    def correlation(self) -> np.ndarray:
+        deviation = np.sqrt(self.covariance.diagonal())
+        with np.errstate(invalid="ignore"):
+            return self.covariance / np.outer(deviation, deviation)
+
+    def _by_name(self, values: ArrayLike) -> dict[str, float]:
+        return dict(zip(self.names, np.asarray(values, float).tolist(), strict=True))
+
+
+class Export(Estimates):
     """The methods of a `Fit` that return or write its contents as data."""
 
     def to_pandas(self: Any, level: float = 0.95) -> pd.DataFrame:
@@ -167,7 +200,7 @@ class Export:
         trials, channels = self.problem.trials, self.problem.channels
         n_t, names = max(len(trial.t) for trial in trials), self.trial_names
 
-        def padded(x: Any) -> np.ndarray:
+        def padded(x: Sequence[float] | np.ndarray) -> np.ndarray:
             return np.pad(np.asarray(x, float), (0, n_t - len(x)), constant_values=np.nan)
 
         rows = {

@@ -12,11 +12,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from ..._common.files import atomic_write, differences
 from ..._scalarjit.digest import digest
 from ..._system.parameters import leaf_name
+from ..problem.model import Model
 from ..problem.problem import Problem
+from ..problem.windows import Windows
 from .kalman import filtered
 
 _RESUME = (
@@ -52,7 +55,7 @@ def read_state(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         ) from None
 
 
-def tree_of(path: Path, arrays: Mapping[str, np.ndarray], name: str, like: Any) -> Any:
+def tree_of(path: Path, arrays: Mapping[str, np.ndarray], name: str, like: PyTree) -> Any:
     """The saved tree with this name, with the structure of `like`.
 
     **Raises:** `ValueError` if a part of it is missing.
@@ -117,7 +120,7 @@ def described(problem: Problem) -> dict[str, Any]:
     fixed = {name: x for i, name, x in leaves if eqx.is_array(x) and i not in changed}
     guessed = [x for i, _, x in leaves if eqx.is_array(x) and i in changed]
 
-    def residuals(numbers, window, z, b, x):
+    def residuals(numbers: Model, window: Windows, z: Array, b: Array, x: Array):
         model = eqx.combine(numbers, rest)
         start = model.consistent(window, z, x)
         if model.noise is not None:
