@@ -34,9 +34,9 @@ from jaxkane.fit import (
     save_report,
     validate,
 )
+from jaxkane.fit.result.data import html_table, html_text
 from jaxkane.fit.result.statistics import residual_test
 from jaxkane.fit.result.studies import MultiStart
-from jaxkane.fit.result.tables import html_table, html_text
 from jaxkane.fit.solve.optimizers import solve_nuisance
 
 NAMES = ("mass", "stiffness", "damping")

@@ -53,8 +53,8 @@ from .problem.problem import Problem
 from .problem.specification import ProblemSpec
 from .problem.trial import Trial, trial_names
 from .problem.windows import state_names
+from .result.data import Estimates, parameter_rows, text_table
 from .result.statistics import intervals, t_quantile
-from .result.tables import Estimates, parameter_rows, text_table
 
 
 class Kkt:

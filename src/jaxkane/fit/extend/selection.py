@@ -16,12 +16,12 @@ from tqdm import tqdm
 from ..._common.lookup import refuse, refuse_unknown, whole_number
 from ..._scalarjit.compat import on_device
 from ..problem.specification import parameters_of, refuse_other
+from ..result.data import Rows, Tables, html_tables, text_tables
 from ..result.diagnostics import AT_A_MINIMUM, Ranges, implausible, plausible_of, refuse_unless_at_a_minimum
 from ..result.fit_result import Fit
 from ..result.linearized import LinearizedProblem, Score, linearized_problem, score_test, trial_folds
 from ..result.statistics import check_level
 from ..result.studies import energy_sources
-from ..result.tables import Rows, Tables, html_tables, text_tables
 from ..solve.fit import search, solve, uninterrupted
 from ..solve.optimizers import LeastSquares, usable
 from .candidates import (

@@ -21,9 +21,9 @@ from ..._kane.regressor import Bodies
 from ..._scalarjit.cache_key import jit
 from ..._system.parameters import leaf_name
 from ..._system.system import System
+from ..result.data import text_table
 from ..result.identifiability import combination
 from ..result.statistics import Clusters, infinite_along, jackknife
-from ..result.tables import text_table
 from .kinematics import KinematicSamples, Motions, kinematic_samples
 from .regressor import Names, Regressor, RegressorSpec, check_linear, input_names, regressor_spec
 

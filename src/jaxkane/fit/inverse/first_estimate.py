@@ -21,8 +21,8 @@ from ..problem.declarations import Items
 from ..problem.parameters import Parameters
 from ..problem.specification import parameters_of
 from ..problem.trial import Trial
+from ..result.data import text_table
 from ..result.diagnostics import describe_bodies
-from ..result.tables import text_table
 from .base_parameters import BaseParameters, base_structure, equations_at, estimated, states_for
 from .kinematics import Motions, kinematic_samples, max_spacing
 from .regressor import RegressorSpec, check_linear

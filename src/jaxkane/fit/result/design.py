@@ -24,8 +24,8 @@ from ..problem.problem import Problem
 from ..problem.trial import Trial
 from ..problem.windows import Windows, state_names
 from ..solve.linearization import by_next, jacobian_of, map_windows, starts_of
+from .data import text_table
 from .statistics import infinite_along
-from .tables import text_table
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,10 +24,10 @@ from ..problem.trial import trial_names
 from ..solve.linearization import Linearization
 from . import diagnostics as diagnostics
 from . import statistics as statistics
+from .data import Export, costs_in_words, read_fit
 from .identifiability import Identifiability, identifiability_at
 from .linearized import Posterior, linearized_problem, trial_folds
 from .statistics import ByTrial, ResidualTest, infinite_along
-from .tables import Export, costs_in_words, read_fit
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,8 +15,8 @@ from ..problem.problem import Problem
 from ..problem.specification import refuse_other
 from ..solve.linearization import Linearization, eliminate
 from ..solve.optimizers import solve_nuisance
+from .data import Rows, text_table
 from .statistics import formal_covariance, infinite_along, prior_information
-from .tables import Rows, text_table
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,11 +21,11 @@ from ..._common.lookup import label_of
 from ..._system.system import System
 from ..extend.selection import ForwardSelection
 from ..problem.specification import refuse_other
+from .data import Rows, costs_in_words, html_table, html_text, parameter_rows, text_table
 from .diagnostics import STATUS
 from .fit_result import Fit
 from .statistics import autocorrelations
 from .studies import Profile, check_signs
-from .tables import Rows, costs_in_words, html_table, html_text, parameter_rows, text_table
 from .validation import CrossValidation, cross_validate
 
 

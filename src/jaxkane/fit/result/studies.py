@@ -26,10 +26,10 @@ from ..problem.specification import refuse_other
 from ..problem.windows import Windows
 from ..solve.fit import minimize, search, uninterrupted
 from ..solve.optimizers import LeastSquares, Optimizer, solve_nuisance
+from .data import text_table
 from .diagnostics import AT_A_MINIMUM, poorly_fitted_channels, refuse_unless_at_a_minimum
 from .fit_result import Fit
 from .statistics import FEWEST_TRIALS, bootstrap_steps, clustered, t_quantile
-from .tables import text_table
 
 
 @dataclasses.dataclass(frozen=True)

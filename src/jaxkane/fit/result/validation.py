@@ -24,11 +24,11 @@ from ..problem.trial import Trial, as_trials, trial_names
 from ..solve.fit import search, uninterrupted, with_distributions
 from ..solve.linearization import Blocks, Linearization
 from ..solve.optimizers import LeastSquares, Unsimulated, solve_nuisance
+from .data import Rows, Tables, html_tables, text_table, text_tables
 from .diagnostics import AT_A_MINIMUM, STATUS, implausible, plausible_of
 from .fit_result import Fit
 from .linearized import trial_folds
 from .statistics import LARGEST_LEVERAGE, intervals, t_quantile
-from .tables import Rows, Tables, html_tables, text_table, text_tables
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -25,9 +25,9 @@ from ..problem.model import Simulation, Unknowns
 from ..problem.problem import Problem, finer, residual_deviation
 from ..problem.specification import refuse_other, with_options
 from ..problem.trial import Trial, trial_names
+from ..result.data import Checkpoint
 from ..result.diagnostics import AT_A_MINIMUM
 from ..result.fit_result import Fit
-from .checkpoints import Checkpoint
 from .linearization import Linearization, eliminate, triangle
 from .optimizers import Iterate, LeastSquares, Optimizer, Unsimulated, moved, proposed, solve_nuisance, usable
 

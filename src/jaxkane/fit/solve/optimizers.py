@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from ..._common.lookup import real_number
 from ..._integrate.status import Status, reason
 from ..._scalarjit.compat import on_device
+from ..._scalarjit.components import Numbers
 from ..._scalarjit.digest import digest
 from ..problem.model import Unknowns
 from ..problem.problem import Problem
@@ -476,7 +477,7 @@ def _descend(transform: optax.GradientTransformation) -> Callable[..., tuple[Arr
     """A function for the step of optax: the parameter step, the new preconditioned coordinates, the new state."""
 
     @jax.jit
-    def descend(directions: Array, unit: Array, gradient: Array, of_optax: PyTree, y: Array):
+    def descend(directions: Numbers, unit: Numbers, gradient: Numbers, of_optax: PyTree, y: Numbers):
         # The schedules of optax mix integers and floats, which JAX rejects if the user has set strict type promotion.
         with jax.numpy_dtype_promotion("standard"):
             updates, of_optax = transform.update(directions.T @ gradient / unit, of_optax, y)
