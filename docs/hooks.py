@@ -103,7 +103,7 @@ SUBJECTS = {
         "result": ("Results, uncertainty, validation", "uncertainty"),
         "extend": ("Model extensions", "model_extensions"),
         "inverse": ("Inverse dynamics", "inverse_dynamics"),
-        "collocated": ("Fits by collocation", "process_noise"),
+        "_collocation": ("Fits by collocation", "process_noise"),
         "_bicycle": ("Bicycles", "bicycles_fit"),
     },
 }

@@ -7,7 +7,7 @@ import pytest
 from benchmarks.chain import Chain
 
 import jaxkane as jk
-from jaxkane.fit.solve.blocks import Blocks, eliminate
+from jaxkane.fit.solve.linearization import Blocks, eliminate
 
 N, SMALL = 40_000, 1000
 SYSTEMS = {"double pendulum": jk.catalog.DoublePendulum(mass=1.0, length=0.7), "chain": Chain(n=14)}

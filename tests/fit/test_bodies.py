@@ -9,7 +9,7 @@ import jaxkane as jk
 from jaxkane.catalog import RigidBody, WhippleBicycle
 from jaxkane.fit import Free, Inertia, LeastSquares, Problem, Trial, frame_inertia, minimize
 from jaxkane.fit.problem.bodies import PossibleBody
-from jaxkane.fit.problem.from_declarations import parameters_of
+from jaxkane.fit.problem.specification import parameters_of
 
 BICYCLE = WhippleBicycle.benchmark()
 MOMENTS = ("I11", "I22", "I33")

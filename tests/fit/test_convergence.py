@@ -12,9 +12,8 @@ from systems import POSED, PUSH, SEEN, SETS, TRIAL, Cart, T, Track, coverage_ban
 import jaxkane.fit.solve.fit as search
 from jaxkane.fit import Free, GradientDescent, LeastSquares, Problem, Simulation, Trial, fit, minimize
 from jaxkane.fit.problem.parameters import Interval
-from jaxkane.fit.solve.blocks import Blocks, eliminate
-from jaxkane.fit.solve.local_unknowns import Unsimulated
-from jaxkane.fit.solve.optimizers import Optimizer, negligible_gain, proposed, variance_of
+from jaxkane.fit.solve.linearization import Blocks, eliminate
+from jaxkane.fit.solve.optimizers import Optimizer, Unsimulated, negligible_gain, proposed, variance_of
 
 FREE = ("gain", "drift")
 

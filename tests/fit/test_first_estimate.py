@@ -11,7 +11,7 @@ from swings import FREE, Swing, random_samples, swings
 import jaxkane as jk
 from jaxkane.fit import Inertia, Trial, first_estimate, regressor
 from jaxkane.fit.inverse.kinematics import kinematic_samples, max_spacing
-from jaxkane.fit.problem.from_declarations import parameters_of
+from jaxkane.fit.problem.specification import parameters_of
 from jaxkane.fit.result.diagnostics import describe_bodies
 from jaxkane.joints import Actuator, Link, hinge, mechanism
 

@@ -24,7 +24,7 @@ from jaxkane.fit import (
     minimize,
 )
 from jaxkane.fit.solve import optimizers
-from jaxkane.fit.solve.blocks import Blocks, eliminate
+from jaxkane.fit.solve.linearization import Blocks, eliminate
 
 TRUTH = DoublePendulum(mass=1.2, length=0.7)
 GUESS = DoublePendulum(mass=1.0, length=0.8)

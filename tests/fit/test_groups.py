@@ -22,7 +22,7 @@ from jaxkane.fit import (
     multi_start,
     validate,
 )
-from jaxkane.fit.solve.variance_components import degrees_of_freedom
+from jaxkane.fit.result.statistics import degrees_of_freedom
 
 TIGHT = 1e-6
 T = np.linspace(0.0, 2.0, 21)

@@ -23,9 +23,8 @@ from jaxkane.fit import (
     save_report,
 )
 from jaxkane.fit.problem.specification import ProblemSpec
-from jaxkane.fit.solve.blocks import eliminate
-from jaxkane.fit.solve.local_unknowns import moved, refined
-from jaxkane.fit.solve.optimizers import Iterate, Optimizer
+from jaxkane.fit.solve.linearization import eliminate
+from jaxkane.fit.solve.optimizers import Iterate, Optimizer, moved, refined
 
 
 @dataclasses.dataclass(frozen=True)

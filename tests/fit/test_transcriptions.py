@@ -21,8 +21,8 @@ from jaxkane.fit import (
     Trial,
     minimize,
 )
-from jaxkane.fit.solve.blocks import Blocks, eliminate
-from jaxkane.fit.solve.local_unknowns import solve_nuisance
+from jaxkane.fit.solve.linearization import Blocks, eliminate
+from jaxkane.fit.solve.optimizers import solve_nuisance
 
 TRUTH = Cart(mass=1.3, stiffness=5.0, damping=0.4)
 GUESS = Cart(mass=1.0, stiffness=4.0, damping=0.2)

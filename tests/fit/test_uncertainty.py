@@ -34,10 +34,10 @@ from jaxkane.fit import (
     save_report,
     validate,
 )
+from jaxkane.fit.result.data import html_table, html_text
 from jaxkane.fit.result.statistics import residual_test
 from jaxkane.fit.result.studies import MultiStart
-from jaxkane.fit.result.tables import html_table, html_text
-from jaxkane.fit.solve.local_unknowns import solve_nuisance
+from jaxkane.fit.solve.optimizers import solve_nuisance
 
 NAMES = ("mass", "stiffness", "damping")
 T = np.arange(0.0, 4.0, 0.1)

@@ -28,7 +28,7 @@ from jaxkane.fit import (
 from jaxkane.fit.result import validation
 from jaxkane.fit.result.validation import CrossValidation, costs_by_trial
 from jaxkane.fit.solve.linearization import trajectories_of
-from jaxkane.fit.solve.local_unknowns import solve_nuisance
+from jaxkane.fit.solve.optimizers import solve_nuisance
 
 
 class Falling(Track):

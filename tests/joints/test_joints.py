@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane.fit.problem.from_declarations import parameters_of
+from jaxkane.fit.problem.specification import parameters_of
 from jaxkane.joints import (
     Actuator,
     Coupling,

@@ -15,9 +15,6 @@ from ._equipment import SteerByWire as SteerByWire
 from ._equipment import SteeringFriction as SteeringFriction
 from ._equipment import SteeringMotor as SteeringMotor
 from ._equipment import Trailer as Trailer
-from ._ground import Ground as Ground
-from ._ground import Road as Road
-from ._ground import Slope as Slope
 from ._literature import browser_jason as browser_jason
 from ._literature import sharp_motorcycle as sharp_motorcycle
 from ._literature import toroidal as toroidal
@@ -28,10 +25,13 @@ from ._rider import Rider as Rider
 from ._rider import RigidRider as RigidRider
 from ._rider import separate_rider as separate_rider
 from ._tyre import Contact as Contact
+from ._tyre import Ground as Ground
 from ._tyre import LateralSlip as LateralSlip
 from ._tyre import LongitudinalSlip as LongitudinalSlip
 from ._tyre import MagicFormula as MagicFormula
 from ._tyre import MagicFormula89 as MagicFormula89
+from ._tyre import Road as Road
+from ._tyre import Slope as Slope
 from ._tyre import Tyre as Tyre
 from ._tyre import TyreForceLaw as TyreForceLaw
 from ._tyre import schwalbe_energizer as schwalbe_energizer

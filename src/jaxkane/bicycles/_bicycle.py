@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,18 +17,18 @@ import jax.numpy as jnp
 
 from .._common.lookup import not_there, refuse_unknown
 from .._kane.arguments import as_row, is_concrete
-from .._kane.right_hand_side import named_row
+from .._kane.right_hand_side import MeasurementContext, named_row
 from .._scalarjit.components import Component, add, component, total
 from .._system.kinematics import Frame, Point, Vector, inertial
 from .._system.motion import Body, DuplicateName
 from .._system.parameters import parameters_in, with_parameters
 from .._system.system import NamedVector
+from ..catalog._entry import Loads, Quantity, Values
 from ..catalog.bicycle import WhippleBicycle
 from ._equipment import HeadTwist
 from ._files import as_meijaard, read_yaml
-from ._ground import Ground, Slope
 from ._part import NAMES, BicycleMotion, Contact, Part, called
-from ._tyre import Tyre
+from ._tyre import Ground, Slope, Tyre
 
 OFF_ROAD = 1e-3
 """[m]: a simulation on a `Road` ends if the distance of a contact from the road exceeds this value."""
@@ -39,7 +39,7 @@ _SECOND_OF_A_KIND = "Values are read by name. For a second part of this kind, wr
 _ASIDE = ("_lateral_slip", "_lateral_deflection")
 
 
-def _as_tuple(parts: Any) -> tuple[Any, ...]:
+def _as_tuple(parts: object) -> tuple[Any, ...]:
     if isinstance(parts, (tuple, list)):
         return tuple(parts)
     return () if parts is None else (parts,)
@@ -241,7 +241,7 @@ class Bicycle(WhippleBicycle):
         groups |= dict(zip(("wobble", "front end"), [names for names in elastic if names], strict=False))
         return {name: names for name, names in groups.items() if names}
 
-    def q_dot(self, t, q, u):
+    def q_dot(self, t: Component, q: NamedVector, u: NamedVector) -> Sequence[Component]:
         turning = [u[f"{name}_rate"] for name in ("roll", "rear_wheel", "steer", "yaw", "pitch", "front_wheel")]
         road: Any = self.road
         rates = road.rates(q["x"], q["y"], q["yaw"], *self._contact_rates(q, u))
@@ -256,11 +256,10 @@ class Bicycle(WhippleBicycle):
     def steer_point(self) -> tuple[Component, Component]:
         """x, z of the point S [m], measured from the rear contact of the upright bicycle. S is the point on the steer
         axis that is nearest to the rear wheel's centre (Example 7)."""
-        cos, sin = jnp.cos(self.lam), jnp.sin(self.lam)
-        x = (self.w + self.c) * cos * cos - self.rR * sin * cos
-        return x, -self.rR - x * sin / cos
+        x, above = self._steer_point()
+        return x, -self.rR - above
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> BicycleMotion:
         motion = self._motion_without_parts(q, u)
         for _, place, part in self._placed_parts():
             try:
@@ -282,38 +281,20 @@ class Bicycle(WhippleBicycle):
         )
         Y = T.rotate(3, q["yaw"], u["yaw_rate"], "Y")
         R = Y.rotate(1, q["roll"], u["roll_rate"], "R")
-        B = R.rotate(2, q["pitch"], u["pitch_rate"], "B")  # rear frame
-        tilted = B.rotate(2, self.lam, 0.0, "tilt")
-
-        xS, zS = self.steer_point
-        omega_A = B.angular_velocity + u["rear_wheel_rate"] * B.y
         along, across = self._slip(REAR, u)
         place = q["x"] * N.x + q["y"] * N.y
         if self.road.curved:
             place = place - q["rear_height"] * N.z
-        r_P_A = -self.rear_tyre.reach(R.z, T.z, self.rR)
         P = Point(Y.vector(along, across, 0.0), O, place)  # point of the tyre
-        G_A = Point(P.velocity + omega_A.cross(r_P_A), P, r_P_A)
-        G_B = G_A.fixed(self.xB * B.x + (self.zB + self.rR) * B.z)
-        S = G_A.fixed(xS * B.x + (zS + self.rR) * B.z)
-        if self.head is not None:
-            tilted, S = self.head.turned(tilted, S, q, u)
-        C = tilted.rotate(3, q["steer"], u["steer_rate"], "C")  # fork, 3 along the steer axis
-        H = C.rotate(2, -self.lam, 0.0, "H")  # fork, aligned with B at zero steer
-
-        def from_S(x, z):  # measured from P of the upright bicycle, as a vector fixed in the fork
-            return ((x - xS) * H.x + (z - zS) * H.z).express(C)
-
-        G_C = S.fixed(from_S(self.xH, self.zH))
-        G_D = S.fixed(from_S(self.w, -self.rF))
-        omega_D = C.angular_velocity + u["front_wheel_rate"] * C.y
+        r_P_A, head = -self.rear_tyre.reach(R.z, T.z, self.rR), self.head
+        twisted = None if head is None else lambda tilted, S: head.turned(tilted, S, q, u)
+        bodies, S, B, C, H = self._linkage(R, P, r_P_A, q, u, twisted)
+        front = bodies[-1]
         normal = self.road.normal(N, *self._front_place(q))
         n1, _, n3 = normal.components_in(C)
         down = C.vector(n1, 0.0, n3).normalize()  # in the plane of the front wheel
         r_D_Q = self.front_tyre.reach(down, normal, self.rF)
-        Q = Point(G_D.velocity + omega_D.cross(r_D_Q), G_D, r_D_Q)
-
-        bodies = self.bodies((G_A, G_B, G_C, G_D), (R, B, H, C), omega_A, omega_D)
+        Q = Point(front.center.velocity + front.angular_velocity.cross(r_D_Q), front.center, r_D_Q)
         frames = {"Y": Y, "B": B, "C": C, "H": H}
         motion = BicycleMotion(bodies, points={"P": P, "Q": Q, "S": S}, frames=frames)
         motion.rear = Contact(P, Y.x, Y.y, T.z, R.z, q["roll"], forward, (along, across))
@@ -368,11 +349,11 @@ class Bicycle(WhippleBicycle):
             residuals += [moved.dot(heading) - speed, moved.dot(across) - aside]
         return contact, residuals
 
-    def _wheels(self, motion: Any) -> Iterator[tuple[str, Tyre, Contact, Body, Component]]:
+    def _wheels(self, motion: BicycleMotion) -> Iterator[tuple[str, Tyre, Contact, Body, Component]]:
         for (end, tyre, radius), contact in zip(self._tyres(), (motion.rear, motion.front), strict=True):
             yield end, tyre, contact, motion[f"{end} wheel"], radius
 
-    def _off_road(self, motion: Any, q: NamedVector) -> list[Component]:
+    def _off_road(self, motion: BicycleMotion, q: NamedVector) -> list[Component]:
         """The distances of the contacts from the ground [m]."""
         Q, N = motion["Q"].position, motion.N
         road: Any = self.road
@@ -381,7 +362,7 @@ class Bicycle(WhippleBicycle):
         front = Q - road.place(N, *self._front_place(q))
         return [*(front.dot(axis) for axis in (N.x, N.y, N.z)), q["rear_height"] - road.at(q["x"], q["y"])]
 
-    def _clearance(self, motion: Any) -> Component:
+    def _clearance(self, motion: BicycleMotion) -> Component:
         """The smaller clearance of both wheels, see `Road.clearance`."""
         road: Any = self.road
         wheels = self._wheels(motion)
@@ -389,7 +370,7 @@ class Bicycle(WhippleBicycle):
             *(road.clearance(motion.N, at, wheel.center, r, tyre.crown) for _, tyre, at, wheel, r in wheels)
         )
 
-    def on_frame(self, motion: Any, x: Component, y: Component, z: Component) -> Point:
+    def on_frame(self, motion: BicycleMotion, x: Component, y: Component, z: Component) -> Point:
         """A point that is fixed in the frame B.
 
         **Arguments:**
@@ -400,14 +381,14 @@ class Bicycle(WhippleBicycle):
         """
         return motion["rear wheel"].center.fixed(motion["B"].vector(x, y, add(z, self.rR)))
 
-    def on_fork(self, motion: Any, x: Component, y: Component, z: Component) -> Point:
+    def on_fork(self, motion: BicycleMotion, x: Component, y: Component, z: Component) -> Point:
         """A point that is fixed in the fork; x, y, z [m] as in `on_frame`, at zero steer."""
         return motion["fork"].center.fixed(motion["H"].vector(x - self.xH, y, z - self.zH))
 
     def gravity(self, N: Frame) -> Vector:
         return self.road.gravity(self.g, N)
 
-    def tyre_loads(self, motion: Any) -> dict[str, Component]:
+    def tyre_loads(self, motion: BicycleMotion) -> dict[str, Component]:
         """Static loads under the wheels [N], "rear" and "front": the moments of all weights about the contacts, without
         accelerations."""
         gravity, Y, P = self.gravity(motion.N), motion["Y"], motion["P"]
@@ -416,7 +397,7 @@ class Bicycle(WhippleBicycle):
         pressing = _mass(motion) * gravity.dot(motion.rear.normal)
         return {REAR: pressing - front * motion.front.normal.dot(motion.rear.normal), FRONT: front}
 
-    def tyre_forces(self, motion: Any, values: Mapping[str, Component]) -> dict[str, Component]:
+    def tyre_forces(self, motion: BicycleMotion, values: Values) -> dict[str, Component]:
         """Forces of the ground on the slipping tyres [N], e.g. "front_lateral_force". `values` as in `loads`."""
         carried, forces = _loads_with_transfer(self, motion, values), {}
         for end, tyre, contact, _, _ in self._wheels(motion):
@@ -424,7 +405,7 @@ class Bicycle(WhippleBicycle):
             forces |= {f"{end}_{name}_force": force for name, force in of_tyre.items()}
         return forces
 
-    def why_not_finite(self, motion, inputs):
+    def why_not_finite(self, motion: BicycleMotion, inputs: Values) -> str:
         carried = _loads_with_transfer(self, motion, inputs)
         return " and ".join(
             f"the {end} tyre carries {float(carried[end]):.4g} N, more than the largest_load of its "
@@ -434,7 +415,7 @@ class Bicycle(WhippleBicycle):
             if float(carried[end]) > law.largest_load
         )
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, inputs: Values) -> Loads:
         values = _commanded(self, t, q, u, motion, inputs)
         loads: list[Any] = [super().loads(t, q, u, motion, values)]
         slipping = [each for each in self._wheels(motion) if each[1].laws or each[1].rolling_resistance is not None]
@@ -445,7 +426,15 @@ class Bicycle(WhippleBicycle):
         loads += [part.loads(self, t, q, u, motion, values) for part in self.parts]
         return loads
 
-    def state_rates(self, t, q, u, x, motion: Any, now):
+    def state_rates(
+        self,
+        t: Component,
+        q: NamedVector,
+        u: NamedVector,
+        x: NamedVector,
+        motion: BicycleMotion,
+        now: MeasurementContext,
+    ) -> Sequence[Component]:
         now = now.with_values(_commanded(self, t, q, u, motion, now))
         rates = []
         for end, tyre, contact, _, _ in self._wheels(motion):
@@ -460,7 +449,9 @@ class Bicycle(WhippleBicycle):
             rates += named_row(of_part, part.states, _method(part, "state_rates"))
         return rates
 
-    def outputs(self, t, q, u, motion: Any, now):
+    def outputs(
+        self, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, now: MeasurementContext
+    ) -> Values:
         values = _commanded(self, t, q, u, motion, now)
         now = now.with_values(values)
         outputs: dict[str, Any] = dict(self.tyre_forces(motion, now))
@@ -474,8 +465,8 @@ class Bicycle(WhippleBicycle):
             outputs |= of_part
         return outputs
 
-    def configuration_constraints(self, t, q):
-        motion = _motion_at_rest(self, t, q)
+    def configuration_constraints(self, t: Component, q: NamedVector) -> Sequence[Component]:
+        motion = self._motion_at_rest(t, q)
         residuals = self._off_road(motion, q)
         if self.road.curved:
             # only near a solution: intermediate iterates of a solver must stay finite
@@ -484,11 +475,11 @@ class Bicycle(WhippleBicycle):
             residuals = [jnp.where(refused, jnp.nan, x) for x in residuals]
         return [*residuals, *(x for part in self.parts for x in part.configuration_constraints(self, t, q, motion))]
 
-    def events(self, t, q, u):
+    def events(self, t: Component, q: NamedVector, u: NamedVector) -> Mapping[str, Quantity]:
         events = super().events(t, q, u)
         if not self.road.curved:
             return events
-        motion = _motion_at_rest(self, t, q)
+        motion = self._motion_at_rest(t, q)
         # If an edge is narrower than a step of the solver, it is detected by the distance from the road after the step.
         on_road = 1.0 - sum(x * x for x in self._off_road(motion, q)) / OFF_ROAD**2
         return {**events, "wheel_touches_twice": self._clearance(motion), "wheel_off_the_road": on_road}
@@ -519,7 +510,7 @@ def _front_speeds(bicycle: Bicycle) -> tuple[str, ...]:
     return ("front_x_rate", "front_y_rate") if bicycle.road.curved else ()
 
 
-def _loads_with_transfer(bicycle: Bicycle, motion: Any, values: Mapping[str, Component]) -> dict[str, Component]:
+def _loads_with_transfer(bicycle: Bicycle, motion: BicycleMotion, values: Values) -> dict[str, Component]:
     """Loads that the tyre laws use [N]."""
     loads = bicycle.tyre_loads(motion)
     for name in _load_transfers(bicycle):
@@ -529,7 +520,7 @@ def _loads_with_transfer(bicycle: Bicycle, motion: Any, values: Mapping[str, Com
 
 
 def _commanded(
-    bicycle: Bicycle, t: Component, q: NamedVector, u: NamedVector, motion: Any, values: Mapping[str, Component]
+    bicycle: Bicycle, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
 ) -> _Commanded:
     """Inputs and states by name, including what the parts add to the inputs.
 
@@ -556,10 +547,6 @@ def _commanded(
     return commanded
 
 
-def _motion_at_rest(bicycle: Bicycle, t: Component, q: NamedVector) -> Any:
-    return bicycle.motion(t, q, (0.0,) * (len(bicycle.speeds) + len(bicycle.dependent_speeds)))
-
-
 class _Commanded(dict[str, Any]):
     """Inputs and states by name, as parts receive them.
 
@@ -567,7 +554,7 @@ class _Commanded(dict[str, Any]):
     - `read`: names that were looked up.
     """
 
-    def __init__(self, values: Mapping[str, Component]):
+    def __init__(self, values: Values):
         super().__init__(values)
         self.commanded: dict[str, None] = {}
         self.read: set[str] = set()
@@ -584,19 +571,19 @@ def _method(part: Part, method: str) -> str:
     return f"{type(part).__name__}.{method}"
 
 
-def _checked_dict(returned: Any, label: str) -> Mapping[str, Any]:
+def _checked_dict(returned: object, label: str) -> Mapping[str, Any]:
     if not isinstance(returned, Mapping):
         raise TypeError(f"{label} must return a dict of numbers by name, got {_returned(returned)}")
     return returned
 
 
-def _returned(value: Any) -> str:
+def _returned(value: object) -> str:
     return f"{value!r}." + " Does it end without a `return`?" * (value is None)
 
 
-def _deflections_of(end: str, tyre: Tyre, values: Any) -> dict[str, Component]:
+def _deflections_of(end: str, tyre: Tyre, values: Values | NamedVector) -> dict[str, Component]:
     return {name: values[f"{end}_{name}_deflection"] for name in tyre.deflects}
 
 
-def _mass(motion: Any) -> Component:
+def _mass(motion: BicycleMotion) -> Component:
     return total(component(body.mass) for body in motion.bodies)

@@ -10,17 +10,20 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from .._common.lookup import as_names, refuse_unknown
 from .._kane.arguments import is_concrete
+from .._kane.right_hand_side import MeasurementContext
 from .._scalarjit.components import Component, Scalar, mul, sub
 from .._system.parameters import Learned, learned, parameter, to_float
 from .._system.system import NamedVector
+from ..catalog._entry import Values
 from ..catalog.bicycle import TILT
 from ..loads import smooth_abs
 from ..stability import linearize, lqr, straight_ahead
 from ._bicycle import Bicycle
-from ._part import BicycleMotion, ParametricModule, Part
+from ._part import BicycleLike, BicycleMotion, ParametricModule, Part
 
 STEER = "steer_torque"
 
@@ -50,7 +53,9 @@ class LeanSteerGains(Part):
     inputs = ("desired_roll",)
     units = {"desired_roll": "rad"}
 
-    def commands(self, bicycle, t, q, u, motion, values):
+    def commands(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
+    ) -> Values:
         follow = self.roll if self.follow is None else self.follow
         angles = self.roll * q["roll"] + self.steer * q["steer"]
         rates = self.roll_rate * u["roll_rate"] + self.steer_rate * u["steer_rate"]
@@ -86,7 +91,7 @@ class ScheduledGains(Part):
     inputs = ("desired_roll",)
     units = {"desired_roll": "rad"}
 
-    def check(self, bicycle):
+    def check(self, bicycle: BicycleLike) -> None:
         known = (*bicycle.coordinates, *bicycle.speeds, *bicycle.dependent_speeds, *bicycle.states)
         refuse_unknown(self.measured, known, f"ScheduledGains: {type(bicycle).__name__} has no")
 
@@ -104,7 +109,9 @@ class ScheduledGains(Part):
             if is_concrete(value) and not np.all(np.isfinite(np.asarray(value))):
                 raise ValueError(f"ScheduledGains: `{name}` contains a value that is not finite.")
 
-    def commands(self, bicycle, t, q, u, motion, values):
+    def commands(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
+    ) -> Values:
         passed = self._passed(motion.rear.speed)
         command = mul(_at(passed, self.follow), values["desired_roll"])
         for i, name in enumerate(self.measured):
@@ -123,7 +130,7 @@ class ScheduledGains(Part):
         return [0.5 + (low - high) / (2.0 * length) for low, high, length in pairs]
 
 
-def _at(passed: list[Component], values: Any) -> Component:
+def _at(passed: list[Component], values: Float[Array, " n"]) -> Component:
     """x_0 + sum of passed_i (x_i+1 - x_i)."""
     value = values[0]
     for i, share in enumerate(passed):
@@ -153,8 +160,8 @@ def follow_gain(bicycle: Bicycle, speed: float) -> float:
 def scheduled_lqr(
     bicycle: Bicycle,
     speeds: Sequence[float],
-    Q: Any,
-    R: Any,
+    Q: ArrayLike,
+    R: ArrayLike,
     *,
     states: Sequence[str] | None = None,
     command: str = STEER,
@@ -250,7 +257,9 @@ class PathFollower(Part):
     gain: Scalar = parameter(1.0)
     limit: Scalar = parameter(0.3, positive=True, within=TILT, unit="rad")
 
-    def commands(self, bicycle, t, q, u, motion, values):
+    def commands(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
+    ) -> Values:
         cos, sin = jnp.cos(q["yaw"]), jnp.sin(q["yaw"])
         ahead = motion.rear.speed * self.preview
         aside = (self.path(q["x"] + ahead * cos) - q["y"] - ahead * sin) * cos
@@ -332,10 +341,12 @@ class SequentialLoopRider(Part):
         gains: list[Any] = [np.interp(speed, speeds, column) for column in columns]
         return cls(*gains, **fields)
 
-    def commands(self, bicycle, t, q, u, motion, values):
+    def commands(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
+    ) -> Values:
         return {self.command: values["rider_torque"]}
 
-    def wanted_roll(self, q: NamedVector, motion: BicycleMotion, values: Any) -> Component:
+    def wanted_roll(self, q: NamedVector, motion: BicycleMotion, values: Values) -> Component:
         """[rad]: the command of the inner loops."""
         if self.path is None:
             return values["desired_roll"]
@@ -343,7 +354,16 @@ class SequentialLoopRider(Part):
         heading = self.deviation * (self.path(x + motion.rear.speed * self.preview) - y)
         return values["desired_roll"] + self.heading * (heading - q["yaw"])
 
-    def state_rates(self, bicycle, t, q, u, x, motion, now):
+    def state_rates(
+        self,
+        bicycle: BicycleLike,
+        t: Component,
+        q: NamedVector,
+        u: NamedVector,
+        x: NamedVector,
+        motion: BicycleMotion,
+        now: MeasurementContext,
+    ) -> Sequence[Component]:
         roll_rate = self.roll * (self.wanted_roll(q, motion, now) - q["roll"])
         steer = self.roll_rate * (roll_rate - u["roll_rate"])
         commanded = self.steer * (steer - q["steer"])

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 
+from .._kane.right_hand_side import MeasurementContext
 from .._scalarjit.components import Component, Scalar, mul
 from .._system.kinematics import Frame, Point
 from .._system.motion import Body, Force, Torque
 from .._system.parameters import parameter
 from .._system.system import NamedVector
+from ..catalog._entry import Loads, Values
 from ..catalog.bicycle import ABOVE_GROUND, FAR
 from ..loads import coulomb, rotor, smooth_abs
-from ._part import Part
+from ._part import BicycleLike, BicycleMotion, Part
 
 
 class HeadTwist(Part):
@@ -38,7 +43,7 @@ class HeadTwist(Part):
     speeds = ("head_twist_rate",)
     units = {"head_twist": "rad", "head_twist_rate": "rad/s"}
 
-    def check(self, bicycle):
+    def check(self, bicycle: BicycleLike) -> None:
         if bicycle.head is not self:
             raise ValueError("A HeadTwist belongs between frame and fork: use with_parts(head=HeadTwist(...)).")
 
@@ -48,10 +53,14 @@ class HeadTwist(Part):
         twisted = tilted.rotate(1, q["head_twist"], u["head_twist_rate"], "head")
         return twisted, axis.fixed(self.height * twisted.z)
 
-    def motion(self, bicycle, motion, t, q, u):
+    def motion(
+        self, bicycle: BicycleLike, motion: BicycleMotion, t: Component, q: NamedVector, u: NamedVector
+    ) -> BicycleMotion:
         return motion.extended(frames={"head": motion["C"].parent})
 
-    def loads(self, bicycle, t, q, u, motion, values):
+    def loads(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
+    ) -> Loads:
         torque = -self.stiffness * q["head_twist"] - self.damping * u["head_twist_rate"]
         head = motion["head"]
         return Torque(torque * head.x, head, reaction_on=motion["B"])
@@ -70,7 +79,9 @@ class SteeringFriction(Part):
     level: Scalar = parameter(positive=True, unit="N m")
     width: Scalar = parameter(0.02, positive=True, unit="rad/s")
 
-    def loads(self, bicycle, t, q, u, motion, values):
+    def loads(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
+    ) -> Loads:
         torque = coulomb(u["steer_rate"], self.level, width=self.width)
         return Torque(-torque * motion["C"].z, motion["fork"], reaction_on=motion["rear frame"])
 
@@ -113,24 +124,37 @@ class SteeringMotor(Part):
     def units(self) -> dict[str, str]:
         return dict.fromkeys((*self.inputs, *self.states), "N m")
 
-    def motion(self, bicycle, motion, t, q, u):
+    def motion(
+        self, bicycle: BicycleLike, motion: BicycleMotion, t: Component, q: NamedVector, u: NamedVector
+    ) -> BicycleMotion:
         if self.rotor_inertia is None:
             return motion
         head = motion["C"].parent
         spinning = mul(self.ratio, u["steer_rate"])
         return motion.extended([rotor(self.rotor_inertia, head.z, spinning, head, motion["S"], name="steering motor")])
 
-    def commands(self, bicycle, t, q, u, motion, values):
+    def commands(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
+    ) -> Values:
         return {"steer_torque": self._limited_command(values) if self.lag is None else values["steer_motor_torque"]}
 
-    def _limited_command(self, values) -> Component:
+    def _limited_command(self, values: Values) -> Component:
         """The command [N m], delayed and limited."""
         command = values["steer_command"]
         if self.delay is not None:
             command = values["steer_delayed"] - values["steer_delayed_slope"] / 3.0
         return command if self.limit is None else self.limit * jnp.tanh(command / self.limit)
 
-    def state_rates(self, bicycle, t, q, u, x, motion, now):
+    def state_rates(
+        self,
+        bicycle: BicycleLike,
+        t: Component,
+        q: NamedVector,
+        u: NamedVector,
+        x: NamedVector,
+        motion: BicycleMotion,
+        now: MeasurementContext,
+    ) -> Sequence[Component]:
         rates = []
         if self.delay is not None:  # w and T w', with w + 2/3 T w' + T^2 w'' / 6 = command
             w, slope = now["steer_delayed"], now["steer_delayed_slope"]
@@ -182,7 +206,9 @@ class SteerByWire(Part):
     inputs = ("handlebar_torque",)
     units = {"handlebar": "rad", "handlebar_rate": "rad/s", "handlebar_torque": "N m"}
 
-    def motion(self, bicycle, motion, t, q, u):
+    def motion(
+        self, bicycle: BicycleLike, motion: BicycleMotion, t: Component, q: NamedVector, u: NamedVector
+    ) -> BicycleMotion:
         turned = motion["C"].parent.rotate(3, q["handlebar"], u["handlebar_rate"], "handlebar")
         G = turned.rotate(2, -bicycle.lam, 0.0, "grips")  # aligned with the rear frame at a zero angle
         x, z = bicycle.steer_point
@@ -191,14 +217,18 @@ class SteerByWire(Part):
         bar = Body(self.mass, inertia, center, G, name="handlebar")
         return motion.extended([bar], frames={"grips": G})
 
-    def _torque(self, q, u):
+    def _torque(self, q: NamedVector, u: NamedVector) -> Component:
         apart, sliding = self.ratio * q["handlebar"] - q["steer"], self.ratio * u["handlebar_rate"] - u["steer_rate"]
         return self.stiffness * apart + self.damping * sliding
 
-    def commands(self, bicycle, t, q, u, motion, values):
+    def commands(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
+    ) -> Values:
         return {self.command: self._torque(q, u)}
 
-    def loads(self, bicycle, t, q, u, motion, values):
+    def loads(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
+    ) -> Loads:
         torque = values["handlebar_torque"] - self.feedback * self.ratio * self._torque(q, u)
         return Torque(torque * motion["C"].parent.z, motion["handlebar"], reaction_on=motion["rear frame"])
 
@@ -221,12 +251,16 @@ class Drag(Part):
 
     resists = True
 
-    def motion(self, bicycle, motion, t, q, u):
+    def motion(
+        self, bicycle: BicycleLike, motion: BicycleMotion, t: Component, q: NamedVector, u: NamedVector
+    ) -> BicycleMotion:
         B, hub = motion["B"], motion["rear wheel"].center
         place = hub.fixed(self.ahead * B.x + (bicycle.rR - self.height) * B.z, B)
         return motion.extended(points={"center of drag": place})
 
-    def loads(self, bicycle, t, q, u, motion, values):
+    def loads(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
+    ) -> Loads:
         v = motion["center of drag"].velocity
         size = 0.5 * self.density * self.area * smooth_abs(v, 1e-3)  # [N s/m]; smoothed below 1 mm/s
         return Force(-size * v, motion["center of drag"])
@@ -252,10 +286,20 @@ class ConstantSpeed(Part):
     dependent_speeds = ("rear_wheel_rate",)
     units = {"holding_torque": "N m"}
 
-    def motion(self, bicycle, motion, t, q, u):
+    def motion(
+        self, bicycle: BicycleLike, motion: BicycleMotion, t: Component, q: NamedVector, u: NamedVector
+    ) -> BicycleMotion:
         return motion.extended((), [u["rear_wheel_rate"] + self.speed / bicycle.rR])
 
-    def outputs(self, bicycle, t, q, u, motion, now):
+    def outputs(
+        self,
+        bicycle: BicycleLike,
+        t: Component,
+        q: NamedVector,
+        u: NamedVector,
+        motion: BicycleMotion,
+        now: MeasurementContext,
+    ) -> Values:
         return {"holding_torque": now.multipliers[bicycle.dependent_speeds.index("rear_wheel_rate")]}
 
 
@@ -298,11 +342,13 @@ class Trailer(Part):
         "trailer_pitch_rate": "rad/s",
     }
 
-    def check(self, bicycle):
+    def check(self, bicycle: BicycleLike) -> None:
         if bicycle.road.curved:
             raise ValueError("A Trailer needs level ground or a Slope; it cannot be used on a Road of given height.")
 
-    def motion(self, bicycle, motion, t, q, u):
+    def motion(
+        self, bicycle: BicycleLike, motion: BicycleMotion, t: Component, q: NamedVector, u: NamedVector
+    ) -> BicycleMotion:
         heading = motion["Y"].rotate(3, q["trailer_angle"], u["trailer_angle_rate"])
         T = heading.rotate(2, q["trailer_pitch"], u["trailer_pitch_rate"], "trailer")
         hitch = bicycle.on_frame(motion, self.hitch_x, 0.0, self.hitch_z)
@@ -312,10 +358,12 @@ class Trailer(Part):
         residuals = [axle.velocity.dot(motion.N.z), axle.velocity.dot(heading.y)]
         return motion.extended([box], residuals, points={"hitch": hitch, "axle": axle}, frames={"trailer": T})
 
-    def configuration_constraints(self, bicycle, t, q, motion):
+    def configuration_constraints(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, motion: BicycleMotion
+    ) -> Sequence[Component]:
         return [motion["axle"].position.dot(motion.N.z) + self.wheel_radius]
 
-    def draw(self, bicycle, motion, sketch):
+    def draw(self, bicycle: BicycleLike, motion: BicycleMotion, sketch: Any) -> None:
         axle, T, half = motion["axle"].position, motion["trailer"], 0.5 * self.track
         for side in (-1.0, 1.0):
             sketch.circle("ink", axle + side * half * T.y, T.x, T.z, self.wheel_radius, width=3.0, fill=0.05)

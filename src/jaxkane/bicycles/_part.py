@@ -8,11 +8,13 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
 
+from .._kane.right_hand_side import MeasurementContext
 from .._scalarjit.components import Component
 from .._system.kinematics import Point, Vector
 from .._system.motion import Motion
 from .._system.parameters import check_parameter, module_text, parameter_info
 from .._system.system import NamedVector
+from ..catalog._entry import Loads, Values
 
 BicycleLike: TypeAlias = Any
 """A `Bicycle`. Its file imports this one, so the class itself cannot be named here."""
@@ -34,7 +36,7 @@ class ParametricModule(eqx.Module):
                 check_parameter(f"{type(self).__name__}.{name}", value, infos[name])
 
 
-def called(value: Any) -> str:
+def called(value: object) -> str:
     """A value as text for an error message: a module by its class, because its numbers would be long."""
     return f"a {type(value).__name__}" if isinstance(value, eqx.Module) else repr(value)
 
@@ -131,8 +133,8 @@ class Part(ParametricModule):
         q: NamedVector,
         u: NamedVector,
         motion: BicycleMotion,
-        values: Mapping[str, Component],
-    ) -> Mapping[str, Component]:
+        values: Values,
+    ) -> Values:
         """Values that the part adds to inputs of the bicycle, by name: `{"steer_torque": -self.gain * q["roll"]}`.
 
         **Arguments:**
@@ -149,8 +151,8 @@ class Part(ParametricModule):
         q: NamedVector,
         u: NamedVector,
         motion: BicycleMotion,
-        values: Mapping[str, Component],
-    ) -> Any:
+        values: Values,
+    ) -> Loads:
         """Forces and torques. `values` contains inputs, with all additions of parts, and states by name."""
         return ()
 
@@ -160,17 +162,23 @@ class Part(ParametricModule):
         t: Component,
         q: NamedVector,
         u: NamedVector,
-        x: Any,
+        x: NamedVector,
         motion: BicycleMotion,
-        now: Any,
-    ) -> Sequence[Component] | Mapping[str, Component]:
+        now: MeasurementContext,
+    ) -> Sequence[Component] | Values:
         """Rates of the part's states of the first order, in their order or by name. `now` as in `System.state_rates`;
         its inputs include all additions of parts."""
         return ()
 
     def outputs(
-        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, now: Any
-    ) -> Mapping[str, Any]:
+        self,
+        bicycle: BicycleLike,
+        t: Component,
+        q: NamedVector,
+        u: NamedVector,
+        motion: BicycleMotion,
+        now: MeasurementContext,
+    ) -> Values:
         """The measurements of the part's sensors, by name."""
         return {}
 

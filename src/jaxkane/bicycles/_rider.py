@@ -20,8 +20,9 @@ from .._system.motion import Body, Motion, Torque
 from .._system.parameters import in_batches, parameter
 from .._system.system import NamedVector
 from ..catalog import read_bicycle_file
+from ..catalog._entry import Loads, Values
 from ..catalog.bicycle import ABOVE_GROUND, FAR, TILT
-from ._part import BicycleLike, Part
+from ._part import BicycleLike, BicycleMotion, Part
 
 _IN_A_FILE = {"mB": "mass", "xB": "x", "zB": "z", "IBxx": "Ixx", "IByy": "Iyy", "IBzz": "Izz", "IBxz": "Ixz"}
 
@@ -71,7 +72,9 @@ class Rider(Part):
     ) -> tuple[Frame, Point, Scalar, Scalar]:
         """The rider's frame, a point that is fixed in it, and x and z of this point for an upright rider."""
 
-    def motion(self, bicycle, motion, t, q, u):
+    def motion(
+        self, bicycle: BicycleLike, motion: BicycleMotion, t: Component, q: NamedVector, u: NamedVector
+    ) -> BicycleMotion:
         U, hinge, x, z = self.carried(bicycle, motion, q, u)
         center = hinge.fixed(U.vector(self.x - x, 0.0, self.z - z))
         inertia = ((self.Ixx, 0.0, self.Ixz), (0.0, self.Iyy, 0.0), (self.Ixz, 0.0, self.Izz))
@@ -98,7 +101,7 @@ class RigidRider(Rider):
 
     shoulder: Float[Array, 3] | None = parameter(None, within=(-FAR, FAR), shape=(3,), unit="m")
 
-    def carried(self, bicycle, motion, q, u):
+    def carried(self, bicycle: BicycleLike, motion: BicycleMotion, q: NamedVector, u: NamedVector):
         B = motion["B"]
         return B.rotate(2, 0.0, 0.0, "U"), bicycle.on_frame(motion, self.x, 0.0, self.z), self.x, self.z
 
@@ -145,13 +148,15 @@ class LeaningRider(Rider):
             return B.x
         return jnp.cos(self.hinge_tilt) * B.x - jnp.sin(self.hinge_tilt) * B.z
 
-    def carried(self, bicycle, motion, q, u):
+    def carried(self, bicycle: BicycleLike, motion: BicycleMotion, q: NamedVector, u: NamedVector):
         B = motion["B"]
         axis = 1 if self.hinge_tilt is None else self._axis(B)
         U = B.rotate(axis, q["rider_lean"], u["rider_lean_rate"], "U")
         return U, bicycle.on_frame(motion, self.hinge_x, 0.0, self.hinge_z), self.hinge_x, self.hinge_z
 
-    def loads(self, bicycle, t, q, u, motion, values):
+    def loads(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
+    ) -> Loads:
         torque = values["rider_lean_torque"] - self.stiffness * q["rider_lean"] - self.damping * u["rider_lean_rate"]
         B = motion["B"]
         return Torque(torque * self._axis(B), motion["U"], reaction_on=B)
@@ -196,7 +201,7 @@ def separate_rider(bicycle: BicycleLike, rider: Rider) -> Any:
     return bicycle.with_parts(**dict(zip(_IN_A_FILE, rest, strict=True)), rider=rider)
 
 
-def without(body: Sequence[Any], part: Sequence[Any]) -> list[Any]:
+def without(body: Sequence[Scalar], part: Sequence[Scalar]) -> list[Scalar]:
     """The body that remains if a part is removed.
 
     All have the values m, x, z, Ixx, Iyy, Izz, Ixz: the mass, the mass centre, and the inertia about it.
@@ -207,7 +212,7 @@ def without(body: Sequence[Any], part: Sequence[Any]) -> list[Any]:
     return [m, x, z, *(whole - removed - shift for whole, removed, shift in about_origin)]
 
 
-def _about(m: Scalar, x: Scalar, z: Scalar, Ixx: Any, Iyy: Any, Izz: Any, Ixz: Any) -> tuple[Any, Any, Any, Any]:
+def _about(m: Scalar, x: Scalar, z: Scalar, Ixx: Scalar, Iyy: Scalar, Izz: Scalar, Ixz: Scalar) -> tuple[Scalar, ...]:
     """Moments and product of inertia about the origin of x and z, from the central ones."""
     return Ixx + m * z * z, Iyy + m * (x * x + z * z), Izz + m * x * x, Ixz - m * x * z
 
@@ -267,7 +272,7 @@ class Arms(Part):
     def lateral(self):
         return ()
 
-    def check(self, bicycle):
+    def check(self, bicycle: BicycleLike) -> None:
         rider = _with_shoulders(takewhile(lambda part: part is not self, bicycle.parts))
         if rider is None:
             raise ValueError(
@@ -291,7 +296,7 @@ class Arms(Part):
             )
 
     @classmethod
-    def of_person(cls, mass: float, height: float, grip: Any, **parameters: Any) -> Self:
+    def of_person(cls, mass: float, height: float, grip: Float[Array, " 3"], **parameters: Any) -> Self:
         """The arms of a person, by the means of Winter (2009), *Biomechanics and Motor Control of Human Movement*,
         Table 4.1 and Figure 4.1.
 
@@ -312,7 +317,7 @@ class Arms(Part):
         masses = {"upper_mass": 0.028 * mass, "fore_mass": 0.022 * mass}
         return cls(grip=grip, **masses, **lengths, **centers, **inertia, **parameters)
 
-    def posture(self, shoulder: Any) -> tuple[Component, Component, Component]:
+    def posture(self, shoulder: Float[Array, " 3"]) -> tuple[Component, Component, Component]:
         """Flexion and rotation of the shoulder, and flexion of the elbow [rad], from a hanging arm to the grip of the
         upright bicycle. NaN if the arm does not reach it.
 
@@ -331,7 +336,9 @@ class Arms(Part):
         flexion = jnp.arctan2(forwards, down) - jnp.arctan2(across * jnp.cos(rotation), upper + fore * cos_elbow)
         return flexion, rotation, elbow
 
-    def motion(self, bicycle, motion, t, q, u):
+    def motion(
+        self, bicycle: BicycleLike, motion: BicycleMotion, t: Component, q: NamedVector, u: NamedVector
+    ) -> BicycleMotion:
         rider: Any = _with_shoulders(bicycle.parts)
         angles = self.posture(rider.right_shoulder)
         bodies, residuals, points = [], [], {}
@@ -353,11 +360,15 @@ class Arms(Part):
             points |= {f"{side}_elbow": bend, f"{side}_hand": hand, f"{side}_grip": grip}
         return motion.extended(bodies, residuals, points=points)
 
-    def configuration_constraints(self, bicycle, t, q, motion):
+    def configuration_constraints(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, motion: BicycleMotion
+    ) -> Sequence[Component]:
         apart = [motion[f"{side}_hand"].position_from(motion[f"{side}_grip"]) for side in _SIDES]
         return [x for r in apart for x in r.components_in(motion["H"])]
 
-    def loads(self, bicycle, t, q, u, motion, values):
+    def loads(
+        self, bicycle: BicycleLike, t: Component, q: NamedVector, u: NamedVector, motion: BicycleMotion, values: Values
+    ) -> Loads:
         torques = []
         for side, sign in _SIDES.items():
             upper, fore = motion[f"{side} upper arm"].frame, motion[f"{side} forearm"].frame

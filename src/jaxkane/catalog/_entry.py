@@ -1,13 +1,21 @@
-"""The table of the catalogue."""
+"""The table of the catalogue, and the types of what its systems receive and return."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias, TypeVar
 
+from .._integrate.events import Crossing
+from .._scalarjit.components import Component
+from .._system.motion import Force, Torque
 from .._system.system import System
 
+Values: TypeAlias = Mapping[str, Component]
+"""Inputs and first-order states by name."""
+Quantity: TypeAlias = Component | Crossing
+"""A quantity whose zero is an event."""
+Loads: TypeAlias = Force | Torque | Sequence["Loads"]
 _Class = TypeVar("_Class", bound=type[System])
 
 

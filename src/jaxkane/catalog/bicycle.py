@@ -5,19 +5,19 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
 
 from .._common.lookup import decimal_number
-from .._scalarjit.components import Scalar
+from .._scalarjit.components import Component, Scalar
 from .._system.kinematics import Frame, Point, Vector, inertial
 from .._system.motion import Body, Motion, Torque, weight
 from .._system.parameters import parameter, parameter_info
-from .._system.system import System
-from ._entry import entry
+from .._system.system import NamedVector, System
+from ._entry import Loads, Quantity, Values, entry
 
 # Meijaard et al. (2007), Table 1: the benchmark bicycle.
 _BENCHMARK = {
@@ -152,7 +152,8 @@ class WhippleBicycle(System):
                     )
         fields = [field for field in dataclasses.fields(cls) if field.init]  # type: ignore[arg-type]
         unknown = sorted(set(values) - {field.name for field in fields})
-        missing = [field.name for field in fields if field.name not in values and not _has_default(field)]
+        required = [field.name for field in fields if field.default is field.default_factory]  # both are MISSING
+        missing = [name for name in required if name not in values]
         if unknown or missing:
             parts = [f"missing: {', '.join(missing)}"] * bool(missing) + [f"unknown: {', '.join(unknown)}"] * bool(
                 unknown
@@ -182,44 +183,65 @@ class WhippleBicycle(System):
         except ValueError as error:
             raise ValueError(f"{os.fspath(path)}: {error}") from None
 
-    def q_dot(self, t, q, u):
+    def q_dot(self, t: Component, q: NamedVector, u: NamedVector) -> Sequence[Component]:
         # P moves with the wheel: v_P = v_A - omega_R x r_P_A. The frame R has the roll, but not the pitch.
         forward = -self.rR * (u["rear_wheel_rate"] + u["pitch_rate"])
         turning = [u[f"{part}_rate"] for part in ("roll", "rear_wheel", "steer", "yaw", "pitch", "front_wheel")]
         return (*turning, forward * jnp.cos(q["yaw"]), forward * jnp.sin(q["yaw"]))
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O = inertial()
         Y = N.rotate(3, q["yaw"], u["yaw_rate"], "Y")
         R = Y.rotate(1, q["roll"], u["roll_rate"], "R")
-        B = R.rotate(2, q["pitch"], u["pitch_rate"], "B")  # rear frame
-        tilted = B.rotate(2, self.lam, 0.0, "tilt")
-        C = tilted.rotate(3, q["steer"], u["steer_rate"], "C")  # fork, 3 along the steer axis
-        H = C.rotate(2, -self.lam, 0.0, "H")  # fork, aligned with B at zero steer
-        omega_A = B.angular_velocity + u["rear_wheel_rate"] * B.y
-        omega_D = C.angular_velocity + u["front_wheel_rate"] * C.y
+        P = O.fixed(q["x"] * N.x + q["y"] * N.y, N)  # the ground under the rear wheel, at rest
+        bodies, S, B, C, _ = self._linkage(R, P, -self.rR * R.z, q, u)
+        front = bodies[-1]
+        n1, _, n3 = N.z.components_in(C)  # downwards in the plane of the front wheel
+        r_D_Q = self.rF * C.vector(n1, 0.0, n3).normalize()
+        Q = Point(front.center.velocity + front.angular_velocity.cross(r_D_Q), front.center, r_D_Q)
+        return Motion(bodies, [Q.velocity], points={"P": P, "Q": Q, "S": S}, frames={"Y": Y, "B": B, "C": C})
 
-        # All points follow from the centre G_A of the rear wheel, by way of S on the steer axis (Example 7).
+    def _steer_point(self) -> tuple[Component, Component]:
+        """The point S on the steer axis that is nearest to the rear wheel's centre: how far before and above it [m]."""
         cos, sin = jnp.cos(self.lam), jnp.sin(self.lam)
         xS = (self.w + self.c) * cos * cos - self.rR * sin * cos
-        zS = xS * sin / cos
+        return xS, xS * sin / cos
 
-        def from_S(x, z):  # a position relative to P (upright) as a vector fixed in the fork
-            return ((x - xS) * H.x + (z + self.rR + zS) * H.z).express(C)
+    def _linkage(
+        self,
+        R: Frame,
+        P: Point,
+        r_P_A: Vector,
+        q: NamedVector,
+        u: NamedVector,
+        twisted: Callable[[Frame, Point], tuple[Frame, Point]] | None = None,
+    ) -> tuple[tuple[Body, ...], Point, Frame, Frame, Frame]:
+        """The four bodies, S, and the frames B, C and H. All points follow from the rear wheel's centre (Example 7).
 
-        P = O.fixed(q["x"] * N.x + q["y"] * N.y, N)  # the ground under the rear wheel, at rest
-        r_P_A = -self.rR * R.z
+        **Arguments:**
+
+        - `R`: the frame with yaw and roll.
+        - `P`, `r_P_A`: the point of the rear tyre at the contact, and the vector from it to the wheel's centre.
+        - `twisted`: changes the frame along the steer axis and S, before the steer angle.
+        """
+        B = R.rotate(2, q["pitch"], u["pitch_rate"], "B")  # rear frame
+        tilted = B.rotate(2, self.lam, 0.0, "tilt")
+        xS, zS = self._steer_point()
+        omega_A = B.angular_velocity + u["rear_wheel_rate"] * B.y
         G_A = Point(P.velocity + omega_A.cross(r_P_A), P, r_P_A)
         G_B = G_A.fixed(self.xB * B.x + (self.zB + self.rR) * B.z)
         S = G_A.fixed(xS * B.x - zS * B.z)
-        G_C = S.fixed(from_S(self.xH, self.zH))
-        G_D = S.fixed(from_S(self.w, -self.rF))
-        n1, _, n3 = N.z.components_in(C)  # downwards in the plane of the front wheel
-        r_D_Q = self.rF * C.vector(n1, 0.0, n3).normalize()
-        Q = Point(G_D.velocity + omega_D.cross(r_D_Q), G_D, r_D_Q)
+        if twisted is not None:
+            tilted, S = twisted(tilted, S)
+        C = tilted.rotate(3, q["steer"], u["steer_rate"], "C")  # fork, 3 along the steer axis
+        H = C.rotate(2, -self.lam, 0.0, "H")  # fork, aligned with B at zero steer
+        omega_D = C.angular_velocity + u["front_wheel_rate"] * C.y
 
-        bodies = self.bodies((G_A, G_B, G_C, G_D), (R, B, H, C), omega_A, omega_D)
-        return Motion(bodies, [Q.velocity], points={"P": P, "Q": Q, "S": S}, frames={"Y": Y, "B": B, "C": C})
+        def from_S(x: Component, z: Component) -> Vector:  # from P of the upright bicycle
+            return ((x - xS) * H.x + (z + self.rR + zS) * H.z).express(C)
+
+        G_C, G_D = S.fixed(from_S(self.xH, self.zH)), S.fixed(from_S(self.w, -self.rF))
+        return self.bodies((G_A, G_B, G_C, G_D), (R, B, H, C), omega_A, omega_D), S, B, C, H
 
     def bodies(
         self, centers: Sequence[Point], frames: Sequence[Frame], omega_A: Vector, omega_D: Vector
@@ -245,7 +267,7 @@ class WhippleBicycle(System):
             Body(self.mF, D_inertia, G_D, C, omega_D, name="front wheel"),
         )
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         wheel, frame, fork = (motion[name] for name in ("rear wheel", "rear frame", "fork"))
         steer_torque = inputs["steer_torque"] - self.steer_damping * u["steer_rate"]
         return (
@@ -259,16 +281,16 @@ class WhippleBicycle(System):
         """Gravitational acceleration [m/s^2]. `N` is the inertial frame, whose z is normal to the ground."""
         return self.g * N.z
 
-    def configuration_constraints(self, t, q):
-        motion = self.motion(t, q, (0.0,) * (len(self.speeds) + len(self.dependent_speeds)))
+    def _motion_at_rest(self, t: Component, q: NamedVector) -> Any:
+        names = (*self.speeds, *self.dependent_speeds)
+        return self.motion(t, q, NamedVector((0.0,) * len(names), names))
+
+    def configuration_constraints(self, t: Component, q: NamedVector) -> Sequence[Component]:
+        motion = self._motion_at_rest(t, q)
         return [motion["Q"].position.dot(motion.N.z)]  # height of the front contact, downwards
 
-    def events(self, t, q, u):
+    def events(self, t: Component, q: NamedVector, u: NamedVector) -> Mapping[str, Quantity]:
         return {"fell_over": jnp.cos(q["roll"]) - 0.2}  # beyond 78 degrees
-
-
-def _has_default(field: dataclasses.Field[Any]) -> bool:
-    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
 def text_of(path: str | os.PathLike[str]) -> str:

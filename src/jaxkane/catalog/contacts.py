@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import TypeAlias
+
 import jax.numpy as jnp
 
 from .._integrate.events import falling
 from .._kane.contact.declarations import Contact, DryFriction
-from .._scalarjit.components import Scalar
-from .._system.kinematics import inertial
+from .._scalarjit.components import Component, Scalar
+from .._system.kinematics import Point, inertial
 from .._system.motion import Body, Force, Motion, Torque, weight
 from .._system.parameters import parameter
-from .._system.system import System
-from ._entry import entry
+from .._system.system import NamedVector, System
+from ._entry import Loads, Quantity, Values, entry
+
+Contacts: TypeAlias = Mapping[str, Contact | DryFriction]
 
 
 @entry(
@@ -50,17 +55,17 @@ class BouncingBall(System):
     speeds = ("climb",)
     units = {"height": "m", "climb": "m/s"}
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O = inertial()
         P = O.moving(q["height"] * N.y, u["climb"] * N.y)
         return Motion([Body(self.mass, 0.0, P, name="ball")])
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         v = u["climb"]
         resistance = -self.drag * v * jnp.abs(v) * motion.N.y
         return weight(motion, -self.gravity * motion.N.y), Force(resistance, motion["ball"])
 
-    def events(self, t, q, u):
+    def events(self, t: Component, q: NamedVector, u: NamedVector) -> Mapping[str, Quantity]:
         return {"bounce": falling(q["height"], then={"climb": -self.restitution * u["climb"]})}
 
 
@@ -101,14 +106,14 @@ class Belt(System):
     speeds = ("x_dot",)
     units = {"x": "m", "x_dot": "m/s"}
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O = inertial()
         return Motion([Body(self.mass, 0.0, O.moving(q["x"] * N.x, u["x_dot"] * N.x), name="block")])
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         return Force(-self.stiffness * q["x"] * motion.N.x, motion["block"])
 
-    def contacts(self, t, q, u, motion):
+    def contacts(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion) -> Contacts:
         return {"belt": DryFriction(u["x_dot"] - self.speed, self.kinetic, static=self.static)}
 
 
@@ -149,17 +154,17 @@ class Backlash(System):
     inputs = ("torque",)
     units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(speeds, "rad/s") | {"torque": "N m"}
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O = inertial()
         M = N.rotate(3, q["motor"], u["motor_rate"], "M")
         L = N.rotate(3, q["load"], u["load_rate"], "L")
         motor = Body(0.0, (0.0, 0.0, self.motor_inertia), O, M, name="motor")
         return Motion([motor, Body(0.0, (0.0, 0.0, self.load_inertia), O, L, name="load")])
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         return Torque(inputs["torque"] * motion.N.z, motion["motor"])
 
-    def contacts(self, t, q, u, motion):
+    def contacts(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion) -> Contacts:
         lead = q["motor"] - q["load"]
         return {
             "drive": Contact(gap=0.5 * self.play - lead, restitution=self.restitution),
@@ -210,7 +215,7 @@ class RockingBlock(System):
     speeds = ("x_dot", "y_dot", "rate")
     units = {"x": "m", "y": "m", "angle": "rad", "x_dot": "m/s", "y_dot": "m/s", "rate": "rad/s"}
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O = inertial()
         b, h = self.half_width, self.half_height
         B = N.rotate(3, q["angle"], u["rate"], "B")
@@ -219,10 +224,10 @@ class RockingBlock(System):
         corners = {"left": G.fixed(-b * B.x - h * B.y), "right": G.fixed(b * B.x - h * B.y)}
         return Motion([Body(self.mass, (0.0, 0.0, I), G, B, name="block")], points=corners)
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         return weight(motion, -self.gravity * motion.N.y)
 
-    def contacts(self, t, q, u, motion):
+    def contacts(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion) -> Contacts:
         laws = {"restitution": self.restitution, "friction": self.friction}
         return {name: Contact(motion[name], motion.N.y, **laws) for name in ("left", "right")}
 
@@ -269,16 +274,16 @@ class KerbWheel(System):
     speeds = ("x_dot", "y_dot", "spin")
     units = {"x": "m", "y": "m", "angle": "rad", "x_dot": "m/s", "y_dot": "m/s", "spin": "rad/s"}
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O = inertial()
         W = N.rotate(3, -q["angle"], -u["spin"], "W")
         axle = O.moving(q["x"] * N.x + q["y"] * N.y, u["x_dot"] * N.x + u["y_dot"] * N.y)
         return Motion([Body(self.mass, (0.0, 0.0, self.inertia), axle, W, name="wheel")])
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         return weight(motion, -self.gravity * motion.N.y)
 
-    def contacts(self, t, q, u, motion):
+    def contacts(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion) -> Contacts:
         N, wheel = motion.N, motion["wheel"]
         # From the nearest point of the kerb to the axle
         x, y = jnp.maximum(q["x"], 0.0), q["y"] - self.kerb
@@ -343,7 +348,7 @@ class SliderCrankWithClearance(System):
     speeds = ("crank_rate", "rod_rate", "slider_rate")
     units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(speeds, "rad/s")
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O = inertial()
         crank, rod, slider = (N.rotate(3, q[name], u[f"{name}_rate"], name) for name in ("crank", "rod", "slider"))
         A = O.fixed(self.crank_length * crank.x)
@@ -363,10 +368,10 @@ class SliderCrankWithClearance(System):
         }
         return Motion(bodies, points={"A": A, **corners})
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         return weight(motion, -self.gravity * motion.N.y)
 
-    def contacts(self, t, q, u, motion):
+    def contacts(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion) -> Contacts:
         N, half = motion.N, self.half_height + self.clearance
         laws = {"restitution": self.restitution, "friction": self.friction}
         contacts = {}
@@ -431,12 +436,12 @@ class Woodpecker(System):
     speeds = ("climb", "sleeve_rate", "bird_rate")
     units = {"height": "m", "sleeve": "rad", "bird": "rad", "climb": "m/s"} | dict.fromkeys(speeds[1:], "rad/s")
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O = inertial()
         sleeve = N.rotate(3, q["sleeve"], u["sleeve_rate"], "sleeve")
         bird = N.rotate(3, q["bird"], u["bird_rate"], "bird")
 
-        def at(x, x_dot, arm, bird_arm):
+        def at(x: Component, x_dot: Component, arm: Component, bird_arm: Component) -> Point:
             """A point at x that small angles move up by the arms [m]."""
             y = q["height"] + arm * q["sleeve"] + bird_arm * q["bird"]
             y_dot = u["climb"] + arm * u["sleeve_rate"] + bird_arm * u["bird_rate"]
@@ -457,12 +462,12 @@ class Woodpecker(System):
         }
         return Motion(bodies, points=points)
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         torque = self.stiffness * (q["sleeve"] - q["bird"]) * motion.N.z
         spring = Torque(torque, motion["bird"]), Torque(-torque, motion["sleeve"])
         return weight(motion, -self.gravity * motion.N.y), *spring
 
-    def contacts(self, t, q, u, motion):
+    def contacts(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion) -> Contacts:
         # The points have the distance from the pole as their x.
         N, mu = motion.N, self.friction
         beak = Contact(motion["beak"], N.x, friction=mu, restitution=self.restitution)

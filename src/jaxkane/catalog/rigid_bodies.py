@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 
@@ -11,21 +11,21 @@ from .._scalarjit.components import Component, Scalar
 from .._system.kinematics import Frame, Point, inertial
 from .._system.motion import Body, Force, Motion, Torque, weight
 from .._system.parameters import parameter
-from .._system.system import System
-from ._entry import entry
+from .._system.system import NamedVector, System
+from ._entry import Loads, Quantity, Values, entry
 
 
 class _EulerParameters(System):
     # Coordinates `e1` ... `e4` of unit norm, scalar last, with body-fixed speeds `omega1` ... `omega3`.
     dependent_coordinates = ("e4",)
 
-    def configuration_constraints(self, t, q):
+    def configuration_constraints(self, t: Component, q: NamedVector) -> Sequence[Component]:
         return (q["e1"] ** 2 + q["e2"] ** 2 + q["e3"] ** 2 + q["e4"] ** 2 - 1.0,)
 
-    def _frame(self, N, q, u, name):
+    def _frame(self, N: Frame, q: NamedVector, u: NamedVector, name: str) -> Frame:
         return N.rotate_euler(q["e1":"e4"], u["omega1":"omega3"], name)
 
-    def _frame_rates(self, q, u):
+    def _frame_rates(self, q: NamedVector, u: NamedVector) -> Sequence[Component]:
         return rotations.euler_parameter_rates(q["e1":"e4"], u["omega1":"omega3"])
 
 
@@ -36,18 +36,18 @@ class _FreeBody(System):
     units = dict.fromkeys("xyz", "m") | dict.fromkeys(speeds[:3], "m/s") | dict.fromkeys(speeds[3:], "rad/s")
     units |= dict.fromkeys(inputs[:3], "N") | dict.fromkeys(inputs[3:], "N m")
 
-    def _frame(self, N: Frame, q, u, name: str) -> Frame:
+    def _frame(self, N: Frame, q: NamedVector, u: NamedVector, name: str) -> Frame:
         raise NotImplementedError
 
-    def _frame_rates(self, q, u) -> Sequence[Component]:
+    def _frame_rates(self, q: NamedVector, u: NamedVector) -> Sequence[Component]:
         raise NotImplementedError
 
-    def q_dot(self, t, q, u):
+    def q_dot(self, t: Component, q: NamedVector, u: NamedVector) -> Sequence[Component]:
         N, _ = inertial()
         velocity = self._frame(N, q, u, "B").vector(*u["v1":"v3"])
         return (*velocity.components_in(N), *self._frame_rates(q, u))
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         body = motion.bodies[0]
         F, T = (body.frame.vector(*(inputs[f"{name}{i}"] for i in (1, 2, 3))) for name in ("force", "torque"))
         return Force(F, motion["G"]), Torque(T, body)
@@ -81,7 +81,7 @@ class RigidBody(_EulerParameters, _FreeBody):
 
     coordinates = ("x", "y", "z", "e1", "e2", "e3", "e4")
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, _ = inertial()
         B = self._frame(N, q, u, "B")
         G = Point.at(B.vector(*u["v1":"v3"]), N.vector(*q["x":"z"]), "G")
@@ -115,7 +115,7 @@ class _Aircraft(_FreeBody):
     engine2_speed: Scalar = parameter(400.0, unit="rad/s")
     engine2_acceleration: Scalar = parameter(0.0, unit="rad/s^2")
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         mA, mE = self.airframe_mass, self.engine_mass
         xE, yE, zE = self.engine_x, self.engine_y, self.engine_z
         N, _ = inertial()
@@ -176,13 +176,13 @@ class Aircraft(_Aircraft):
     coordinates = ("x", "y", "z", "psi", "theta", "phi")
     units = {**_Aircraft.units, **dict.fromkeys(coordinates[3:], "rad")}
 
-    def _frame(self, N, q, u, name):
+    def _frame(self, N: Frame, q: NamedVector, u: NamedVector, name: str) -> Frame:
         return N.rotate_sequence("3-2-1", q["psi":"phi"], angular_velocity=u["omega1":"omega3"], name=name)
 
-    def _frame_rates(self, q, u):
+    def _frame_rates(self, q: NamedVector, u: NamedVector) -> Sequence[Component]:
         return rotations.angle_rates("3-2-1", q["psi":"phi"], u["omega1":"omega3"])
 
-    def events(self, t, q, u):
+    def events(self, t: Component, q: NamedVector, u: NamedVector) -> Mapping[str, Quantity]:
         return {"gimbal_lock": jnp.cos(q["theta"])}
 
 
@@ -236,17 +236,17 @@ class SpinningTop(_EulerParameters):
     speeds = ("omega1", "omega2", "omega3")
     units = dict.fromkeys(speeds, "rad/s")
 
-    def q_dot(self, t, q, u):
+    def q_dot(self, t: Component, q: NamedVector, u: NamedVector) -> Sequence[Component]:
         return self._frame_rates(q, u)
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O = inertial()
         T = self._frame(N, q, u, "T")
         G = O.fixed(self.distance * T.z)
         I = self.transverse_inertia
         return Motion([Body(self.mass, (I, I, self.axial_inertia), G, T, name="top")], frames={"T": T})
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         return weight(motion, -self.gravity * motion.N.z)
 
 
@@ -284,10 +284,10 @@ class Bracket(System):
     inputs = ("tip_force1", "tip_force3", "arm_force")
     units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(speeds, "rad/s") | dict.fromkeys(inputs, "N")
 
-    def q_dot(self, t, q, u):
+    def q_dot(self, t: Component, q: NamedVector, u: NamedVector) -> Sequence[Component]:
         return rotations.angle_rates("1-2-3", q["theta1":"theta3"], u["omega1":"omega3"])
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         m, L = self.mass, self.length
         N, O = inertial()
         E = N.rotate_sequence("1-2-3", q["theta1":"theta3"], angular_velocity=u["omega1":"omega3"], name="E")
@@ -298,7 +298,7 @@ class Bracket(System):
         bracket = Body(2.0 * m, (I, I, 2.0 * I), G, E, name="bracket")
         return Motion([bracket], points={"A": A, "B": B}, frames={"E": E})
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         E = motion["E"]
         return (
             weight(motion, -self.gravity * motion.N.y),
@@ -306,7 +306,7 @@ class Bracket(System):
             Force(inputs["arm_force"] * E.z, motion["B"]),
         )
 
-    def events(self, t, q, u):
+    def events(self, t: Component, q: NamedVector, u: NamedVector) -> Mapping[str, Quantity]:
         return {"gimbal_lock": jnp.cos(q["theta2"])}
 
 
@@ -356,7 +356,7 @@ class Rattleback(System):
     speeds = ("omega1", "omega2", "omega3")
     units = dict.fromkeys(coordinates, "rad") | dict.fromkeys("xy", "m") | dict.fromkeys(speeds, "rad/s")
 
-    def body(self, q, u):
+    def body(self, q: NamedVector, u: NamedVector):
         """The frame of the body, the position of the contact relative to the centre, and the velocity of the centre."""
         N, O = inertial()
         B = N.rotate_sequence("3-1-2", q["yaw":"pitch"], angular_velocity=u["omega1":"omega3"], name="B")
@@ -367,20 +367,20 @@ class Rattleback(System):
         contact = -B.vector(a2 * n1 / depth, b2 * n2 / depth, c2 * n3 / depth)
         return N, O, B, depth, contact, B.angular_velocity.cross(-contact)
 
-    def q_dot(self, t, q, u):
+    def q_dot(self, t: Component, q: NamedVector, u: NamedVector) -> Sequence[Component]:
         N, _, _, _, _, velocity = self.body(q, u)
         rates = rotations.angle_rates("3-1-2", q["yaw":"pitch"], u["omega1":"omega3"])
         return *rates, velocity.dot(N.x), velocity.dot(N.y)
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O, B, depth, contact, velocity = self.body(q, u)
         center = O.moving(N.vector(q["x"], q["y"], depth), velocity)
         I = ((self.I11, self.I12, 0.0), (self.I12, self.I22, 0.0), (0.0, 0.0, self.I33))
         stone = Body(self.mass, I, center.fixed(-self.offset * B.z), B, name="stone")
         return Motion([stone], points={"center": center, "contact": center.fixed(contact, B)}, frames={"B": B})
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         return weight(motion, -self.gravity * motion.N.z)
 
-    def events(self, t, q, u):
+    def events(self, t: Component, q: NamedVector, u: NamedVector) -> Mapping[str, Quantity]:
         return {"gimbal_lock": jnp.cos(q["roll"])}

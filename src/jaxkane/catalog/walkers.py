@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 
 from .._integrate.events import falling, rising
 from .._kane.contact.impulses import Impact
-from .._scalarjit.components import Scalar
+from .._scalarjit.components import Component, Scalar
 from .._system.kinematics import inertial
 from .._system.motion import Body, Motion, weight
 from .._system.parameters import parameter
-from .._system.system import System
-from ._entry import entry
+from .._system.system import NamedVector, System
+from ._entry import Loads, Quantity, Values, entry
 
 
 @entry(
@@ -58,10 +59,10 @@ class RimlessWheel(System):
     speeds = ("rate",)
     units = {"angle": "rad", "foot": "m", "rate": "rad/s"}
 
-    def q_dot(self, t, q, u):
+    def q_dot(self, t: Component, q: NamedVector, u: NamedVector) -> Sequence[Component]:
         return u["rate"], 0.0
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O = inertial()
         S = N.rotate(3, -self.slope, 0.0, "S")
         W = N.rotate(3, -q["angle"], -u["rate"], "W")
@@ -72,10 +73,10 @@ class RimlessWheel(System):
         wheel = Body(self.mass, (0.0, 0.0, self.inertia), hub, W, name="wheel")
         return Motion([wheel], points={"foot": foot, "hub": hub, "toe": toe}, frames={"S": S})
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         return weight(motion, -self.gravity * motion.N.y)
 
-    def events(self, t, q, u):
+    def events(self, t: Component, q: NamedVector, u: NamedVector) -> Mapping[str, Quantity]:
         # The angular momentum about the next foot does not change when it lands.
         I, ml2 = self.inertia, self.mass * self.length**2
         ratio = (I + ml2 * jnp.cos(2.0 * self.half_angle)) / (I + ml2)
@@ -130,10 +131,10 @@ class CompassGait(System):
     speeds = ("stance_rate", "swing_rate")
     units = {"stance": "rad", "swing": "rad", "foot": "m"} | dict.fromkeys(speeds, "rad/s")
 
-    def q_dot(self, t, q, u):
+    def q_dot(self, t: Component, q: NamedVector, u: NamedVector) -> Sequence[Component]:
         return u["stance_rate"], u["swing_rate"], 0.0
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O = inertial()
         S = N.rotate(3, -self.slope, 0.0, "S")
         A = N.rotate(3, -q["stance"], -u["stance_rate"], "A")
@@ -148,17 +149,17 @@ class CompassGait(System):
         ]
         return Motion(bodies, points={"foot": foot, "toe": toe}, frames={"S": S})
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         return weight(motion, -self.gravity * motion.N.y)
 
-    def exchange(self, t, q, u):
+    def exchange(self, t: Component, q: NamedVector, u: NamedVector) -> Values:
         """The swing leg becomes the stance leg."""
         motion = self.motion(t, q, u)
         new_foot = motion["toe"].position.dot(motion["S"].x)
         angles = {"stance": q["swing"], "swing": q["stance"], "foot": new_foot}
         return {**angles, "stance_rate": u["swing_rate"], "swing_rate": u["stance_rate"]}
 
-    def events(self, t, q, u):
+    def events(self, t: Component, q: NamedVector, u: NamedVector) -> Mapping[str, Quantity]:
         motion = self.motion(t, q, u)
         S, toe = motion["S"], motion["toe"].velocity
         lands = Impact(toe.dot(S.x), toe.dot(S.y), release=("foot",))
@@ -208,10 +209,10 @@ class SimplestWalker(System):
     speeds = ("theta_dot", "phi_dot")
     units = {"theta": "rad", "phi": "rad", "foot": "m"} | dict.fromkeys(speeds, "rad/s")
 
-    def q_dot(self, t, q, u):
+    def q_dot(self, t: Component, q: NamedVector, u: NamedVector) -> Sequence[Component]:
         return u["theta_dot"], u["phi_dot"], 0.0
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector) -> Motion:
         N, O = inertial()
         S = N.rotate(3, -self.slope, 0.0, "S")
         A = S.rotate(3, q["theta"], u["theta_dot"], "A")
@@ -226,17 +227,17 @@ class SimplestWalker(System):
         ]
         return Motion(bodies, points={"foot": foot, "toe": toe}, frames={"S": S})
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Values) -> Loads:
         return weight(motion, -self.gravity * motion.N.y)
 
-    def exchange(self, t, q, u):
+    def exchange(self, t: Component, q: NamedVector, u: NamedVector) -> Values:
         """The swing leg becomes the stance leg."""
         motion = self.motion(t, q, u)
         new_foot = motion["toe"].position.dot(motion["S"].x)
         angles = {"theta": q["theta"] - q["phi"], "phi": -q["phi"], "foot": new_foot}
         return {**angles, "theta_dot": u["theta_dot"] - u["phi_dot"], "phi_dot": -u["phi_dot"]}
 
-    def events(self, t, q, u):
+    def events(self, t: Component, q: NamedVector, u: NamedVector) -> Mapping[str, Quantity]:
         motion = self.motion(t, q, u)
         S, toe = motion["S"], motion["toe"].velocity
         lands = Impact(toe.dot(S.x), toe.dot(S.y), release=("foot",))

@@ -23,8 +23,8 @@ from .._kane.contact.forces import has_contacts
 from .._kane.right_hand_side import output_names
 from .._system.parameters import in_batches
 from .._system.system import State, System, packed
-from ..fit.problem.from_declarations import parameters_of
 from ..fit.problem.parameters import Parameters
+from ..fit.problem.specification import parameters_of
 
 Values = Mapping[str, Condition] | State
 

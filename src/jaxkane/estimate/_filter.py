@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .._common.lookup import refuse_unknown, whole_number
@@ -41,11 +42,11 @@ from .._kane.constraint_residuals import (
 )
 from .._kane.right_hand_side import output_names, outputs_at, values_of, vector_field
 from .._scalarjit.cache_key import jit
+from .._scalarjit.components import Component, Scalar
 from .._system.parameters import concrete_numbers, module_text, parameters_in, text_of, with_parameters, wrapped
 from .._system.system import State, System, named_numbers, packed, units_of, unpacked
-from ._process_noise import MODES, Disturbance, checked_noise, checked_numbers
-from ._square_root import moments, root
-from ._square_root import update as update_root
+from ._filter_step import MODES, Disturbance, checked_noise, checked_numbers, moments, root
+from ._filter_step import update as update_root
 
 Inputs = Mapping[str, Any] | None
 
@@ -256,7 +257,7 @@ def begin(filter: Filter, state: State, deviation: Mapping[str, float], t: float
     return Belief(jnp.full(m, t, v.dtype), jnp.tile(v, (m, 1)), jnp.tile(wide, (m, 1, 1)), jnp.zeros((), v.dtype))
 
 
-def _check_belief(function: str, filter: Filter, belief: Any) -> None:
+def _check_belief(function: str, filter: Filter, belief: object) -> None:
     """**Raises:** `TypeError` or `ValueError` if the belief does not belong to this filter."""
     if not isinstance(filter, Filter) or not isinstance(belief, Belief):
         kinds = f"{type(filter).__name__} and {type(belief).__name__}"
@@ -274,7 +275,7 @@ def _check_belief(function: str, filter: Filter, belief: Any) -> None:
 
 
 @jit
-def predict(filter: Filter, belief: Belief, dt: Any, inputs: Inputs = None) -> Belief:
+def predict(filter: Filter, belief: Belief, dt: Scalar, inputs: Inputs = None) -> Belief:
     """The belief after one time step.
 
     **Arguments:**
@@ -292,6 +293,7 @@ def predict(filter: Filter, belief: Belief, dt: Any, inputs: Inputs = None) -> B
     m, n = belief.mean.shape
     k, n_w = belief.root.shape[2], len(filter.noise)
     t, dt = belief.t[0], jnp.asarray(dt, belief.mean.dtype)
+    # The step is computed even if its length is zero, and would divide by it.
     still = dt == 0
     dt = jnp.where(still, 1.0, jnp.where(dt > 0, dt, jnp.nan))
     values = {name: jnp.asarray(x, dt.dtype) for name, x in checked_inputs(filter.system, inputs).items()}
@@ -317,7 +319,12 @@ def predict(filter: Filter, belief: Belief, dt: Any, inputs: Inputs = None) -> B
 
 
 def update(
-    filter: Filter, belief: Belief, measured: Any, inputs: Inputs = None, *, age: int = 0
+    filter: Filter,
+    belief: Belief,
+    measured: Mapping[str, Scalar] | Float[Array, " n_c"],
+    inputs: Inputs = None,
+    *,
+    age: int = 0,
 ) -> tuple[Belief, Innovation]:
     """The belief after a measurement.
 
@@ -420,7 +427,9 @@ def _flow(filter: Filter, t0: Array, dt: Array, v: Array, xi: Array, inputs: dic
     return jnp.concatenate([y, v[n:]])
 
 
-def sensed(system: System, sensors: tuple[str, ...], t: Any, q: Array, u: Array, values: Mapping[str, Any]) -> Array:
+def sensed(
+    system: System, sensors: tuple[str, ...], t: Component, q: Array, u: Array, values: Mapping[str, Any]
+) -> Array:
     """The readings (n_c,) of the sensors at a state. `values` contains inputs and first-order states by name."""
     by_name = dict(zip((*system.coordinates, *system.speeds), (*q, *u), strict=True))
     by_name |= {name: values[name] for name in system.states}
@@ -431,7 +440,7 @@ def sensed(system: System, sensors: tuple[str, ...], t: Any, q: Array, u: Array,
     return jnp.stack([by_name[name] for name in sensors])
 
 
-def _as_measured(filter: Filter, measured: Any, dtype: Any) -> Array:
+def _as_measured(filter: Filter, measured: Mapping[str, Scalar] | Float[Array, " n_c"], dtype: DTypeLike) -> Array:
     if isinstance(measured, Mapping):
         refuse_unknown(measured, filter.sensors, "update: `measured` contains unknown names:", "the filter has")
         for name, value in measured.items():

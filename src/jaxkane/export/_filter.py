@@ -27,7 +27,7 @@ from .._scalarjit.graph import NotScalarError
 from .._version import __version__
 from ..estimate import Belief, Filter, predict, update
 from ..estimate._filter import sensed
-from ..estimate._process_noise import MODES
+from ..estimate._filter_step import MODES
 from ._source import COMPARE, C, CText, in_comment, listed, sections_of, variable_units
 
 

@@ -4,7 +4,7 @@ from ._bicycle import bicycle_problem as bicycle_problem
 from ._bicycle import bicycle_rides as bicycle_rides
 from ._bicycle import fit_bicycle as fit_bicycle
 from ._bicycle import frame_inertia as frame_inertia
-from .collocated._fit import Collocation as Collocation
+from ._collocation import Collocation as Collocation
 from .extend.candidates import Candidate as Candidate
 from .extend.selection import forward_selection as forward_selection
 from .inverse.base_parameters import base_parameters as base_parameters
@@ -21,10 +21,10 @@ from .problem.declarations import SpectralDensity as SpectralDensity
 from .problem.errors import AutoRegressive as AutoRegressive
 from .problem.errors import Huber as Huber
 from .problem.errors import StudentT as StudentT
-from .problem.from_declarations import JointPrior as JointPrior
-from .problem.from_declarations import Linear as Linear
 from .problem.model import Simulation as Simulation
 from .problem.problem import Problem as Problem
+from .problem.specification import JointPrior as JointPrior
+from .problem.specification import Linear as Linear
 from .problem.trial import Trial as Trial
 from .problem.trial import check_records as check_records
 from .result.design import design as design

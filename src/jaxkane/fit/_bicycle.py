@@ -11,11 +11,10 @@ import numpy as np
 from ..catalog import WhippleBicycle, read_bicycle_file
 from .problem.bodies import Inertia
 from .problem.declarations import Items
-from .problem.from_declarations import parameters_of
 from .problem.model import Unknowns
 from .problem.parameters import Prior
 from .problem.problem import Problem
-from .problem.specification import with_options
+from .problem.specification import parameters_of, with_options
 from .problem.trial import Trial, as_trials
 from .result.fit_result import Fit
 from .solve.fit import solve

@@ -1,11 +1,12 @@
-"""Candidate extensions of a model: they are checked, grouped, and combined in one augmented problem."""
+"""Candidate extensions of a model, which are checked, grouped, and combined in one problem; models and moves."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -14,13 +15,15 @@ from ..._common.lookup import as_names, refuse, refuse_unknown
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
 from ..problem.declarations import CalibrationTerm, Declaration, Delay, Free, Item, Items
-from ..problem.from_declarations import as_items, parameters_of
 from ..problem.model import Simulation, Unknowns
 from ..problem.parameters import Interval, with_entries
 from ..problem.problem import Problem
-from ..problem.specification import Names, ProblemSpec, deviations_by_name
+from ..problem.specification import Names, ProblemSpec, as_items, deviations_by_name, parameters_of
+from ..result.diagnostics import Ranges, implausible
 from ..result.fit_result import Fit
-from ..solve.local_unknowns import usable
+from ..result.linearized import LinearizedProblem, linearized_problem
+from ..result.statistics import serial_correlation
+from ..solve.optimizers import usable
 
 Bounds = tuple[float | None, float | None]
 
@@ -302,3 +305,198 @@ def mapped_point(source: Problem, at: Unknowns, problem: Problem, names: Sequenc
         places = np.array([new.window_names.index(name) for name in old.window_names])
         z = on_device(with_entries(np.asarray(z).T, places, np.asarray(at.window_starts).T).T)
     return Unknowns(point.parameters, at.trial_unknowns, z)
+
+
+@dataclasses.dataclass(frozen=True)
+class Extension:
+    """A change of the model and its tests.
+
+    - `name`: name of the candidate; "a and b" for a pair, "a instead of b" for an exchange, "without b" for a removal.
+    - `parameters`: names of the parameters that it frees.
+    - `values`: by name, the values of these and of all other free parameters. From its fit if `cost` is not NaN,
+        otherwise from the linearization.
+    - `errors`: by name, standard errors of `parameters`, from the same source.
+    - `nested`: whether the trajectories are the same as those of the model before a parameter is freed.
+    - `predicted_cost`: sum of squares predicted by the linearization, if it is nested.
+    - `cost`: sum of squares of its fit, NaN if it was not fitted.
+    - `p`: p-value of the test of the added parameters. NaN if none is added, or if it is not nested. One-sided for a
+        parameter whose plausible range starts where the parameter has no effect.
+    - `criterion`: "score test" before a fit, "Wald test" after it, or "trials left out" alone.
+    - `held_out_cost`: sum of squares of trials that are left out in turn.
+    - `bound_violations`: a sentence for each implausible value of a free parameter.
+    - `reason`: why it is not accepted, or "".
+    - `accepted`: whether it is accepted.
+    """
+
+    name: str
+    parameters: tuple[str, ...] = ()
+    values: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)
+    errors: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)
+    nested: bool = True
+    predicted_cost: float = math.nan
+    cost: float = math.nan
+    p: float = math.nan
+    criterion: str = ""
+    held_out_cost: float = math.nan
+    bound_violations: tuple[str, ...] = ()
+    reason: str = ""
+    accepted: bool = False
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        known = [name for name in self.parameters if not math.isnan(self.errors[name])]
+        estimates = ", ".join(f"{self.values[name]:.4g}" for name in known)
+        errors = ", ".join(f"{self.errors[name]:.2g}" for name in known)
+        numbers = (self.predicted_cost, ".5g"), (self.cost, ".5g"), (self.p, ".2g"), (self.held_out_cost, ".5g")
+        predicted, cost, p, held_out = ("" if math.isnan(x) else f"{x:{form}}" for x, form in numbers)
+        decision = self.reason or "accepted"
+        return self.name, estimates, errors, predicted, cost, p, self.criterion, held_out, decision
+
+
+@dataclasses.dataclass(frozen=True)
+class Alternative:
+    """Another model that was accepted.
+
+    - `names`: names of its candidates.
+    - `cost`: sum of squares of its fit.
+    - `held_out_cost`: sum of squares of trials that are left out in turn.
+    - `is_as_good`: whether it predicts as well as the selected model, within two standard errors of the differences by
+        fold.
+    """
+
+    names: tuple[str, ...]
+    cost: float
+    held_out_cost: float
+    is_as_good: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A fitted model of the search.
+
+    - `terms`: its candidates.
+    - `fit`: its fit.
+    - `correlation`: the largest serial correlation of the residuals of a channel, because a candidate may act on only
+        that channel.
+    - `linearized`: linearization at the minimum, with one column per free parameter.
+    - `held_out` (K,): linearized sums of squares of the folds. None without folds.
+    - `at_bound`: names of parameters that rest at a bound. The linearization would move them beyond it, so they are
+        fixed there.
+    - `bound_violations`: by name, implausible estimates.
+    """
+
+    terms: tuple[Candidate, ...]
+    fit: Fit
+    correlation: float
+    linearized: LinearizedProblem
+    held_out: np.ndarray | None
+    at_bound: tuple[str, ...]
+    bound_violations: Mapping[str, str]
+
+    @classmethod
+    def of(
+        cls, fit: Fit, terms: Sequence[Candidate], folds: Sequence[Sequence[int]] | None, plausible: Ranges
+    ) -> Model:
+        """The model of a fit.
+
+        **Raises:** `ValueError` if the residuals do not have finite derivatives at the minimum.
+        """
+        if not usable(fit.linearization):
+            raise ValueError("the residuals have no finite derivatives at its minimum")
+        linearized, at_bound = linearized_problem(fit.linearization), fit.identifiability.at_bound
+        free = [i for i, name in enumerate(fit.names) if name not in at_bound]
+        held_out = None if folds is None else linearized.costs_left_out(free, folds)
+        correlation = max(serial_correlation(fit.residuals).values())
+        violations = implausible(plausible, fit.estimates)
+        return cls(tuple(terms), fit, correlation, linearized, held_out, at_bound, violations)
+
+    @property
+    def key(self) -> frozenset[str]:
+        return frozenset(c.name for c in self.terms)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        residuals, unknowns = self.fit.problem.size
+        return residuals - unknowns
+
+    @property
+    def held_out_cost(self) -> float:
+        return math.nan if self.held_out is None else float(np.sum(self.held_out))
+
+    @property
+    def rank(self) -> float:
+        """The cost by which models are ranked: that of held-out trials, with one trial the sum of squares."""
+        return self.fit.cost if self.held_out is None else self.held_out_cost
+
+    def compared_with(self, best: Model) -> Alternative:
+        is_as_good = False
+        if self.held_out is not None and best.held_out is not None:
+            difference = self.held_out - best.held_out
+            error = np.std(difference, ddof=1) * math.sqrt(len(difference))
+            rounding = 1e-9 * best.held_out_cost  # equivalent models differ only by rounding errors
+            is_as_good = bool(difference.sum() <= 2.0 * error + rounding)
+        return Alternative(tuple(c.name for c in self.terms), self.fit.cost, self.held_out_cost, is_as_good)
+
+
+class Round(NamedTuple):
+    model: Model
+    extensions: tuple[Extension, ...]
+
+
+class Branch(NamedTuple):
+    """A model, and the rounds of the search that led to it."""
+
+    model: Model
+    rounds: tuple[Round, ...]
+
+
+class Move(NamedTuple):
+    """A change of a model: candidates that are added, and candidates that are dropped."""
+
+    add: tuple[Candidate, ...]
+    drop: tuple[Candidate, ...] = ()
+
+    @property
+    def name(self) -> str:
+        added, dropped = (" and ".join(c.name for c in part) for part in self)
+        if not self.add:
+            return f"without {dropped}"
+        return f"{added} instead of {dropped}" if self.drop else added
+
+
+class Group(NamedTuple):
+    """Candidates of one system together with the selected ones, in one problem that is linearized at the minimum of the
+    model.
+
+    - `problem`, `point`: the augmented problem and the minimum of the model in it.
+    - `cost`: sum of squares at `point`.
+    - `linearized`: the linearization at `point`.
+    - `base`: places of the parameters of the model without its terms.
+    - `own`: places of the parameters, by term.
+    - `at_bound`: places of the parameters of the model that rest at a bound.
+    - `nested`: whether the trajectories at `point` are those of the model.
+    """
+
+    problem: Problem
+    point: Unknowns
+    cost: float
+    linearized: LinearizedProblem
+    base: list[int]
+    own: Mapping[str, list[int]]
+    at_bound: list[int]
+    nested: bool
+
+    def places(self, terms: Sequence[Candidate]) -> list[int]:
+        return list(dict.fromkeys([*self.base, *(i for c in terms for i in self.own[c.name])]))
+
+    def places_of(self, terms: Sequence[Candidate], move: Move) -> tuple[list[int], list[int], list[int]]:
+        """Places of the parameters that remain free, of these and the added ones, and of the dropped ones."""
+        kept = [c for c in terms if c not in move.drop]
+        base, both = self.places(kept), self.places([*kept, *move.add])
+        return base, both, [i for i in self.places(terms) if i not in base]
+
+    def neutral(self, places: Sequence[int]) -> np.ndarray:
+        """Unconstrained parameters (p,). Those at these places have the value at which they have no effect."""
+        x = np.array(self.point.parameters)
+        x[list(places)] = 0.0
+        return x

@@ -4,32 +4,319 @@ from __future__ import annotations
 
 import dataclasses
 import html
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import equinox as eqx
+import numpy as np
 from tqdm import tqdm
 
 from ..._common.lookup import refuse, refuse_unknown, whole_number
-from ..problem.from_declarations import parameters_of
-from ..problem.specification import refuse_other
-from ..result.diagnostics import Plausible, plausible_of, refuse_unless_at_a_minimum
+from ..._scalarjit.compat import on_device
+from ..problem.specification import parameters_of, refuse_other
+from ..result.data import Rows, Tables, html_tables, text_tables
+from ..result.diagnostics import AT_A_MINIMUM, Ranges, implausible, plausible_of, refuse_unless_at_a_minimum
 from ..result.fit_result import Fit
-from ..result.linearized import trial_folds
+from ..result.linearized import LinearizedProblem, Score, linearized_problem, score_test, trial_folds
 from ..result.statistics import check_level
 from ..result.studies import energy_sources
-from ..result.tables import Rows, Tables, html_tables, text_tables
-from ..solve.fit import solve
-from ..solve.optimizers import LeastSquares
+from ..solve.fit import search, solve, uninterrupted
+from ..solve.optimizers import LeastSquares, usable
 from .candidates import (
+    Alternative,
+    Branch,
+    Candidate,
     Candidates,
+    Extension,
+    Group,
+    Model,
+    Move,
+    Round,
     Terms,
+    augmented_problem,
     checked_terms,
+    compatible_groups,
     extended_specification,
     mapped_point,
     scaled_terms,
 )
-from .search import Alternative, Extension, Search
+
+NESTED = 1e-6
+"""Largest relative difference of the sum of squares at the start of a nested candidate."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Search:
+    fit: Fit
+    terms: Terms
+    exchange: bool
+    depth: int
+    refits: int | None
+    level: float
+    plausible: Ranges
+    folds: Sequence[Sequence[int]] | None
+    bar: Any
+
+    def run(self, beam: int) -> tuple[list[Branch], list[Branch]]:
+        """Branches that could not be extended further, and all models that were accepted during the search."""
+        first = Model.of(self.fit, self.terms.removable, self.folds, self.plausible)
+        branches, ended, accepted = [Branch(first, ())], [], {}
+        while branches:
+            longer: dict[frozenset[str], Branch] = {}
+            for branch in branches:
+                extensions, models = self.round(branch.model)
+                taken = [one for one in extensions if one.accepted]
+                if not taken:
+                    more = [Round(branch.model, extensions)] * bool(extensions or not branch.rounds)
+                    ended.append(Branch(branch.model, (*branch.rounds, *more)))
+                for one in taken:
+                    ordered = (one, *(other for other in extensions if other is not one))
+                    other = Branch(models[one.name], (*branch.rounds, Round(branch.model, ordered)))
+                    key = other.model.key
+                    # Several branches may lead to the same model. Only the best of them is extended.
+                    if key not in accepted or other.model.rank < accepted[key].model.rank:
+                        longer[key] = accepted[key] = other
+            branches = sorted(longer.values(), key=lambda branch: branch.model.rank)[:beam]
+        return ended, list(accepted.values())
+
+    def round(self, model: Model) -> tuple[tuple[Extension, ...], dict[str, Model]]:
+        """The extensions that are tried, the best accepted one first, and the models after them."""
+        rest = [c for c in self.terms.all if c not in model.terms]
+        added = [c for c in model.terms if c in self.terms.candidates]
+        single, pairs = [], []
+        if len(added) < self.depth:
+            single = [Move((c,)) for c in rest]
+        # A removal is decided by held-out trials. Without folds nothing is removed.
+        asked = self.terms.all if self.exchange else self.terms.removable * bool(self.folds)
+        dropped = [c for c in model.terms if c.has_parameters_only and c in asked]
+        parameters_only = [c for c in rest if c.has_parameters_only]
+        exchanges = [Move((), (d,)) for d in dropped if len(model.fit.names) > 1]
+        exchanges += [Move((c,), (d,)) for d in dropped for c in parameters_only]
+        if self.exchange and len(added) + 2 <= self.depth:
+            pairs = [Move(pair) for pair in itertools.combinations(parameters_only, 2)]
+        if not (single or exchanges):
+            return (), {}
+        share = 0.5 if pairs else 1.0  # split the level, so that pairs do not increase false positives
+        groups, lost = self._groups(model, rest)
+        kinds = (single, share * self.level), (exchanges, self.level * len(exchanges)), (pairs, share * self.level)
+        extensions, models = [], {}
+        for moves, level in kinds:
+            if moves and not (moves is pairs and any(one.accepted for one in extensions)):
+                others, more = self._tried(model, groups, moves, level / len(moves))
+                extensions, models = extensions + others, models | more
+        return tuple(sorted(extensions + lost, key=_order)), models
+
+    def _groups(self, model: Model, rest: Sequence[Candidate]) -> tuple[dict[str, Group], list[Extension]]:
+        """The group in which each candidate and selected term is tested, by name, and candidates that cannot be
+        simulated.
+        """
+        groups: dict[str, Group] = {}
+        lost: list[Extension] = []
+        for members in compatible_groups(self.fit, rest) or [[]]:
+            self.bar.set_postfix_str(f"{len(members)} linearized")
+            try:
+                group = self._group(model, members)
+            except ValueError as error:
+                lost += [Extension(c.name, reason=str(error)) for c in members]
+            else:
+                if not group.nested and self.folds is None:
+                    reason = "not nested, and no trial can be left out"
+                    lost += [Extension(c.name, nested=False, reason=reason) for c in members]
+                    continue
+                groups |= {c.name: group for c in members}
+                if group.nested:
+                    groups |= {c.name: group for c in model.terms}
+            self.bar.update()
+        return groups, lost
+
+    def _group(self, model: Model, members: Sequence[Candidate]) -> Group:
+        """The group of these candidates.
+
+        **Raises:** `ValueError` if the augmented problem cannot be constructed or simulated.
+        """
+        order = [c.name for c in self.terms.all]  # a fixed order, so that all rounds share a compiled program
+        both = sorted((*model.terms, *members), key=lambda c: order.index(c.name))
+        problem, point = augmented_problem(self.terms.base, (model.fit.problem, model.fit.point, model.fit.names), both)
+        at = problem.linearize(point)
+        if at is None or not usable(at):
+            raise ValueError("the simulation fails at its initial guess")
+        names, linearized = problem.parameters.names, linearized_problem(at)
+        own = {c.name: [names.index(name) for name in c.names(problem.system)] for c in both}
+        of_terms = {i for places in own.values() for i in places}
+        base = [i for i, name in enumerate(names) if name in model.fit.names and i not in of_terms]
+        free = [names.index(name) for name in model.fit.names]
+        of_priors = linearized.priors[[*free, *range(len(names), len(linearized.priors))], -1]
+        cost = at.cost - at.prior_squares + float(np.sum(of_priors**2))
+        # The absolute tolerance is for simulated measurements, whose cost is almost zero.
+        nested = abs(cost - model.fit.cost) <= NESTED * model.fit.cost + 1e-9
+        at_bound = [names.index(name) for name in model.at_bound]
+        return Group(problem, point, cost, linearized, base, own, at_bound, nested)
+
+    def _tried(
+        self, model: Model, groups: Mapping[str, Group], moves: Sequence[Move], level: float
+    ) -> tuple[list[Extension], dict[str, Model]]:
+        """Linearize moves of one kind, fit the most promising ones, and decide at `level` for each move."""
+        tried: list[tuple[Move, Group, Extension]] = []
+        for move in moves:
+            of_each = [groups.get(c.name) for c in move.add or move.drop]
+            group = of_each[0]
+            if group is not None and all(other is group for other in of_each):  # otherwise one cannot be simulated
+                tried.append((move, group, self._predicted(model, move, group)))
+        fitted = [item for item in tried if not item[2].reason]
+        if self.refits is not None:
+            # Plausible ones first, then by predicted cost, or for exchanges and removals by held-out cost.
+            nested = sorted(
+                (item for item in fitted if item[2].nested),
+                key=lambda x: (bool(x[2].bound_violations), x[2].held_out_cost if x[0].drop else x[2].predicted_cost),
+            )[: self.refits]
+            fitted = nested + [item for item in fitted if not item[2].nested] * bool(self.refits)
+        extensions, models = {move.name: extension for move, _, extension in tried}, {}
+        for move, group, extension in fitted:
+            self.bar.set_postfix_str(move.name)
+            extensions[move.name], after = self._refitted(model, move, group, extension)
+            models |= {} if after is None else {move.name: after}
+            self.bar.update()
+        decided = []
+        for name, extension in extensions.items():
+            after = models[name].bound_violations if name in models else {}
+            worse = [words for of, words in after.items() if of not in model.bound_violations]
+            decided.append(self._decided(model, extension, level, worse))
+        shown = [e for e in decided if np.isfinite(e.cost) or all(not m.drop and len(m.add) == 1 for m in moves)]
+        return shown, models
+
+    def _predicted(self, model: Model, move: Move, group: Group) -> Extension:
+        """The extension as predicted by the linearization at the minimum of the model."""
+        base, both, dropped = group.places_of(model.terms, move)
+        new, names = both[len(base) :], group.problem.parameters.names
+        steps, of_base = ([i for i in places if i not in group.at_bound] for places in (both, base))
+        x = np.asarray(group.point.parameters)
+        linearized = _moved(group.linearized, dropped, -x[dropped])
+        freedom = model.degrees_of_freedom + len(dropped)
+        score = score_test(linearized, of_base, new, degrees_of_freedom=freedom, correlation=model.correlation)
+        slopes, step = np.asarray(group.problem.parameters.slopes(group.point.parameters)), np.zeros(len(names))
+        step[steps], cost = linearized.minimum(steps)
+        values = np.asarray(group.problem.parameters.values(on_device(group.neutral(dropped)))) + slopes @ step
+        new_names = tuple(names[i] for i in new)
+        extension = Extension(
+            name=move.name,
+            parameters=new_names,
+            values={names[i]: float(values[i]) for i in both},
+            errors=_errors(new_names, slopes[np.ix_(new, new)], score.covariance),
+            nested=group.nested,
+        )
+        if not group.nested:
+            return extension
+        held_out = math.nan if self.folds is None else float(np.sum(linearized.costs_left_out(steps, self.folds)))
+        return dataclasses.replace(
+            extension,
+            predicted_cost=cost,
+            p=self._one_sided(score, new_names, group) if new else math.nan,
+            criterion="score test" if new else "",
+            held_out_cost=held_out,
+            bound_violations=tuple(implausible(self.plausible, extension.values).values()),
+            reason=_undetermined(new_names, score),
+        )
+
+    def _refitted(self, model: Model, move: Move, group: Group, extension: Extension) -> tuple[Extension, Model | None]:
+        """The extension and the model after a fit of all parameters that are then free."""
+        base, both, dropped = group.places_of(model.terms, move)
+        # A subset of the augmented problem, not a problem of its own, which would have to be compiled for each
+        # candidate.
+        parameters = group.problem.model.parameters.subset(both, on_device(group.neutral(dropped)))
+        problem = dataclasses.replace(
+            group.problem, model=eqx.tree_at(lambda m: m.parameters, group.problem.model, parameters)
+        )
+        start = eqx.tree_at(lambda p: p.parameters, group.point, group.point.parameters[parameters.places])
+        try:
+            fit = uninterrupted(search(problem, LeastSquares(), start=start))
+            if fit.status not in AT_A_MINIMUM:
+                return dataclasses.replace(extension, reason=f"its fit has not converged ({fit.status})"), None
+            kept = (c for c in model.terms if c not in move.drop)
+            after = Model.of(fit, (*kept, *move.add), self.folds, self.plausible)
+        except ValueError as error:
+            return dataclasses.replace(extension, reason=str(error)), None
+        n = len(base)
+        new, names = range(n, len(both)), fit.names[n:]
+        x = np.asarray(fit.point.parameters)[n:]
+        at_zero = _moved(after.linearized, new, -x)  # null hypothesis: no effect
+        of_base = [i for i in range(n) if fit.names[i] not in after.at_bound]
+        freedom = after.degrees_of_freedom + len(new)
+        score = score_test(at_zero, of_base, new, degrees_of_freedom=freedom, correlation=after.correlation)
+        slopes = np.asarray(problem.parameters.slopes(fit.point.parameters))
+        tested = bool(move.add) and extension.nested
+        return dataclasses.replace(
+            extension,
+            values=fit.estimates,
+            errors=_errors(names, slopes[n:, n:], score.covariance),
+            cost=fit.cost,
+            p=self._one_sided(score, names, group) if tested else math.nan,
+            criterion="Wald test" if tested else "trials left out",
+            held_out_cost=after.held_out_cost,
+            bound_violations=tuple(after.bound_violations.values()),
+        ), after
+
+    def _one_sided(self, score: Score, names: Sequence[str], group: Group) -> float:
+        """The p-value, one-sided if the only tested parameter is plausible on one side of its start only."""
+        if len(names) != 1 or not np.isfinite(score.p):
+            return score.p
+        parameters = group.problem.parameters
+        start = float(parameters.start[parameters.names.index(names[0])])
+        low, high = self.plausible.get(names[0], (-math.inf, math.inf))
+        if start not in (low, high):
+            return score.p
+        inside = score.step[0] > 0 if start == low else score.step[0] < 0
+        return score.p / 2 if inside else 1.0 - score.p / 2
+
+    def _decided(self, model: Model, extension: Extension, level: float, worse: Sequence[str]) -> Extension:
+        """The extension, accepted or with the first reason against it. `worse`: new implausible values."""
+        is_fitted = np.isfinite(extension.cost)
+        held_out = f"{extension.held_out_cost:.5g} against {model.held_out_cost:.5g}"
+        reasons: tuple[tuple[Any, str], ...] = (
+            (extension.reason, extension.reason),
+            (worse, f"not plausible: {', '.join(worse)}"),
+            (extension.p >= level, "no more than chance"),
+            (not is_fitted and extension.bound_violations, "predicted values not plausible, not fitted"),
+            (not is_fitted, "promising, not fitted" if extension.nested else "not nested, not fitted"),
+            (
+                is_fitted and np.isfinite(extension.p) and not extension.cost < model.fit.cost,
+                "its fit does not lower the cost",
+            ),
+            (extension.held_out_cost >= model.held_out_cost, f"does not predict held-out trials better: {held_out}"),
+        )
+        reason = next((words for applies, words in reasons if applies), "")
+        return dataclasses.replace(extension, reason=reason, accepted=not reason)
+
+
+def _order(extension: Extension) -> tuple[bool, float]:
+    """Sort key: accepted ones first, then by held-out cost, or by the cost or predicted cost."""
+    if extension.accepted and math.isfinite(extension.held_out_cost):
+        return False, extension.held_out_cost
+    costs = [x for x in (extension.cost, extension.predicted_cost) if not math.isnan(x)]
+    return not extension.accepted, costs[0] if costs else math.inf
+
+
+def _moved(linearized: LinearizedProblem, places: Sequence[int], step: np.ndarray) -> LinearizedProblem:
+    """The linearization expanded about another point, which is a `step` away in the columns at these places."""
+    data, priors = linearized.data.copy(), linearized.priors.copy()
+    for rows in (data, priors):
+        rows[..., -1] += rows[..., list(places)] @ step
+    return dataclasses.replace(linearized, data=data, priors=priors)
+
+
+def _errors(names: Sequence[str], slopes: np.ndarray, covariance: np.ndarray) -> dict[str, float]:
+    deviations = np.sqrt(np.diagonal(slopes @ covariance @ slopes.T)) if names else []
+    return {name: float(deviation) for name, deviation in zip(names, deviations, strict=True)}
+
+
+def _undetermined(names: Sequence[str], score: Score) -> str:
+    """The parameters that the data do not determine, as text."""
+    insensitive, collinear = (", ".join(np.array(names, str)[~ok]) for ok in (score.sensitive, score.distinguishable))
+    if insensitive:
+        return f"these data do not depend on {insensitive}"
+    return f"{collinear} cannot be distinguished from the free parameters" if collinear else ""
+
 
 HEAD = ("candidate", "estimate", "std. error", "predicted cost", "cost", "p", "criterion", "held-out cost", "decision")
 
@@ -221,7 +508,7 @@ def forward_selection(
     )
 
 
-def _plausible_ranges(fit: Fit, terms: Terms, plausible: Mapping[str, Any]) -> Plausible:
+def _plausible_ranges(fit: Fit, terms: Terms, plausible: Mapping[str, Any]) -> Ranges:
     """Plausible ranges by name, of all parameters that are free or may be freed."""
     ranges, known, priors = {}, set(fit.names), fit.problem.specification.priors or {}
     for candidate in terms.all:
@@ -230,13 +517,13 @@ def _plausible_ranges(fit: Fit, terms: Terms, plausible: Mapping[str, Any]) -> P
         parameters = parameters_of(candidate.system or fit.problem.system, candidate.items, trials=fit.problem.trials)
         parameters = parameters.with_priors(priors)
         of_fit = {name: pair for name, pair in plausible.items() if name in parameters.names}
-        ranges |= plausible_of(parameters, {**candidate.plausible, **of_fit}).ranges
+        ranges |= plausible_of(parameters, {**candidate.plausible, **of_fit})
         known |= {*parameters.names, *candidate.plausible}
     refuse_unknown(plausible, known, "`plausible` contains unknown names:", "the names are")
     asked = {name: pair for candidate in terms.all for name, pair in candidate.plausible.items()} | {**plausible}
     # Parameters that are already free use the initial guess of the fit, not the value of a candidate's system.
     of_fit = {name: pair for name, pair in asked.items() if name in fit.names}
-    return Plausible({**ranges, **plausible_of(fit.parameters, of_fit).ranges})
+    return {**ranges, **plausible_of(fit.parameters, of_fit)}
 
 
 def _check_arguments(fit: Fit, depth: int, beam: int, refits: int | None, level: float) -> None:

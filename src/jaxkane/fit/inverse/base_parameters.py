@@ -11,6 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from ..._common.lookup import positive_number, refuse_unknown
 from ..._kane.consistent_state import assemble
@@ -19,9 +21,9 @@ from ..._kane.regressor import Bodies
 from ..._scalarjit.cache_key import jit
 from ..._system.parameters import leaf_name
 from ..._system.system import System
+from ..result.data import text_table
 from ..result.identifiability import combination
 from ..result.statistics import Clusters, infinite_along, jackknife
-from ..result.tables import text_table
 from .kinematics import KinematicSamples, Motions, kinematic_samples
 from .regressor import Names, Regressor, RegressorSpec, check_linear, input_names, regressor_spec
 
@@ -77,7 +79,7 @@ class BaseParameters:
     def base_units(self) -> tuple[str, ...]:
         return tuple(self.units[i] for i in self.places)
 
-    def of(self, values: Any) -> np.ndarray:
+    def of(self, values: ArrayLike) -> np.ndarray:
         """Base parameters (b,) of parameters (p,)."""
         return self.matrix @ np.asarray(values)
 
@@ -172,7 +174,14 @@ def equations_at(spec: RegressorSpec, samples: KinematicSamples) -> tuple[np.nda
 
 
 @jit
-def _equations(spec, t, q, u, inputs, u_dot):
+def _equations(
+    spec: RegressorSpec,
+    t: Float[Array, " N"],
+    q: Float[Array, "N n_q"],
+    u: Float[Array, "N n_u"],
+    inputs: Mapping[str, Array],
+    u_dot: Float[Array, "N n_u"],
+):
     rows, _ = jax.vmap(spec.at)(t, q, u, inputs, u_dot)
     return rows.matrix, rows.forces
 
@@ -207,7 +216,7 @@ def random_states(system: System, n: int) -> KinematicSamples:
 
 
 @jit
-def _assembled(system, t, q):
+def _assembled(system: System, t: Float[Array, " N"], q: Float[Array, "N n_q"]):
     return jax.vmap(lambda t, q: assemble(system, q, t=t).q)(t, q)
 
 

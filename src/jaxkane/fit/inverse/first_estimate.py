@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from scipy.optimize import least_squares
 
 from ..._kane.checks import check_bodies
@@ -17,11 +18,11 @@ from ..._kane.regressor import regressor_model
 from ..._scalarjit.cache_key import jit
 from ..._system.system import System
 from ..problem.declarations import Items
-from ..problem.from_declarations import parameters_of
 from ..problem.parameters import Parameters
+from ..problem.specification import parameters_of
 from ..problem.trial import Trial
+from ..result.data import text_table
 from ..result.diagnostics import describe_bodies
-from ..result.tables import text_table
 from .base_parameters import BaseParameters, base_structure, equations_at, estimated, states_for
 from .kinematics import Motions, kinematic_samples, max_spacing
 from .regressor import RegressorSpec, check_linear
@@ -216,11 +217,11 @@ def _projection(
         at = jnp.asarray(np.frombuffer(x), parameters.start.dtype)
         return jax.device_get(_values_with_slopes(spec, parameters, at))
 
-    def residuals(x: Any) -> np.ndarray:
+    def residuals(x: np.ndarray) -> np.ndarray:
         values, priors = evaluate(x.tobytes())[0]
         return np.concatenate([root @ (base.of(values) - base.estimates), _PULL * x, priors])
 
-    def slopes(x: Any) -> np.ndarray:
+    def slopes(x: np.ndarray) -> np.ndarray:
         values, priors = evaluate(x.tobytes())[1]
         return np.vstack([root @ base.matrix @ values, _PULL * np.eye(len(x)), priors])
 
@@ -231,12 +232,12 @@ def _projection(
 
 
 @jit
-def _values_with_slopes(spec, parameters, x):
+def _values_with_slopes(spec: RegressorSpec, parameters: Parameters, x: Float[Array, " p"]):
     """The values of the columns and the residuals of the priors, and their derivatives with respect to the
     unconstrained parameters.
     """
 
-    def values(x):
+    def values(x: Float[Array, " p"]):
         system = parameters.apply(spec.system, x)[0]
         columns = spec.of(system).values(jnp.zeros(()), jnp.full(len(system.coordinates), 0.3))
         return columns, parameters.prior_residuals(x)

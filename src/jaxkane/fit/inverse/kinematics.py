@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from scipy.interpolate import make_interp_spline, make_lsq_spline
 
 from ..._common.lookup import refuse_unknown
@@ -29,11 +30,17 @@ _RATIO = 1.25  # ratio of successive spacings that are tried
 
 
 @jit
-def _speeds_and_rates(system, t, q, q_dot, q_ddot):
+def _speeds_and_rates(
+    system: System,
+    t: Float[Array, " n"],
+    q: Float[Array, "n n_q"],
+    q_dot: Float[Array, "n n_q"],
+    q_ddot: Float[Array, "n n_q"],
+):
     """Independent speeds and their rates (n, n_u) from the coordinate rates, which are affine in the speeds."""
     zero = jnp.zeros(len(system.speeds), q.dtype)
 
-    def speeds(t, q, q_dot):
+    def speeds(t: Float[Array, ""], q: Float[Array, " n_q"], q_dot: Float[Array, " n_q"]):
         slopes = jax.jacfwd(lambda u: coordinate_rates(system, t, q, u))(zero)
         return jnp.linalg.pinv(slopes) @ (q_dot - coordinate_rates(system, t, q, zero))
 

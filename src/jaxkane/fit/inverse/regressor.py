@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
@@ -30,6 +31,7 @@ from ..._kane.regressor import (
 from ..._scalarjit.cache import Cache
 from ..._scalarjit.cache_key import jit
 from ..._scalarjit.compat import Tracer, concretely
+from ..._scalarjit.components import Numbers
 from ..._system.parameters import declared, leaf_name
 from ..._system.system import System
 from ..problem.declarations import find_leaves
@@ -91,7 +93,7 @@ class RegressorSpec(eqx.Module):
         """The same specification for a system with other values."""
         return eqx.tree_at(lambda spec: spec.model.system, self, system)
 
-    def own(self, dtype: Any) -> Array:
+    def own(self, dtype: DTypeLike) -> Array:
         """The values of the parameters that belong to no body."""
         leaves = jax.tree.leaves(self.system)
         entries = [jnp.ravel(leaves[leaf])[place].astype(dtype) for leaf, place in self.places]
@@ -109,7 +111,7 @@ class RegressorSpec(eqx.Module):
         kinematics, own = regressor_kinematics(self.model, t, q, u, inputs, u_dot), self.own(q.dtype)
         Y, values = regressor_columns(kinematics, parts), self.values(t, q)
 
-        def along(own):
+        def along(own: Float[Array, " k"]):
             changed = list(leaves)
             for x, (leaf, place) in zip(own, self.places, strict=True):
                 flat = jnp.ravel(changed[leaf]).at[place].set(x.astype(changed[leaf].dtype))
@@ -153,7 +155,14 @@ def regressor_spec(system: System, bodies: Bodies, parameters: Names) -> Regress
 
 
 @jit
-def regressor_at(spec: RegressorSpec, t, q, u, inputs, u_dot):
+def regressor_at(
+    spec: RegressorSpec,
+    t: Float[Array, ""],
+    q: Float[Array, " n_q"],
+    u: Float[Array, " n_u"],
+    inputs: Mapping[str, Array],
+    u_dot: Float[Array, " n_u"],
+):
     return spec.at(t, q, u, inputs, u_dot)
 
 
@@ -163,7 +172,7 @@ def regressor_at(spec: RegressorSpec, t, q, u, inputs, u_dot):
 _CHECKED = Cache()  # structures and parameters with columns that have been checked
 
 
-def check_linear(spec: RegressorSpec, t: Any, q: Any) -> None:
+def check_linear(spec: RegressorSpec, t: Numbers, q: Numbers) -> None:
     """Reject systems where tau or Y depends on the parameters. Each structure and choice of parameters is checked only
     once.
     """
@@ -177,7 +186,7 @@ def check_linear(spec: RegressorSpec, t: Any, q: Any) -> None:
         _CHECKED.keep(key, _is_checked(spec, *at))
 
 
-def _is_checked(spec: RegressorSpec, system: System, t: Any, q: Any) -> bool:
+def _is_checked(spec: RegressorSpec, system: System, t: Numbers, q: Numbers) -> bool:
     """Check all parameters at a random state by changing one number of the system after another.
 
     **Returns:** whether all numbers were finite, so that the check was possible.

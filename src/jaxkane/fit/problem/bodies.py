@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from ..._common.lookup import as_names, not_there, refuse_unknown
 from ..._kane.description import DescriptionEvaluator
@@ -42,7 +43,7 @@ class PossibleBody(Bijection):
     wheel: tuple[int, int] | None = eqx.field(static=True)  # the two axes that are equal
 
     @classmethod
-    def of(cls, values: Any, moves: tuple[int, ...], wheel: tuple[int, int] | None = None) -> PossibleBody:
+    def of(cls, values: ArrayLike, moves: tuple[int, ...], wheel: tuple[int, int] | None = None) -> PossibleBody:
         """The bijection for all ten values. **Raises:** `ValueError` if they are not physically possible."""
         values = np.asarray(values, float)
         start = np.asarray(_factors(jnp.asarray(values)))
@@ -197,7 +198,9 @@ class Inertia(Declaration):
         moments, products = tuple(parameters[4:7]), tuple(parameters[7:])
         return cls(moments, products, **kept, **more)  # type: ignore[arg-type]
 
-    def parts(self, system: System, noise: Any = None, channels: Sequence[str] = ()) -> list[Part]:
+    def parts(
+        self, system: System, noise: Mapping[str, float] | None = None, channels: Sequence[str] = ()
+    ) -> list[Part]:
         if (self.matrix is None) == (self.moments is None):
             raise ValueError("Inertia: pass `moments` (and `products`) or `matrix`, but not both.")
         for what in ("center", "moments", "products"):
@@ -251,7 +254,7 @@ def _inertias_and_slopes(system: System) -> tuple[dict[str, Array], dict[str, An
     """By body, ten numbers: mass, components of the last offset to the mass centre, and central inertia; and their
     derivatives with respect to the parameters of the system."""
 
-    def read(system):
+    def read(system: System):
         zero = jnp.zeros((), jnp.result_type(float))
         n_u = len(system.speeds) + len(system.dependent_speeds)
         q = tuple(zero + 0.3 for _ in system.coordinates)
@@ -268,7 +271,9 @@ def _inertias_and_slopes(system: System) -> tuple[dict[str, Array], dict[str, An
     return read(system), jax.jacfwd(read)(system)
 
 
-def _owner(value: float, slopes: list[np.ndarray], i: int, with_path: Any) -> tuple[str, tuple[int, ...]] | None:
+def _owner(
+    value: float, slopes: list[np.ndarray], i: int, with_path: Sequence[tuple[Any, Array]]
+) -> tuple[str, tuple[int, ...]] | None:
     """The parameter that equals this number or has it as an entry, and its shape; None if it is not unique."""
     moved = [(k, place) for k, slope in enumerate(slopes) for place in np.flatnonzero(slope[i])]
     if len(moved) != 1:

@@ -96,7 +96,9 @@ class Free(Declaration):
     unit: str = ""
     each: str | None = None
 
-    def parts(self, system: System, noise: Any = None, channels: Sequence[str] = ()) -> list[Part]:
+    def parts(
+        self, system: System, noise: Mapping[str, float] | None = None, channels: Sequence[str] = ()
+    ) -> list[Part]:
         if not isinstance(self.tied, Mapping):
             raise TypeError(f"`tied` must be a dict from names to factors, such as {{'rF': 1.0}}, got {self.tied!r}.")
         chosen, leaves = find_leaves(system, self.where)
@@ -372,7 +374,7 @@ scale, or of the distance between the bounds if that is less."""
 def scalar(
     entry: Entry,
     item: Free | Named,
-    start: Any,
+    start: float,
     info: ParameterInfo = ANY,
     tied_limits: Sequence[tuple[float, float]] = (),
 ) -> Part:
@@ -409,7 +411,7 @@ def scalar(
     return Part([entry], bijection, [start], [scale], [prior])
 
 
-def is_lognormal(prior: Any) -> bool:
+def is_lognormal(prior: object) -> bool:
     """Whether the prior is ("lognormal", median, standard deviation of the logarithm)."""
     return isinstance(prior, (tuple, list)) and len(prior) == 3 and prior[0] == "lognormal"
 
@@ -424,7 +426,7 @@ def _limits(info: ParameterInfo, factor: float) -> tuple[float, float]:
     return min(ends), max(ends)
 
 
-def _checked_bounds(name: str, bounds: Any) -> tuple[float, float]:
+def _checked_bounds(name: str, bounds: Bounds | None) -> tuple[float, float]:
     """The bounds (lower, upper), infinite for None."""
     if bounds is None:
         return -math.inf, math.inf

@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
 from jax.scipy.stats import norm
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..._common.lookup import positive_number, real_number, refuse_unknown
 from ..._scalarjit.cache_key import jit
 from ..._scalarjit.compat import on_device
 from .trial import Trial
+from .windows import Windows
 
 LOG_2PI = 1.8378770664093453
 LARGEST_PARTIAL_AUTOCORRELATION, MOST_DEGREES_OF_FREEDOM = 1 - 1e-5, 1e4
@@ -50,7 +51,7 @@ def _mean_cost(model: AutoRegressive | StudentT, theta: Array, smallest: Array, 
     """Minus twice the log likelihood per sample of all windows (W, n_t), its gradient and Hessian, and the
     `Numbers`."""
 
-    def cost(theta):
+    def cost(theta: Array):
         numbers = model.numbers(theta, smallest)
         losses = jax.vmap(lambda e, seen: model.whitened(numbers, e, seen)[2])(e, seen)
         return jnp.sum(jnp.where(seen, losses, 0.0)) / jnp.sum(seen, dtype=e.dtype)
@@ -69,7 +70,7 @@ def _most_likely(
     """
     x, data = np.array(theta), (on_device(smallest, e.dtype), on_device(e), on_device(seen))
 
-    def evaluate(theta):
+    def evaluate(theta: np.ndarray):
         return jax.device_get(_mean_cost(model, on_device(theta, e.dtype), *data))
 
     value, gradient, hessian, numbers = evaluate(x)
@@ -331,10 +332,10 @@ class Errors(eqx.Module):
 
 
 @jit
-def whitened(errors: Errors, windows: Any, simulated: Array) -> Array:
+def whitened(errors: Errors, windows: Windows, simulated: Array) -> Array:
     """Standardized innovations (W, n_c, n_t); NaN where a sample is missing."""
 
-    def of_window(window):
+    def of_window(window: tuple[Array, Array, Array]):
         measured, weight, y = window
         u = errors.whitened(jnp.where(weight > 0, (y - measured) * weight, 0.0), weight)[0]
         return jnp.where(weight > 0, u, jnp.nan)
@@ -342,7 +343,9 @@ def whitened(errors: Errors, windows: Any, simulated: Array) -> Array:
     return jax.vmap(of_window)((windows.measured, windows.weight, simulated))
 
 
-def errors_of(errors: Any, trials: Sequence[Trial], channels: Sequence[str]) -> Errors | None:
+def errors_of(
+    errors: ErrorModel | Mapping[str, ErrorModel] | None, trials: Sequence[Trial], channels: Sequence[str]
+) -> Errors | None:
     """The error models from the argument `errors` of a fit.
 
     **Raises:** `TypeError` if a value is not an error model; `ValueError` for an unknown channel, or for an
@@ -383,7 +386,7 @@ def innovations(
     covariance = phi[0] * variance / (1.0 - phi[1])
     one = jnp.ones((), e.dtype)
 
-    def step(known: Any, now: Any) -> Any:
+    def step(known: PyTree, now: tuple[Array, Array]) -> Any:
         (x, before), (p, q, s) = known  # predicted means of e_t and e_{t-1}; var e_t, covariance, var e_{t-1}
         y, there = now
         gain = jnp.where(there, q / p, 0.0)

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from ..._common.lookup import positive_number
@@ -22,7 +23,7 @@ from ..._kane.consistent_state import assemble
 from ..._scalarjit.cache_key import jit
 from ..._scalarjit.compat import on_device
 from ..._system.system import State, System, packed, packed_motion, unpacked
-from ...estimate._process_noise import Noise
+from ...estimate._filter_step import Noise
 from .errors import Errors
 from .parameters import LOW_PASSES, Entry, Parameters
 from .windows import Windows, state_names
@@ -76,7 +77,7 @@ class Simulation:
         enough."""
         return self.step is None and self.rtol is None and self.atol is None
 
-    def settings(self, t: Any, varying: bool, sizes: np.ndarray) -> Settings:
+    def settings(self, t: np.ndarray, varying: bool, sizes: np.ndarray) -> Settings:
         """The settings for the integrator.
 
         If the step is fixed, each window has its own step. Tolerances are arrays, so that other tolerances do not cause
@@ -191,7 +192,7 @@ class Ramps(eqx.Module):
     values: Float[Array, " n_t"]
     width: Float[Array, ""]
 
-    def __call__(self, t: Array, state: Any = None) -> Array:
+    def __call__(self, t: Array, state: State | None = None) -> Array:
         done = jnp.clip((t - self.ts[1:]) / self.width + 0.5, 0.0, 1.0)
         return self.values[0] + jnp.sum(done * jnp.diff(self.values))
 
@@ -376,7 +377,7 @@ class Model(eqx.Module):
         return jnp.concatenate([of_start, of_trial, of_norms])
 
 
-def _gain_and_offset(of: str, name: str, calibration: Calibration, dtype: Any) -> tuple[Array, Array]:
+def _gain_and_offset(of: str, name: str, calibration: Calibration, dtype: DTypeLike) -> tuple[Array, Array]:
     numbers = calibration.get((f"gain of {of}", name), 1.0), calibration.get((f"offset of {of}", name), 0.0)
     return jnp.asarray(numbers[0], dtype), jnp.asarray(numbers[1], dtype)
 

@@ -22,6 +22,7 @@ from scipy.special import log_ndtr
 from ..._common.lookup import real_number
 from ..._scalarjit.cache_key import jit
 from ..._scalarjit.compat import Tracer, on_device
+from ..._scalarjit.components import Numbers
 from ..._scalarjit.scalar_function import ScalarFunction
 from ..._system.system import System
 from .trial import Trial, groups_of
@@ -142,7 +143,7 @@ def gaussian_constant(deviation: np.ndarray) -> np.ndarray:
     return -np.log(deviation) - 0.5 * np.log(2 * np.pi)
 
 
-def log_gaussian_mass(a: Any, b: Any) -> Any:
+def log_gaussian_mass(a: Numbers, b: Numbers) -> Any:
     """log (Phi(b) - Phi(a)) for a < b, without cancellation in either tail."""
     a, b = np.where(a > 0, -b, a), np.where(a > 0, -a, b)
     return log_ndtr(b) + np.log1p(-np.exp(log_ndtr(a) - log_ndtr(b)))
@@ -224,7 +225,7 @@ class Parameters(eqx.Module):
         """Whether each parameter (p,) has a prior, separate or joint."""
         return np.isfinite(np.asarray(self.prior_deviation)) | self._in_rows(slice(None))[np.asarray(self.places)]
 
-    def _in_rows(self, rows: Any) -> np.ndarray:
+    def _in_rows(self, rows: np.ndarray | slice) -> np.ndarray:
         """Whether each parameter, free or fixed, is part of these joint priors."""
         return np.any(np.asarray(self.joint_matrix)[rows] != 0, axis=0).reshape(2, -1).any(axis=0)
 
@@ -369,7 +370,7 @@ class Parameters(eqx.Module):
         slopes = self._each(_slope, with_entries(self.rest, self.places, x))
         return slopes if self.mixing is None else _numpy_of(slopes).asarray(self.mixing) @ slopes
 
-    def _each(self, evaluate: Any, numbers: Any) -> Any:
+    def _each(self, evaluate: Any, numbers: Numbers) -> Any:
         """The results of all bijections: concatenated vectors, or a block-diagonal matrix.
 
         Concrete numbers are evaluated by one compiled program per kind of bijection, which all fits share. This also
@@ -382,7 +383,7 @@ class Parameters(eqx.Module):
             parts = [xp.asarray(evaluate(*pair)) for pair in zip(self.bijections, split, strict=True)]
         return xp.concatenate(parts) if parts[0].ndim == 1 else linalg.block_diag(*parts)
 
-    def _of_free(self, of_all: Any) -> Array:
+    def _of_free(self, of_all: Numbers) -> Array:
         xp = _numpy_of(self.places, of_all)
         of_free = of_all[xp.ix_(*[xp.asarray(self.places)] * of_all.ndim)]
         return of_free if xp is jnp else on_device(of_free)
@@ -424,7 +425,7 @@ class Parameters(eqx.Module):
             if entry.group is not None and applies is None:
                 continue
 
-            def own(new, old, i=i, entry=entry):
+            def own(new: Array, old: Array, i: int = i, entry: Entry = entry):
                 return new if entry.group is None else jnp.where(applies[i], new, old)  # type: ignore[index]
 
             calibration |= {role: own(value, calibration.get(role, value)) for role in entry.roles}
@@ -459,7 +460,7 @@ class Parameters(eqx.Module):
         slopes = by_values @ xp.asarray(self.all_slopes(x))[:, xp.asarray(self.places)]
         return xp.column_stack([slopes / deviation[:, None], self.prior_residuals(x)])
 
-    def _positive(self, values: Any) -> Any:
+    def _positive(self, values: Numbers) -> Any:
         """The values (all,) with a prior of their logarithm; 1 for the others, which may be negative."""
         xp = _numpy_of(self, values)
         return xp.where(xp.any(xp.asarray(self.joint_matrix)[:, self.rest.size :] != 0, axis=0), values, 1.0)
@@ -536,7 +537,7 @@ def _numpy_of(*numbers: Any) -> Any:
     return jnp if any(isinstance(x, Tracer) for x in jax.tree.leaves(numbers)) else np
 
 
-def with_entries(every: Any, places: Any, some: Any) -> Any:
+def with_entries(every: Numbers, places: Numbers, some: Numbers) -> Any:
     """A copy of `every` with `some` at the unique indices `places` of the first axis. The result is a NumPy array if
     no argument is traced."""
     if _numpy_of(every, places, some) is jnp:
@@ -557,7 +558,7 @@ def places_of(entry: Entry) -> list[Any]:
     return [*[target[:2] for target in entry.targets], *entry.roles]
 
 
-def checked_prior(name: str, prior: Any) -> tuple[float, float]:
+def checked_prior(name: str, prior: Prior) -> tuple[float, float]:
     """A mean and a positive standard deviation."""
     try:
         mean, deviation = (real_number(x, f"{name}: in a prior, what is given") for x in prior)

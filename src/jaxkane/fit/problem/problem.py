@@ -21,9 +21,9 @@ from ..._kane.arguments import refuse_multipliers
 from ..._kane.consistent_state import NoConfiguration
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
-from ...estimate._process_noise import noise_of
-from ..solve.blocks import Blocks
+from ...estimate._filter_step import noise_of
 from ..solve.linearization import (
+    Blocks,
     Linearization,
     blocks_of,
     half_cost,
@@ -32,7 +32,6 @@ from ..solve.linearization import (
 )
 from .declarations import Delay, Items, LowPass
 from .errors import Errors, errors_of
-from .from_declarations import parameters_of
 from .model import Model, Simulation, Unknowns
 from .parameters import Parameters, Prior
 from .specification import (
@@ -42,6 +41,7 @@ from .specification import (
     delay_range_of,
     delayed_inputs,
     nuisance_of,
+    parameters_of,
     start_assembly,
     with_options,
 )

@@ -91,7 +91,7 @@ class Trial:
             f"all measurements are NaN ({', '.join(measured)}). Omit this trial.",
         )
 
-    def _require(self, is_right: Any, message: str) -> None:
+    def _require(self, is_right: object, message: str) -> None:
         if not is_right:
             raise ValueError(f"{self.name}: {message}")
 
@@ -151,7 +151,7 @@ class Trial:
         channels, signals, known = ({key: samples(c) for key, c in group.items()} for group in groups)
         return cls(samples(time), channels, signals, sigma=sigma, initial=known, name=name, labels=labels)
 
-    def _times(self, t: Any) -> np.ndarray:
+    def _times(self, t: ArrayLike) -> np.ndarray:
         t = self._numbers("t", t)
         self._require(t.ndim == 1 and t.size > 1, f"`t` must be at least two times (n_t,), got the shape {t.shape}.")
         finite, steps = np.isfinite(t), np.diff(t)
@@ -164,7 +164,7 @@ class Trial:
         )
         return t
 
-    def _numbers(self, label: str, value: Any) -> np.ndarray:
+    def _numbers(self, label: str, value: ArrayLike) -> np.ndarray:
         self._require(not callable(value), f"{label} must be samples (n_t,), got a function. {_FEEDBACK}")
         try:
             if isinstance(value, np.ma.MaskedArray):  # masked samples are missing samples
@@ -177,7 +177,7 @@ class Trial:
         except (TypeError, ValueError) as error:
             raise ValueError(f"{self.name}: {label} must be real numbers: {error}.") from None
 
-    def _samples(self, group: str, key: str, value: Any, number: bool = False) -> np.ndarray:
+    def _samples(self, group: str, key: str, value: ArrayLike, number: bool = False) -> np.ndarray:
         """Samples (n_t,). `number`: whether a single number is allowed, and gaps are not."""
         label = f"{group}[{key!r}]"
         array = self._numbers(label, value)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float, PyTree
 from tqdm import tqdm
 
 from ..._common.lookup import as_names, refuse_unknown
@@ -24,8 +24,8 @@ from ..problem.problem import Problem
 from ..problem.trial import Trial
 from ..problem.windows import Windows, state_names
 from ..solve.linearization import by_next, jacobian_of, map_windows, starts_of
+from .data import text_table
 from .statistics import infinite_along
-from .tables import text_table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,9 +80,9 @@ def _correlation(covariance: np.ndarray) -> np.ndarray:
 
 def design(
     system: System,
-    t: Any,
+    t: Float[Array, " n_t"],
     inputs: Callable[[Any, Array], Mapping[str, Array]],
-    coefficients: Any,
+    coefficients: PyTree,
     free: Items,
     *,
     sigma: Mapping[str, float],
@@ -130,13 +130,13 @@ def design(
     if criterion not in ("D", "A"):
         raise ValueError(f"design: `criterion` must be 'D' or 'A', got {criterion!r}.")
 
-    def signals(coefficients: Any, t: Array) -> dict[str, Array]:
+    def signals(coefficients: PyTree, t: Array) -> dict[str, Array]:
         samples = dict(inputs(coefficients, t))
         for name, size in (rms or {}).items():
             samples[name] = size * samples[name] / jnp.sqrt(jnp.mean(samples[name] ** 2))
         return samples
 
-    def planned(coefficients: Any, measured: Mapping[str, Any]) -> Trial:
+    def planned(coefficients: PyTree, measured: Mapping[str, Any]) -> Trial:
         own = {name: np.asarray(x) for name, x in signals(coefficients, t).items()}
         return Trial(t, measured, own, sigma=sigma, initial=initial, name="plan")
 
@@ -181,7 +181,7 @@ _Iterate = tuple[Any, tuple[Array, Windows, Array]]
 
 
 def _minimized(
-    problem: Problem, objective: Objective, coefficients: Any, steps: int, rate: float, progress: bool
+    problem: Problem, objective: Objective, coefficients: PyTree, steps: int, rate: float, progress: bool
 ) -> tuple[_Iterate, _Iterate, tuple[float, ...]]:
     """The first and the best iterate of Adam, and the history of the objective.
 
@@ -189,10 +189,10 @@ def _minimized(
     """
 
     @filter_jit_uncached
-    def gradient(c, model, windows):
+    def gradient(c: PyTree, model: Model, windows: Windows):
         flat, unravel = ravel_pytree(c)
 
-        def of_flat(flat):
+        def of_flat(flat: Array):
             return objective(unravel(flat), model, windows)
 
         value, aux = of_flat(flat)
@@ -240,7 +240,7 @@ def objective_of(
     # Indices of the samples of the windows in the samples of the trial. They do not depend on the coefficients.
     sample = jnp.searchsorted(t, problem.windows.t_input).clip(0, t.shape[0] - 1)
 
-    def objective(coefficients: Any, model: Model, windows: Windows):
+    def objective(coefficients: PyTree, model: Model, windows: Windows):
         inputs, zero = signals(coefficients, t), jnp.zeros_like(t)
         samples = jnp.stack([inputs.get(name, zero)[sample] for name in problem.system.inputs], axis=1)
         windows = eqx.tree_at(lambda w: w.inputs, windows, samples)
@@ -281,7 +281,7 @@ def _information(
     n_z, n_b, p = point.window_starts.shape[1], point.trial_unknowns.shape[1], point.parameters.shape[0]
     n_next = n_z if model.nuisance.has_defects else 0
 
-    def of_window(arguments):
+    def of_window(arguments: PyTree):
         window, z, b, start, start_dot = arguments
         r, J, prediction = jacobian_of(model, window, start, start_dot, z, b, point.parameters)
         links = by_next(model, window, r.shape[0])[:, :n_next]

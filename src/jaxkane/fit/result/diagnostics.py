@@ -4,7 +4,6 @@ fit.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import warnings
 from collections.abc import Iterator, Mapping
@@ -354,30 +353,25 @@ def _constraints_and_priors(fit: Any) -> Iterator[str]:
 
 
 Range = tuple[float, float]
+Ranges = Mapping[str, Range]
 
 # Largest plausible deviation from the mean of the prior, in standard deviations of the prior.
 DEVIATIONS = 3.0
 
 
-@dataclasses.dataclass(frozen=True)
-class Plausible:
-    """By name of a parameter, the range of its plausible values."""
-
-    ranges: Mapping[str, Range]
-
-    def bound_violations(self, values: Mapping[str, float]) -> dict[str, str]:
-        """By name, a sentence for each value that is outside its plausible range."""
-        violations = {}
-        for name, value in values.items():
-            low, high = self.ranges.get(name, (-math.inf, math.inf))
-            if not low <= value <= high:
-                side = f"below {low:.4g}" if value < low else f"above {high:.4g}"
-                violations[name] = f"{name} = {value:.4g} is {side}" if math.isfinite(value) else f"{name} is {value}"
-        return violations
+def implausible(ranges: Ranges, values: Mapping[str, float]) -> dict[str, str]:
+    """By name, a sentence for each value that is outside its plausible range."""
+    violations = {}
+    for name, value in values.items():
+        low, high = ranges.get(name, (-math.inf, math.inf))
+        if not low <= value <= high:
+            side = f"below {low:.4g}" if value < low else f"above {high:.4g}"
+            violations[name] = f"{name} = {value:.4g} is {side}" if math.isfinite(value) else f"{name} is {value}"
+    return violations
 
 
-def plausible_of(parameters: Parameters, plausible: Mapping[str, Any]) -> Plausible:
-    """The plausible range of every parameter.
+def plausible_of(parameters: Parameters, plausible: Mapping[str, Any]) -> dict[str, Range]:
+    """By name of a parameter, the range of its plausible values.
 
     A given range is (lower, upper) or a relative deviation from the start. By default it is three standard deviations
     of the prior. Without a prior it is the bounds, except for their ends. The initial guess alone implies no range.
@@ -394,10 +388,10 @@ def plausible_of(parameters: Parameters, plausible: Mapping[str, Any]) -> Plausi
             ranges[name] = mean - DEVIATIONS * deviation, mean + DEVIATIONS * deviation
         elif isinstance(bijection, Interval) and bijection.uniform and math.isfinite(high - low):
             ranges[name] = low + 1e-3 * (high - low), high - 1e-3 * (high - low)
-    return Plausible(ranges)
+    return ranges
 
 
-def _range(name: str, value: Any, start: float) -> Range:
+def _range(name: str, value: object, start: float) -> Range:
     low = high = math.nan
     if isinstance(value, (int, float)):
         low, high = start - value * abs(start), start + value * abs(start)

@@ -17,18 +17,17 @@ from ..._integrate.trajectory import Trajectory
 from ..._system.system import System
 from ..problem.errors import whitened
 from ..problem.model import Unknowns
-from ..problem.parameters import Parameters, places_of
+from ..problem.parameters import places_of
 from ..problem.problem import STEP_TOLERANCE, Problem, residual_deviation, step_errors
 from ..problem.specification import refuse_other
 from ..problem.trial import trial_names
 from ..solve.linearization import Linearization
-from ..solve.variance_components import degrees_of_freedom
 from . import diagnostics as diagnostics
 from . import statistics as statistics
+from .data import Export, costs_in_words, read_fit
 from .identifiability import Identifiability, identifiability_at
 from .linearized import Posterior, linearized_problem, trial_folds
 from .statistics import ByTrial, ResidualTest, infinite_along
-from .tables import Export, costs_in_words, read_fit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,14 +85,6 @@ class Fit(Export, Posterior):
             except KeyboardInterrupt:
                 status = "unchecked" if status in diagnostics.AT_A_MINIMUM else "interrupted"
         return cls(problem, point, at, errors, tuple(history), status, method)
-
-    @property
-    def parameters(self) -> Parameters:
-        return self.problem.parameters
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.parameters.names
 
     @property
     def cost(self) -> float:
@@ -206,15 +197,8 @@ class Fit(Export, Posterior):
         return dict(zip(names, (self.parameters.deviations * self.variance**0.5).tolist(), strict=True))
 
     @property
-    def start(self) -> dict[str, float]:
-        return self._by_name(self.parameters.start)
-
-    @property
     def estimates(self) -> dict[str, float]:
         return self._by_name(self.parameters.values(self.point.parameters))
-
-    def _by_name(self, values: Any) -> dict[str, float]:
-        return dict(zip(self.names, np.asarray(values).tolist(), strict=True))
 
     @functools.cached_property
     def identifiability(self) -> Identifiability:
@@ -269,10 +253,6 @@ class Fit(Export, Posterior):
         NaN for a validated fit, because its parameters were estimated from other data (`validate`).
         """
         return self.identifiability.covariance * (math.nan if self.status == "validated" else 1.0)
-
-    @property
-    def standard_errors(self) -> dict[str, float]:
-        return self._by_name(np.sqrt(self.covariance.diagonal()))
 
     @property
     def clusters(self) -> tuple[str, int]:
@@ -361,7 +341,7 @@ class Fit(Export, Posterior):
         """
         formal = np.full(len(self.names), self.identifiability.degrees_of_freedom)
         if self.parameters.distributions:
-            formal = degrees_of_freedom(self.problem, self.point, self.linearization)
+            formal = statistics.degrees_of_freedom(self.problem, self.point, self.linearization)
         return self._by_kind(self._jackknife.degrees_of_freedom, {"formal": formal, "none": 1.0})
 
     def _by_kind(self, clustered: np.ndarray, other: Mapping[str, Any]) -> dict[str, float]:
@@ -390,12 +370,6 @@ class Fit(Export, Posterior):
         **Raises:** `ValueError` if `level` is not between 0 and 1.
         """
         return statistics.intervals(self.parameters, self.point.parameters, self.half_widths(level))
-
-    @property
-    def correlation(self) -> np.ndarray:
-        deviation = np.sqrt(self.covariance.diagonal())
-        with np.errstate(invalid="ignore"):
-            return self.covariance / np.outer(deviation, deviation)
 
     @functools.cached_property
     def fitted(self) -> ByTrial:

@@ -13,11 +13,10 @@ import numpy as np
 from ..problem.model import Unknowns
 from ..problem.problem import Problem
 from ..problem.specification import refuse_other
-from ..solve.blocks import eliminate
-from ..solve.linearization import Linearization
-from ..solve.local_unknowns import solve_nuisance
+from ..solve.linearization import Linearization, eliminate
+from ..solve.optimizers import solve_nuisance
+from .data import Rows, text_table
 from .statistics import formal_covariance, infinite_along, prior_information
-from .tables import Rows, text_table
 
 
 @dataclasses.dataclass(frozen=True)

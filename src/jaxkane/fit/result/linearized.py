@@ -10,8 +10,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
-from scipy import stats
+from jaxtyping import Array, PyTree
+from scipy.special import ndtri
 
 from ..._common.lookup import by_name, whole_number
 from ..._kane.api import _dependent_speeds
@@ -22,10 +22,9 @@ from ...estimate._filter import brought_back
 from ..problem.model import Model, Unknowns
 from ..problem.problem import Problem
 from ..problem.trial import Trial
-from ..problem.windows import state_names
-from ..solve.blocks import Blocks, Eliminated, eliminate
+from ..problem.windows import Windows, state_names
 from ..solve.kalman import filtered, smoothed_moments
-from ..solve.linearization import Linearization, map_windows, starts_of
+from ..solve.linearization import Blocks, Eliminated, Linearization, eliminate, map_windows, starts_of
 from .statistics import (
     FEWEST_TRIALS_OF_A_TEST,
     LARGEST_LEVERAGE,
@@ -130,7 +129,7 @@ class Smoothed:
         **Raises:** `ValueError` if `level` is not between 0 and 1.
         """
         check_level(level)
-        half = float(stats.norm.ppf(0.5 * (1 + level))) * self.deviation(name)
+        half = float(ndtri(0.5 * (1 + level))) * self.deviation(name)
         return self[name] - half, self[name] + half
 
     def __repr__(self) -> str:
@@ -277,11 +276,11 @@ def _beginnings(fit: Any) -> Array:
 
 
 @jit
-def _smoothed(model: Model, windows: Any, point: Unknowns, starts: Array, begin: Array) -> tuple[Array, Array]:
+def _smoothed(model: Model, windows: Windows, point: Unknowns, starts: Array, begin: Array) -> tuple[Array, Array]:
     """By trial, the mean (W, n_t, n) and a square root of the covariance (W, n_t, n, k) of [q, u, x, u_dep, b]."""
     n = len(state_names(model.system))
 
-    def of_trial(arguments: Any) -> tuple[Array, Array]:
+    def of_trial(arguments: PyTree) -> tuple[Array, Array]:
         window, b, start, begin = arguments
         system, _ = model.parameters.apply(model.system, point.parameters, window.applies)
         result = filtered(model, window, start, b, point.parameters, begin)

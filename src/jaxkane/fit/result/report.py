@@ -21,11 +21,11 @@ from ..._common.lookup import label_of
 from ..._system.system import System
 from ..extend.selection import ForwardSelection
 from ..problem.specification import refuse_other
+from .data import Rows, costs_in_words, html_table, html_text, parameter_rows, text_table
 from .diagnostics import STATUS
 from .fit_result import Fit
 from .statistics import autocorrelations
 from .studies import Profile, check_signs
-from .tables import Rows, costs_in_words, html_table, html_text, parameter_rows, text_table
 from .validation import CrossValidation, cross_validate
 
 
@@ -148,7 +148,9 @@ class _Section:
         return "".join(parts)
 
 
-def _sections(fit: Fit, truth: Any = None, trials: int | None = 6) -> Iterator[_Section]:
+def _sections(
+    fit: Fit, truth: Mapping[str, float] | System | None = None, trials: int | None = 6
+) -> Iterator[_Section]:
     notes, n_c = (*fit.notes, *check_signs(fit)), len(fit.problem.channels)
     fine = () if notes else ("Every parameter is determined, and nothing looks suspicious.",)
     yield _Section("", (fit.title, _ending(fit), *fine), notes)
@@ -294,7 +296,7 @@ def _draw_trials(fit: Fit, number: int | None) -> Iterator[Any]:
         yield _drawn(lambda axes, some=some: plot.fits(fit, some, axes=axes), *size, **options)
 
 
-def _draw_residuals(fit: Fit, axes: Any) -> None:
+def _draw_residuals(fit: Fit, axes: np.ndarray) -> None:
     """By channel, a histogram of the residuals with the normal density, and their autocorrelation."""
     channels, grid = fit.problem.channels, np.linspace(-4, 4, 200)
     for (left, right), channel in zip(axes, channels, strict=True):

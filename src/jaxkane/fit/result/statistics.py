@@ -12,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-from scipy import stats
+from scipy import special  # all of scipy.stats would take a second to import
 
 from ..._common.lookup import real_number
+from ..._scalarjit.components import Numbers
 from ..problem.model import Unknowns
 from ..problem.parameters import Parameters
 from ..problem.problem import Problem
 from ..problem.trial import trial_names
-from ..solve.blocks import Blocks, Eliminated, eliminate
-from ..solve.linearization import Linearization
+from ..solve.linearization import Blocks, Eliminated, Linearization, eliminate
 
 
 def formal_covariance(inverse: np.ndarray, of_priors: np.ndarray, variance: float) -> np.ndarray:
@@ -130,7 +130,7 @@ def _freedom_of(weights: np.ndarray) -> float:
 
     root: Any = scipy.optimize.brentq
     q = root(lambda c: exceeded(c) - 0.05, 3.8, 200.0) ** 0.5
-    return root(lambda n: stats.t.ppf(0.975, n) - q, 0.99, 1e6)
+    return root(lambda n: special.stdtrit(n, 0.975) - q, 0.99, 1e6)
 
 
 def infinite_along(covariance: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -307,7 +307,7 @@ def prior_information(
     return information, determined, number, float(squares + np.sum(of_nuisance[:, :, -1] ** 2))
 
 
-def intervals(parameters: Parameters, x: Any, half: np.ndarray) -> dict[str, tuple[float, float]]:
+def intervals(parameters: Parameters, x: Numbers, half: np.ndarray) -> dict[str, tuple[float, float]]:
     """By name, intervals with the half-widths `half` (p,) around the parameters at x (p,), truncated at the bounds."""
     values = np.asarray(parameters.values(x))
     ends = np.clip([values - half, values + half], *np.expand_dims(parameters.bounds.T, 1))
@@ -327,7 +327,7 @@ def check_level(level: float) -> None:
 def t_quantile(level: float, degrees_of_freedom: float) -> float:
     """Two-sided quantile of Student's distribution. NaN without a degree of freedom."""
     check_level(level)
-    return float(stats.t.ppf(0.5 * (1 + level), degrees_of_freedom)) if degrees_of_freedom > 0 else float("nan")
+    return float(special.stdtrit(degrees_of_freedom, 0.5 * (1 + level))) if degrees_of_freedom > 0 else float("nan")
 
 
 def by_trial(problem: Problem, simulated: np.ndarray) -> ByTrial:
@@ -389,7 +389,8 @@ def serial_correlation(residuals: ByTrial) -> dict[str, float]:
         weights = [np.maximum(1 - lags / (L + 1), 0.0) for L in (*2 ** np.arange(int(np.log2(most)) + 1), most)]
         more = np.array([2 * w @ rho for w in weights])
         freedom, few = np.array([0.5 * max(n, 1) / (w @ w) for w in weights]), min(most, 20)
-        p = *stats.chi2.sf((1 + more) * freedom, freedom), stats.chi2.sf(n * rho[:few] @ rho[:few], few)
+        box = special.chdtrc(few, n * rho[:few] @ rho[:few])
+        p = *special.chdtrc(freedom, np.maximum(1 + more, 0.0) * freedom), box  # a negative argument gives NaN
         is_white = min(p) > 3e-4
         correlations[name] = 0.0 if is_white else float(max(more.max() / (2 + more.max()), rho[0], 0.01))
     return correlations
@@ -436,7 +437,7 @@ def residual_test(measured: np.ndarray, fitted: np.ndarray, residual: np.ndarray
         rms=float(np.sqrt(np.mean(r**2))),
         variance_accounted_for=variance_accounted_for([measured[finite]], [fitted[finite]]),
         autocorrelation=float(lags[0]),
-        ljung_box=float(stats.chi2.sf(box, lags.size)),
+        ljung_box=float(special.chdtrc(lags.size, box)),
         runs=runs_test(r),
     )
 
@@ -450,7 +451,7 @@ def runs_test(r: np.ndarray) -> float:
     n, runs = n1 + n2, 1 + int(np.sum(up[1:] != up[:-1]))
     mean = 1 + 2 * n1 * n2 / n
     variance = (mean - 1) * (mean - 2) / (n - 1)
-    return float(2 * stats.norm.sf(abs(runs - mean) / np.sqrt(variance))) if variance > 0 else 1.0
+    return float(2 * special.ndtr(-abs(runs - mean) / np.sqrt(variance))) if variance > 0 else 1.0
 
 
 def effective_sample_fraction(correlation: float) -> float:
@@ -466,7 +467,7 @@ def f_test(drop: float, k: int, cost: float, degrees_of_freedom: float, correlat
         return 1.0
     share = effective_sample_fraction(correlation)
     ratio = share * drop / k / max(cost / degrees_of_freedom, 1e-300)
-    return float(stats.f.sf(ratio, k, max(share * degrees_of_freedom, 1.0)))
+    return float(special.fdtrc(k, max(share * degrees_of_freedom, 1.0), ratio))
 
 
 def wald_test(step: np.ndarray, variance: np.ndarray, degrees_of_freedom: np.ndarray) -> float:
@@ -475,7 +476,7 @@ def wald_test(step: np.ndarray, variance: np.ndarray, degrees_of_freedom: np.nda
     Hotelling's test of all of them together rejects too often if few trials contain most information: up to 12 % at a
     level of 5 %.
     """
-    p = 2 * stats.t.sf(np.abs(step) / np.sqrt(variance), degrees_of_freedom)
+    p = 2 * special.stdtr(degrees_of_freedom, -np.abs(step) / np.sqrt(variance))
     return float(min(1.0, len(step) * p.min()))
 
 
@@ -485,3 +486,49 @@ def log_likelihood(problem: Problem, cost: float) -> float:
         return -0.5 * cost
     weight = np.asarray(problem.windows.weight, float)
     return -0.5 * cost + float(np.sum(np.log(weight[weight > 0]) - 0.5 * math.log(2 * math.pi)))
+
+
+def degrees_of_freedom(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
+    """The degrees of freedom (p,) of Student's t distribution of each estimate. They are few for a mean of few groups.
+
+        2 V^2 / var(V),   var(V) = (dV/da)^T cov(a) dV/da
+
+    V is the variance of an estimate. a contains the logarithms of the distributions' standard deviations and of the
+    residual variance (Satterthwaite; Giesbrecht and Burns, Two-stage analysis based on a mixed model, Biometrics 41,
+    1985).
+    """
+    parameters, M = problem.parameters, np.column_stack(eliminate(at.blocks, 0.0).rows).astype(float)
+    rows = parameters.prior_rows(point.parameters)[parameters.size :].astype(float)
+    scale = np.linalg.norm(M, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    parts = [(rows[begin:end] / scale).T @ (rows[begin:end] / scale) for _, begin, end in parameters.distributions]
+    data, nu = (M / scale).T @ (M / scale) - sum(parts), problem.size[0] - problem.size[1]
+    q = np.array([end - begin for _, begin, end in parameters.distributions])
+    to_values = np.asarray(parameters.slopes(point.parameters), float) / scale[:-1]
+    s = len(parts)
+
+    def inverse(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+        """H^-1, the optimal x, and the information from each distribution."""
+        weighed = [np.exp(-2 * log) * part for log, part in zip(a[:s], parts, strict=True)]
+        N = data + sum(weighed)
+        H = np.linalg.pinv(N[:-1, :-1], rcond=1e-14, hermitian=True)
+        return H, np.append(-H @ N[:-1, -1], 1.0), weighed
+
+    def gradient(a: np.ndarray) -> np.ndarray:
+        """The gradient of minus twice the restricted log likelihood."""
+        H, x, weighed = inverse(a)
+        cost = x @ (data + sum(weighed)) @ x
+        own = [2 * (n - np.sum(H * P[:-1, :-1]) - np.exp(-a[s]) * (x @ P @ x)) for n, P in zip(q, weighed, strict=True)]
+        return np.array([*own, nu - np.exp(-a[s]) * cost])
+
+    H, x, weighed = inverse(np.zeros(s + 1))
+    best = np.append(np.zeros(s), np.log(x @ (data + sum(weighed)) @ x / nu))
+    steps = 1e-4 * np.eye(s + 1)
+    hessian = np.array([(gradient(best + h) - gradient(best - h)) / 2e-4 for h in steps])
+    # The pseudo-inverse excludes a distribution whose standard deviation is zero: its groups do not differ.
+    covariance = 2 * np.linalg.pinv((hessian + hessian.T) / 2, rcond=1e-4, hermitian=True)
+    variance = np.einsum("ki,ij,kj->k", to_values, H, to_values)
+    slopes = [2 * np.einsum("ki,ij,kj->k", to_values, H @ P[:-1, :-1] @ H, to_values) for P in weighed]
+    slopes = np.array([*slopes, variance])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.minimum(2 * variance**2 / np.einsum("ap,ab,bp->p", slopes, covariance, slopes), nu)

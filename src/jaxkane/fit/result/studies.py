@@ -12,10 +12,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import norm, qmc
+from jaxtyping import Array
+from scipy.special import ndtr
 from tqdm import tqdm
 
 from ..._common.lookup import positive_number, real_number, refuse_unknown, whole_number
+from ..._integrate.trajectory import Trajectory
 from ..._kane.api import generalized_active_forces
 from ..._scalarjit.compat import on_device
 from ..problem.model import Unknowns
@@ -23,12 +25,11 @@ from ..problem.problem import Problem
 from ..problem.specification import refuse_other
 from ..problem.windows import Windows
 from ..solve.fit import minimize, search, uninterrupted
-from ..solve.local_unknowns import solve_nuisance
-from ..solve.optimizers import LeastSquares, Optimizer
+from ..solve.optimizers import LeastSquares, Optimizer, solve_nuisance
+from .data import text_table
 from .diagnostics import AT_A_MINIMUM, poorly_fitted_channels, refuse_unless_at_a_minimum
 from .fit_result import Fit
 from .statistics import FEWEST_TRIALS, bootstrap_steps, clustered, t_quantile
-from .tables import text_table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,6 +128,8 @@ def multi_start(
             f"{spread}."
         )
     optimizer = LeastSquares() if optimizer is None else optimizer
+    from scipy.stats import qmc  # takes a second
+
     options: Any = {"seed": seed}  # SciPy 1.15 renamed it to rng and still accepts seed
     unit = qmc.LatinHypercube(len(problem.parameters.names), **options).random(max(n, candidates or n))
     drawn = spread * (2 * unit - 1)
@@ -309,7 +312,7 @@ class Bootstrap:
         **Raises:** `ValueError` if `level` is not between 0 and 1.
         """
         G = self.clusters[1]
-        tail = float(norm.cdf(-((G / (G - 1)) ** 0.5) * t_quantile(level, G - 1)))
+        tail = float(ndtr(-((G / (G - 1)) ** 0.5) * t_quantile(level, G - 1)))
         ends = {name: np.quantile(values, [tail, 1 - tail]) for name, values in self.values.items()}
         return {
             name: (float(low), float(high)) if np.isfinite(low) else (-math.inf, math.inf)
@@ -423,7 +426,7 @@ def energy_sources(fit: Fit) -> dict[str, str]:
     """
     problem, rides = fit.problem, fit.problem.trajectories(fit.point)
 
-    def joined(of):
+    def joined(of: Callable[[Trajectory], Any]):
         return np.concatenate([np.asarray(of(ride)) for ride in rides])
 
     samples = {"t": joined(lambda r: r.t), "q": joined(lambda r: r.q), "u": joined(lambda r: r.u)}
@@ -433,7 +436,7 @@ def energy_sources(fit: Fit) -> dict[str, str]:
     t, q, u, *values = (on_device(np.concatenate([x[rows], x[rows]])) for x in samples.values())
     u = on_device(np.asarray(u) * np.repeat([1.0, -1.0], len(rows))[:, None])
 
-    def power(x: Any, t: Any, q: Any, u: Any, *values: Any) -> Any:
+    def power(x: Array, t: Array, q: Array, u: Array, *values: Any) -> Any:
         system = problem.parameters.apply(problem.system, x)[0]
         return generalized_active_forces(system, t, q, u, dict(zip(rides[0].values, values, strict=True))) @ u
 

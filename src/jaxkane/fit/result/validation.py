@@ -17,21 +17,18 @@ from ..._common.lookup import hint, positive_number, refuse_unknown
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
 from ..problem.declarations import Free, leaf_names
-from ..problem.from_declarations import parameters_of
 from ..problem.model import Unknowns
 from ..problem.problem import Problem, finer
-from ..problem.specification import ProblemSpec, refuse_other, with_options
+from ..problem.specification import ProblemSpec, parameters_of, refuse_other, with_options
 from ..problem.trial import Trial, as_trials, trial_names
-from ..solve.blocks import Blocks
 from ..solve.fit import search, uninterrupted, with_distributions
-from ..solve.linearization import Linearization
-from ..solve.local_unknowns import Unsimulated, solve_nuisance
-from ..solve.optimizers import LeastSquares
-from .diagnostics import AT_A_MINIMUM, STATUS, plausible_of
+from ..solve.linearization import Blocks, Linearization
+from ..solve.optimizers import LeastSquares, Unsimulated, solve_nuisance
+from .data import Rows, Tables, html_tables, text_table, text_tables
+from .diagnostics import AT_A_MINIMUM, STATUS, implausible, plausible_of
 from .fit_result import Fit
 from .linearized import trial_folds
 from .statistics import LARGEST_LEVERAGE, intervals, t_quantile
-from .tables import Rows, Tables, html_tables, text_table, text_tables
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -548,7 +545,7 @@ def compare(
         fits=named,
         held_out={} if held_out is None else {name: validate(fit, held_out) for name, fit in named.items()},
         bound_violations={
-            name: tuple(plausible_of(fit.parameters, ranges).bound_violations(fit.estimates).values())
+            name: tuple(implausible(plausible_of(fit.parameters, ranges), fit.estimates).values())
             for name, fit in named.items()
         },
     )

@@ -1,4 +1,6 @@
-"""`fit` and `minimize`: specify the problem, run an optimizer with checkpoints, assemble the `Fit`."""
+"""`fit` and `minimize`: specify the problem, run an optimizer with checkpoints, assemble the `Fit`; and the standard
+deviations of errors and of distributions over groups, which are estimated together with the parameters.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +10,26 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import numpy as np
+import scipy.linalg
+from scipy import optimize
 from tqdm import tqdm
 
 from ..._common.lookup import refuse
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
-from ..collocated._fit import Collocation, CollocationFit
+from .._collocation import Collocation, CollocationFit
 from ..problem.declarations import Items
 from ..problem.model import Simulation, Unknowns
 from ..problem.problem import Problem, finer, residual_deviation
 from ..problem.specification import refuse_other, with_options
 from ..problem.trial import Trial, trial_names
+from ..result.data import Checkpoint
 from ..result.diagnostics import AT_A_MINIMUM
 from ..result.fit_result import Fit
-from .checkpoints import Checkpoint
-from .local_unknowns import Unsimulated, solve_nuisance, usable
-from .optimizers import Iterate, LeastSquares, Optimizer
-from .variance_components import estimate_errors, estimated_deviations
+from .linearization import Linearization, eliminate, triangle
+from .optimizers import Iterate, LeastSquares, Optimizer, Unsimulated, moved, proposed, solve_nuisance, usable
 
 
 @with_options
@@ -142,13 +146,13 @@ def solve(
     return dataclasses.replace(result, failed=failed)
 
 
-def _again(before: Fit, problem: Problem, method: Any, start: Unknowns, run: dict[str, Any]) -> Fit:
+def _again(before: Fit, problem: Problem, method: Optimizer, start: Unknowns, run: dict[str, Any]) -> Fit:
     """Another search, with the history of the ones before."""
     result = search(problem, method, start=start, **run)
     return dataclasses.replace(result, history=(*before.history, *result.history[1:]))
 
 
-def with_distributions(result: Fit, method: Any, run: dict[str, Any]) -> Fit:
+def with_distributions(result: Fit, method: Optimizer, run: dict[str, Any]) -> Fit:
     """Estimate the standard deviations of the distributions over groups and all other unknowns alternately."""
     for _ in range(20 if result.problem.parameters.distributions else 0):
         if result.status not in AT_A_MINIMUM:
@@ -161,7 +165,7 @@ def with_distributions(result: Fit, method: Any, run: dict[str, Any]) -> Fit:
     return result
 
 
-def _with_fine_steps(result: Fit, method: Any, run: dict[str, Any]) -> Fit:
+def _with_fine_steps(result: Fit, method: Optimizer, run: dict[str, Any]) -> Fit:
     """Repeat the fit with finer integration steps while these change the result and the user gave no step or tolerance.
 
     If the repeated fit fails, does not converge or is interrupted, the first fit is returned with the status
@@ -272,7 +276,7 @@ def search(
     return _result(problem, optimizer, run, first, status)
 
 
-def _resting(result: Fit, place: int, method: Any, run: dict[str, Any]) -> Fit:
+def _resting(result: Fit, place: int, method: Optimizer, run: dict[str, Any]) -> Fit:
     """Fix the sum of an inequality at its bound, if the sum is near the bound and the cost does not increase.
 
     The search uses unconstrained variables, so a sum approaches its bound and never reaches it. Near the bound, these
@@ -292,7 +296,7 @@ def _resting(result: Fit, place: int, method: Any, run: dict[str, Any]) -> Fit:
     return result
 
 
-def _refuse_start_of_another(problem: Problem, start: Any) -> None:
+def _refuse_start_of_another(problem: Problem, start: Unknowns) -> None:
     refuse_other(start, Unknowns, "`start=`", "start=fit.point, or change the system's values")
     shapes, own = ([x.shape for x in (u.parameters, u.trial_unknowns, u.window_starts)] for u in (start, problem.start))
     refuse(
@@ -406,7 +410,7 @@ def _result(problem: Problem, optimizer: Optimizer, run: _Run, first: Iterate, s
     return Fit.of(problem, best.point, at, run.history, status, optimizer.name)
 
 
-def uninterrupted(fit: Any) -> Any:
+def uninterrupted(fit: Fit) -> Any:
     """Return a fit that is part of a study.
 
     **Raises:** `KeyboardInterrupt` if Ctrl-C ended the fit, to end the study too.
@@ -414,3 +418,140 @@ def uninterrupted(fit: Any) -> Any:
     if fit.status == "interrupted":
         raise KeyboardInterrupt
     return fit
+
+
+ROUNDS = 50
+SETTLED = 1e-8
+"""The change of minus twice the log likelihood in one round below which the search ends. It corresponds to a change of
+the estimates by about 1e-4 standard errors."""
+SMALL_GAIN = 0.01
+"""The largest remaining gain at which the search has converged: a tenth of a standard error."""
+
+
+def estimate_errors(problem: Problem, best: Iterate, status: str, history: list[float]) -> tuple[Problem, Iterate, str]:
+    """Alternate between estimating the error models from the residuals and a step of all other unknowns.
+
+    Parameters of the mean and of the covariance are orthogonal in the information matrix, so a few rounds are enough.
+    Oberhofer and Kmenta (Econometrica 42, 1974) prove convergence to a stationary point of the joint likelihood. Each
+    step is a step of Fisher scoring.
+
+    **Arguments:**
+
+    - `problem`: the problem with the initial error models.
+    - `best`: the best iterate of the search with the initial error models.
+    - `status`: the status of this search. If it has not converged, the error models are estimated only once.
+    - `history`: the list to which the cost of every round is appended.
+
+    **Returns:** the problem with the estimated error models, the iterate, and the status.
+    """
+    at = best.at if best.at is not None else problem.linearize(best.point)
+    if at is None or not usable(at):
+        return problem, best, status
+    converged, point, ending = status in AT_A_MINIMUM, best.point, "steps"
+    try:
+        for _ in range(ROUNDS if converged else 1):
+            before, estimated = at.cost, _with_estimated_errors(problem, at)
+            again = estimated.linearize(point)
+            assert again is not None  # the initial states exist, because they do not depend on error models
+            gain = proposed(estimated, again, 0.0).gain
+            problem, (point, at) = estimated, _step(estimated, point, again) if converged else (point, again)
+            best = dataclasses.replace(best, point=point, cost=at.cost, at=at)
+            history.append(at.cost)
+            rounding = 1e2 * float(np.finfo(at.blocks.R.dtype).eps) * (abs(at.cost) + at.squares)
+            if abs(at.cost - before) <= max(SETTLED, rounding):
+                ending = status if gain <= max(SMALL_GAIN, rounding) else "stuck"
+                break
+    except KeyboardInterrupt:
+        ending = "interrupted"
+    return problem, best, ending if converged else status
+
+
+def _with_estimated_errors(problem: Problem, at: Linearization) -> Problem:
+    assert problem.model.errors is not None
+    windows = problem.windows
+    weight, measured = np.asarray(windows.weight), np.asarray(windows.measured)
+    difference = np.where(weight > 0, (np.asarray(at.simulated) - measured) * weight, 0.0)
+    # The scale needs a lower limit: residuals of simulated data are rounding errors, whose likelihood has no maximum.
+    size = np.sqrt(np.sum((measured * weight) ** 2, axis=(0, 2)) / np.maximum(np.sum(weight > 0, axis=(0, 2)), 1))
+    smallest = np.maximum(1e3 * np.finfo(weight.dtype).eps * size, np.finfo(weight.dtype).tiny ** 0.25)
+    errors = problem.model.errors.estimated(difference, weight, smallest)
+    return dataclasses.replace(problem, model=dataclasses.replace(problem.model, errors=errors))
+
+
+def _step(problem: Problem, point: Unknowns, at: Linearization) -> tuple[Unknowns, Linearization]:
+    """One step of Fisher scoring, damped if it does not reduce the cost. If no step does, the point is unchanged."""
+    for damping in (0.0, 0.1, 1.0, 10.0):
+        step = proposed(problem, at, damping)
+        tried = moved(point, step.x, step.eliminated)
+        there = problem.linearize(tried)
+        if there is not None and usable(there) and there.cost <= at.cost:
+            return tried, there
+        if step.gain <= SMALL_GAIN:  # integration errors hide such a small gain
+            break
+    return point, at
+
+
+def estimated_deviations(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
+    """The standard deviations (n,) of all distributions, in standard deviations of a residual.
+
+    The restricted likelihood of the model, linearized at the point, is maximized (Lindstrom and Bates, Nonlinear mixed
+    effects models for repeated measures data, Biometrics 46, 1990). Up to a constant, minus twice its logarithm is
+
+        nu log C + log det H + 2 sum_j q_j log d_j
+
+    C is the minimum sum of squares for given standard deviations d_j. H is the information about all unknowns. q_j is
+    the number of groups. nu is the number of measurements minus the number of unknowns without a distribution. The
+    variance of a residual is estimated together with them, as C / nu.
+    """
+    parameters = problem.parameters
+    # With infinite standard deviations, the rows of the distributions are zero. `criterion` adds them with its own.
+    infinite, one = (parameters.with_deviations(np.full(len(parameters.distributions), d)) for d in (np.inf, 1.0))
+    other_priors = on_device(infinite.prior_rows(point.parameters))
+    blocks = eqx.tree_at(lambda blocks: blocks.priors, at.blocks, other_priors)
+    data = triangle(np.column_stack(eliminate(blocks, 0.0).rows).astype(float))
+    p = parameters.size
+    rows = one.prior_rows(point.parameters)[p:].astype(float)
+    places = [slice(begin, end) for _, begin, end in parameters.distributions]
+    q = np.array([s.stop - s.start for s in places])
+    scale = np.linalg.norm(np.concatenate([data, rows]), axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    nu = problem.size[0] - problem.size[1]
+
+    def criterion(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        weighed = [np.exp(-log) * rows[s] for log, s in zip(logs, places, strict=True)]
+        R = triangle(np.concatenate([data, *weighed]) / scale)
+        cost = float((R[p, p] * scale[p]) ** 2)
+        to_x = scipy.linalg.solve_triangular(R[:p, :p], np.eye(p), check_finite=False)
+        x = -to_x @ R[:p, p]
+        value = nu * np.log(cost) + 2 * np.sum(np.log(np.abs(R.diagonal()[:p]))) + 2 * q @ logs
+        slopes = []
+        for one, number in zip(weighed, q, strict=True):
+            A, r = one[:, :p] / scale[:p], one[:, p] / scale[p]
+            explained = np.sum((A @ to_x) ** 2)  # tr H^-1 A^T A
+            slopes.append(2 * (number - explained - nu * np.sum((A @ x + r) ** 2) * scale[p] ** 2 / cost))
+        return float(value), np.array(slopes)
+
+    lower, upper = _limits(data[:p, :p], rows, places)
+    along = np.linspace(lower, upper, 41)  # start from a grid: the criterion may be flat far from the minimum
+    start = min(along, key=lambda logs: criterion(logs)[0])
+    found = optimize.minimize(
+        criterion, start, jac=True, method="L-BFGS-B", bounds=[*zip(lower, upper, strict=True)],
+        options={"ftol": 1e-15, "gtol": 1e-10, "maxiter": 200},
+    )  # fmt: skip
+    return np.exp(found.x)
+
+
+def _limits(R: np.ndarray, rows: np.ndarray, places: list[slice]) -> tuple[np.ndarray, np.ndarray]:
+    """The bounds of the logarithms of the standard deviations.
+
+    The lower bound is a thousandth of the smallest standard error of a group: the groups do not differ. At the upper
+    bound, the groups do not shrink towards the mean.
+    """
+    covariance = np.linalg.pinv(R.T @ R)
+    ends = []
+    for s in places:
+        A, r = rows[s, :-1], rows[s, -1]
+        error = np.sqrt(np.einsum("ki,ij,kj->k", A, covariance, A))
+        error = error[error > 0] if np.any(error > 0) else np.ones(1)
+        ends.append((np.log(1e-3 * error.min()), np.log(1e3 * (error.max() + np.abs(r).max()))))
+    return np.array(ends).T[0], np.array(ends).T[1]

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ..._integrate.inputs import for_fixed_steps, inputs_at
 from ..._integrate.integrate import ends_between, is_valid, one_step
@@ -16,8 +16,7 @@ from ..._integrate.status import Status
 from ..._kane.right_hand_side import values_of
 from ..._system.system import System, unpacked
 from ...estimate._filter import begun, brought_back, sensed
-from ...estimate._process_noise import MODES, Disturbance
-from ...estimate._square_root import moments, root, update
+from ...estimate._filter_step import MODES, Disturbance, moments, root, update
 from ..problem.errors import LOG_2PI
 from ..problem.model import Model, Prediction
 from ..problem.windows import Windows, state_names
@@ -51,7 +50,7 @@ def smoothed_moments(steps: Step) -> tuple[Float[Array, "n_t n"], Float[Array, "
     n = steps.S.shape[-1]
     one = jnp.eye(n, dtype=steps.S.dtype)
 
-    def go_back(after: Any, step: Step) -> tuple[Any, Any]:
+    def go_back(after: tuple[Array, Array], step: Step) -> tuple[Any, Any]:
         a, G = after
         a, G = step.left @ a - step.shift, step.left @ G @ step.left.T
         values, vectors = jnp.linalg.eigh((G + G.T) / 2)
@@ -123,7 +122,7 @@ def filtered(model: Model, window: Windows, start: Array, b: Array, x: Array, be
         new = update(jnp.where(measured, y - h, 0.0), F, sigma, measured)
         return *brought_back(system_at, t, v + S @ new.shift, S @ new.left), new, h + new.known
 
-    def go_on(known: tuple[Array, Array, Reached], now: Any) -> tuple[Any, Any]:
+    def go_on(known: tuple[Array, Array, Reached], now: tuple[Array, ...]) -> tuple[Any, Any]:
         v, S, reached = known
         before, t, y, weight = now
         v, S, back, reached = motion.predicted(v, S, before, t, reached)
@@ -193,7 +192,7 @@ class _Motion:
         moving = t1 > t0
         length = jnp.where(moving, (t1 - t0) / number, self.window.step)
 
-        def piece(i: Array, carry: Any) -> Any:
+        def piece(i: Array, carry: PyTree) -> Any:
             v, S, back, reached = carry
             done = i.astype(dtype)
             t_start = t0 + done * length
@@ -250,7 +249,7 @@ def information_of(model: Model, window: Windows, start: Array, start_dot: Array
     directions = (start_dot.T[moves], unit[:, n_z : n_z + n_b], unit[:, n_z + n_b :])
 
     def along(*direction):
-        def of(start, b, x):
+        def of(start: Array, b: Array, x: Array):
             result = filtered(model, window, start, b, x)
             return (result.innovation, result.deviation), result
 

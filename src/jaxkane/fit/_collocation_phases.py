@@ -12,21 +12,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
+from numpy.typing import ArrayLike
 
-from ..._collocate.functions import Bound, Variables
-from ..._collocate.lobatto import Lobatto
-from ..._collocate.program import Block, EvaluatedBlock
-from ..._collocate.transcription import Builder, Layout, Motion, PhaseProblem, nodes_of
-from ..._integrate.inputs import Samples, inputs_at
-from ..._kane.right_hand_side import vector_field
-from ..._scalarjit.cache_key import jit
-from ..._system.system import System, unpacked
-from ..problem.model import Model, Nuisance
-from ..problem.parameters import Parameters
-from ..problem.problem import Problem
-from ..problem.trial import Trial
-from ..problem.windows import Windows
+from .._collocate.functions import Bound, Variables
+from .._collocate.lobatto import Lobatto
+from .._collocate.program import Block, EvaluatedBlock
+from .._collocate.transcription import Builder, Layout, Motion, PhaseProblem, nodes_of
+from .._integrate.inputs import Samples, inputs_at
+from .._kane.right_hand_side import vector_field
+from .._scalarjit.cache_key import jit
+from .._system.system import System, unpacked
+from .problem.model import Model, Nuisance
+from .problem.parameters import Parameters
+from .problem.problem import Problem
+from .problem.trial import Trial
+from .problem.windows import Windows
 
 DELAY = "delay of input"
 
@@ -57,7 +58,7 @@ class TrialVariables(Variables):
     model: Model
     window: Windows
 
-    def at(self, node: Any, x: Array) -> tuple[System, Array, Array, Array, dict[str, Array]]:
+    def at(self, node: PyTree, x: Array) -> tuple[System, Array, Array, Array, dict[str, Array]]:
         y, w, rest = x[: self.n_y], x[self.n_y : self.n_z], x[self.n_z :]
         duration = jnp.asarray(self.duration)
         t = self.origin + node["s"] * duration
@@ -81,7 +82,7 @@ class Squares(eqx.Module):
 
     variables: TrialVariables
 
-    def __call__(self, data: Any, x: Array) -> Array:
+    def __call__(self, data: PyTree, x: Array) -> Array:
         variables, node = self.variables, data["node"]
         now = variables.now(node, x)
         _, calibration = variables.parameters.apply(variables.system, x[variables.n_z :])
@@ -96,7 +97,7 @@ class Priors(eqx.Module):
 
     parameters: Parameters
 
-    def __call__(self, data: Any, x: Array) -> Array:
+    def __call__(self, data: PyTree, x: Array) -> Array:
         return jnp.sum(jnp.asarray(self.parameters.prior_residuals(x)) ** 2)[None]
 
 
@@ -106,7 +107,7 @@ class Deviations(eqx.Module):
     mean: Array
     deviation: Array
 
-    def __call__(self, data: Any, x: Array) -> Array:
+    def __call__(self, data: PyTree, x: Array) -> Array:
         return jnp.sum(((x - self.mean) / self.deviation) ** 2)[None]
 
 
@@ -239,7 +240,7 @@ def add_squares(problem: Problem, densities: Array, every: int, builder: Builder
 
 
 def _add_deviations(
-    builder: Builder, columns: np.ndarray, mean: Any, deviation: Any, weights: np.ndarray | None = None
+    builder: Builder, columns: np.ndarray, mean: ArrayLike, deviation: ArrayLike, weights: np.ndarray | None = None
 ) -> None:
     """Add the squares of variables (B, n) relative to their prior means and standard deviations (n,)."""
     block = Block(Deviations(jnp.asarray(mean), jnp.asarray(deviation)), np.zeros((len(columns), 0)), columns, 1)

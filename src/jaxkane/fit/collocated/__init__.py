@@ -1,1 +1,0 @@
-"""Parameters from long or unstable motions by direct collocation, with unknown inputs."""
