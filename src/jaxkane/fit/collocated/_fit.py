@@ -16,8 +16,7 @@ import numpy as np
 from ..._collocate.functions import bounds_of
 from ..._collocate.lobatto import lobatto
 from ..._collocate.program import NonlinearProgram
-from ..._collocate.second_order import refused_unless_minimum
-from ..._collocate.solvers import INTERRUPTED, Solution, Solver, default_solver, run
+from ..._collocate.solvers import INTERRUPTED, Solution, Solver, default_solver, refused_unless_minimum, run
 from ..._collocate.transcription import Transcription
 from ..._common.lookup import positive_number, refuse_unknown
 from ..._integrate.jumps import refuse_jumps

@@ -32,8 +32,7 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 from ..._collocate.program import NonlinearProgram
-from ..._collocate.second_order import BandedFactors
-from ..._collocate.solvers import Solution
+from ..._collocate.solvers import BandedFactors, Solution
 from ..._collocate.transcription import Layout, Transcription
 
 

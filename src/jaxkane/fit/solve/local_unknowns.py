@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..._integrate.status import Status, reason
+from ..._integrate.events import Status, reason
 from ..._scalarjit.compat import on_device
 from ..problem.model import Unknowns
 from ..problem.problem import Problem
