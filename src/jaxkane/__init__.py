@@ -33,21 +33,21 @@ if _typing.TYPE_CHECKING:  # the same names as below, for type checkers and the 
     from ._animate import animate as animate
     from ._integrate.audit import Audit as Audit
     from ._integrate.audit import audit as audit
+    from ._integrate.events import Status as Status
     from ._integrate.events import falling as falling
     from ._integrate.events import rising as rising
     from ._integrate.inputs import Samples as Samples
-    from ._integrate.queries import constraint_forces as constraint_forces
-    from ._integrate.queries import constraint_multipliers as constraint_multipliers
-    from ._integrate.queries import orientations as orientations
-    from ._integrate.queries import outputs as outputs
-    from ._integrate.queries import positions as positions
-    from ._integrate.queries import speed_rates as speed_rates
-    from ._integrate.queries import state_rates as state_rates
-    from ._integrate.queries import velocities as velocities
     from ._integrate.simulate import ode_term as ode_term
     from ._integrate.simulate import simulate as simulate
-    from ._integrate.status import Status as Status
     from ._integrate.trajectory import Trajectory as Trajectory
+    from ._integrate.trajectory import constraint_forces as constraint_forces
+    from ._integrate.trajectory import constraint_multipliers as constraint_multipliers
+    from ._integrate.trajectory import orientations as orientations
+    from ._integrate.trajectory import outputs as outputs
+    from ._integrate.trajectory import positions as positions
+    from ._integrate.trajectory import speed_rates as speed_rates
+    from ._integrate.trajectory import state_rates as state_rates
+    from ._integrate.trajectory import velocities as velocities
     from ._kane.api import accelerations as accelerations
     from ._kane.api import constraint_jacobian as constraint_jacobian
     from ._kane.api import constraint_jacobian_rate as constraint_jacobian_rate
@@ -93,13 +93,11 @@ symbolic
 _NAMES = {
     "_animate": "Animation Sketch animate",
     "_integrate.audit": "Audit audit",
-    "_integrate.events": "falling rising",
+    "_integrate.events": "Status falling rising",
     "_integrate.inputs": "Samples",
-    "_integrate.queries": "constraint_forces constraint_multipliers orientations outputs positions "
+    "_integrate.trajectory": "Trajectory constraint_forces constraint_multipliers orientations outputs positions "
     "speed_rates state_rates velocities",
     "_integrate.simulate": "ode_term simulate",
-    "_integrate.status": "Status",
-    "_integrate.trajectory": "Trajectory",
     "_kane.api": "accelerations constraint_jacobian constraint_jacobian_rate coordinate_rates "
     "dependent_accelerations dependent_speeds equations_of_motion forcing generalized_active_forces "
     "generalized_inertia_forces kinetic_energy mass_matrix partial_velocities",

@@ -16,7 +16,7 @@ import jaxkane as jk
 from jaxkane import Scalar, parameter
 from jaxkane.bicycles import sharp_motorcycle
 from jaxkane.stability import critical_speeds, eigenvalues, linearize, straight_ahead
-from jaxkane.stability._modes import _track_and_name, conjugate_pairs, track
+from jaxkane.stability._bicycle import _track_and_name, conjugate_pairs, track
 
 BIKE = jk.catalog.WhippleBicycle.benchmark()
 PUBLISHED = json.loads((Path(__file__).parents[1] / "data" / "meijaard2007.json").read_text())

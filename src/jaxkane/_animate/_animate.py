@@ -8,9 +8,10 @@ import functools
 import html
 import json
 import os
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -19,7 +20,10 @@ from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
 from .._system.system import System
 from ._figures import COLORS, Figure, Record, bodies_and_points, figure_of, record
-from ._scene import FIXED, UPRIGHT, Builder, Scene, angles_of, project, turned_by, upward_axis, view_of
+from ._scene import FIXED, UPRIGHT, Builder, Scene, Shape, angles_of, project, turned_by, upward_axis, view_of
+
+if TYPE_CHECKING:
+    from PIL.ImageDraw import ImageDraw
 
 _FRAMES_PER_SECOND = 50.0
 _MOST_FRAMES = 3000
@@ -82,7 +86,16 @@ def animate(
     return Animation(scene, speed, theme, height)
 
 
-def _scene(motion: Record, figure: Any, speed: float, up, follow, ground, title, name) -> Scene:
+def _scene(
+    motion: Record,
+    figure: Figure | None,
+    speed: float,
+    up: str | None,
+    follow: bool | None,
+    ground: bool | None,
+    title: str | None,
+    name: str,
+) -> Scene:
     turned = turned_by(motion.t, motion.spin, motion.orientation)
     frames = _frames(motion.t, _FRAMES_PER_SECOND / speed)
     total = motion.mass.sum()
@@ -130,7 +143,7 @@ def _scene(motion: Record, figure: Any, speed: float, up, follow, ground, title,
 
 
 def _frames(t: np.ndarray, rate: float) -> np.ndarray:
-    """The frames: the samples nearest to `rate` a second, or all samples if there are fewer."""
+    # The frames: the samples nearest to `rate` a second, or all samples if there are fewer.
     n = int(min(max(np.ceil((t[-1] - t[0]) * rate) + 1, 2), _MOST_FRAMES))
     if n >= len(t):
         return np.arange(len(t))
@@ -231,7 +244,6 @@ def _write_gif(
     azimuth: float | None = None,
     elevation: float | None = None,
 ) -> None:
-    """Write into the open file; see `Animation.save`."""
     from PIL import Image, ImageDraw
 
     view = dataclasses.replace(scene.view, **angles_of(azimuth, elevation))
@@ -286,7 +298,14 @@ class _Painter:
     def pixels(self, p: np.ndarray) -> list[tuple[float, float]]:
         return [tuple(row) for row in (self.middle + p[:, :2] * (self.scale, -self.scale)).tolist()]
 
-    def paint(self, draw: Any, i: int, x: np.ndarray, to_page: Any, lines: Any) -> None:
+    def paint(
+        self,
+        draw: ImageDraw,
+        i: int,
+        x: np.ndarray,
+        to_page: Callable[[np.ndarray], np.ndarray],
+        lines: tuple[np.ndarray, float, int],
+    ) -> None:
         shapes = self.scene.shapes
         if self.scene.ground is not None:
             self._ground(draw, to_page, *lines)
@@ -299,7 +318,7 @@ class _Painter:
         for shape, p in sorted(pairs, key=lambda pair: -pair[1][:, 2].mean()):
             self._shape(draw, shape, self.pixels(p))
 
-    def _shape(self, draw: Any, shape: Any, at: list[tuple[float, float]]) -> None:
+    def _shape(self, draw: ImageDraw, shape: Shape, at: list[tuple[float, float]]) -> None:
         color, width = self.color(shape.color), max(1, round(shape.width * _FINE * 0.8))
         if shape.kind == "line":
             if shape.fill:
@@ -321,7 +340,9 @@ class _Painter:
             else:
                 draw.ellipse(box, fill=color)
 
-    def _ground(self, draw: Any, to_page: Any, middle: np.ndarray, step: float, n: int) -> None:
+    def _ground(
+        self, draw: ImageDraw, to_page: Callable[[np.ndarray], np.ndarray], middle: np.ndarray, step: float, n: int
+    ) -> None:
         for k in range(-n, n + 1):
             for axis in (0, 1):
                 ends = np.full((2, 3), self.scene.ground)

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._integrate.inputs import Coordinates, Speeds
 from .._integrate.trajectory import Trajectory, as_trajectory, reached_times
 from .._scalarjit.cache_key import jit
-from .._scalarjit.components import stack
+from .._scalarjit.components import Component, stack
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Body, Force, Motion, flatten_loads
@@ -72,7 +73,9 @@ class Sketch:
         self.motion = motion
         self.elements: list[Element] = []
 
-    def _add(self, places: Any, kind: str, color: str, turns_with: Body | None = None, **style: Any) -> None:
+    def _add(
+        self, places: Float[Array, "n 3"], kind: str, color: str, turns_with: Body | None = None, **style: Any
+    ) -> None:
         body = None if turns_with is None else self.motion.bodies.index(turns_with)
         self.elements.append(Element(places, kind, color, body=body, **style))
 
@@ -100,7 +103,7 @@ class Sketch:
         center: Location,
         a: Vector,
         b: Vector,
-        radius: Any,
+        radius: Component,
         *,
         width: float = 2.0,
         fill: float = 0.0,
@@ -111,7 +114,7 @@ class Sketch:
             self._around(center, a, b, radius, 40), "line", color, turns_with, width=width, closed=True, fill=fill
         )
 
-    def wheel(self, color: str, body: Body, radius: Any, *, axis: int = 2, spokes: int = 12) -> None:
+    def wheel(self, color: str, body: Body, radius: Component, *, axis: int = 2, spokes: int = 12) -> None:
         """A spoked wheel about the mass centre of a body and its `axis` 1, 2 or 3. It rotates with the body."""
         x, y, z = body.frame.x, body.frame.y, body.frame.z
         a, b = {1: (y, z), 2: (z, x), 3: (x, y)}[axis]
@@ -121,7 +124,7 @@ class Sketch:
         self._add(jnp.stack([hub, rim], axis=1).reshape(-1, 3), "pairs", color, body, width=0.7)
         self.dot(color, body, 3.0)
 
-    def _around(self, center: Location, a: Vector, b: Vector, radius: Any, n: int) -> Float[Array, "n 3"]:
+    def _around(self, center: Location, a: Vector, b: Vector, radius: Component, n: int) -> Float[Array, "n 3"]:
         a_N, b_N = a.to(self.motion.N), b.to(self.motion.N)
         angles = 2.0 * np.pi * np.arange(n)[:, None] / n
         cos, sin = (jnp.asarray(f(angles), dtype=a_N.dtype) for f in (np.cos, np.sin))
@@ -144,7 +147,7 @@ class Sketch:
         for place in places:
             self._add(self._at(place)[None], "trace", color, width=1.2)
 
-    def axes(self, center: Location, frame: Frame, length: Any) -> None:
+    def axes(self, center: Location, frame: Frame, length: Component) -> None:
         """The axes 1, 2 and 3 of a frame in red, green and blue."""
         start = center.center.position if isinstance(center, Body) else center
         start = start.position if isinstance(start, Point) else start
@@ -209,16 +212,16 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
 
 
 @jit
-def _record_along(system, figure, t, q, u):
+def _record_along(system: System, figure: Figure | None, t: Array, q: Coordinates, u: Speeds):
     # This program runs once or twice, so it should compile quickly: use one function for one instant.
     @ScalarFunction
-    def at(system, t, q, u):
+    def at(system: System, t: Array, q: Coordinates, u: Speeds):
         return _record_at(system, figure, t, q, u)
 
     return jax.lax.map(lambda now: at(system, *now), (t, q, u))
 
 
-def _record_at(system: System, figure: Figure | None, t, q, u) -> Any:
+def _record_at(system: System, figure: Figure | None, t: Array, q: Coordinates, u: Speeds) -> Any:
     motion = system.motion(t, q, u)
     N, dtype = motion.N, q.dtype
     placed = [i for i, body in enumerate(motion.bodies) if body.center.has_position]
@@ -235,13 +238,13 @@ def _record_at(system: System, figure: Figure | None, t, q, u) -> Any:
     if figure is not None:
         figure(system, motion, sketch)
 
-    def row(vector, frame=N):
+    def row(vector: Vector, frame: Frame = N):
         return stack([vector.components_in(frame)])[0].astype(dtype)
 
-    def table(rows, *shape):
+    def table(rows: list[Array], *shape):
         return jnp.stack(rows) if rows else jnp.zeros((0, *shape), dtype)
 
-    def rotations(frames):
+    def rotations(frames: list[Frame]):
         return table([rotation(frame, N).astype(dtype) for frame in frames], 3, 3)
 
     return Record(
@@ -273,7 +276,7 @@ def bicycle(system: Any, motion: Motion, s: Sketch) -> None:
     rear, front, S = rear_wheel.center.position, front_wheel.center.position, motion["S"].position
     w, rR = system.w, system.rR
 
-    def at(x, height):  # measured from the rear contact of the upright bicycle
+    def at(x: float, height: Component):  # measured from the rear contact of the upright bicycle
         return rear + B.vector(x * w, 0.0, rR - height)
 
     crank, seat = at(0.40, 0.9 * rR), at(0.22, rR + 0.55)
@@ -310,7 +313,7 @@ def bicycle(system: Any, motion: Motion, s: Sketch) -> None:
         part.draw(system, motion, s)
 
 
-def _wheel(s: Sketch, body: Body, radius: Any, tyre: Any) -> None:
+def _wheel(s: Sketch, body: Body, radius: Component, tyre: Any) -> None:
     """A spoked wheel, and the sides of its tyre if it has a round cross section."""
     s.wheel("ink", body, radius)
     if getattr(tyre, "crown", None) is not None:
@@ -394,7 +397,7 @@ def _solid(build: Builder, body: int, color: str, inertia: np.ndarray) -> bool:
         return False
     axial = [k for k in range(3) if abs(moments[k - 1] - moments[k - 2]) <= 1e-6 * largest]
 
-    def add(x, **style):
+    def add(x: np.ndarray, **style):
         build.local(np.asarray(x) @ axes.T, body)
         build.shape(style.pop("kind", "line"), color, len(x), **style)
 
@@ -444,7 +447,7 @@ def _links(motion: Record, build: Builder) -> bool:
     n = points.shape[1]
     group = list(range(n))
 
-    def join(i, j):
+    def join(i: int, j: int):
         old, new = group[j], group[i]
         group[:] = [new if g == old else g for g in group]
 

@@ -141,7 +141,7 @@ class Scene:
     title: str
     name: str
 
-    def at(self, t: Any) -> tuple[np.ndarray, np.ndarray]:
+    def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (n, V, 3) and the center_of_mass (n, 3) at times (n,), interpolated."""
         t = np.clip(np.atleast_1d(t), self.t[0], self.t[-1])
         i = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
@@ -253,7 +253,7 @@ class Builder:
 
 
 def _quaternions(R: np.ndarray) -> np.ndarray:
-    """Quaternions of rotation matrices (F, 3, 3), with signs such that consecutive ones are close."""
+    # Quaternions of rotation matrices (F, 3, 3), with signs such that consecutive ones are close.
     e = Rotation.from_matrix(R).as_quat()
     turned = np.sum(e[1:] * e[:-1], axis=1) < 0
     return e * np.concatenate([[1], np.where(np.cumsum(turned) % 2, -1, 1)])[:, None]

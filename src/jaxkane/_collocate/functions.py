@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .._common.lookup import not_there, real_number
@@ -24,6 +25,9 @@ from .._scalarjit.components import Component
 from .._system.system import System, explain_value_of_traced, has_outputs, names_of, unpacked
 
 Bound = tuple[float, float]
+Node = dict[str, Any]
+"""The fraction "s" of the duration at a node, and the values of sampled inputs there by name, "inputs"."""
+
 Condition = float | tuple[float | None, float | None]
 
 
@@ -127,7 +131,7 @@ class Variables(eqx.Module):
         system = self.system if self.parameters is None else self.parameters.apply(self.system, rest)[0]
         return system, duration
 
-    def at(self, node: Any, x: Array) -> tuple[System, Array, Array, Array, dict[str, Array]]:
+    def at(self, node: Node, x: Array) -> tuple[System, Array, Array, Array, dict[str, Array]]:
         """System, duration, time, packed state and inputs by name, at a node.
 
         `node`: the fraction of the duration "s", and the values of sampled inputs by name.
@@ -145,7 +149,7 @@ class Variables(eqx.Module):
         inputs |= {name: jnp.zeros_like(t) for name in system.inputs if name not in inputs}
         return system, duration, t, y, inputs
 
-    def now(self, node: Any, x: Array) -> Now:
+    def now(self, node: Node, x: Array) -> Now:
         system, _, t, y, inputs = self.at(node, x)
         return Now(system, t, y, inputs)
 
@@ -155,7 +159,7 @@ class Dynamics(eqx.Module):
 
     variables: Variables
 
-    def __call__(self, node: Any, x: Array) -> Float[Array, " n_y"]:
+    def __call__(self, node: Node, x: Array) -> Float[Array, " n_y"]:
         system, duration, t, y, inputs = self.variables.at(node, x)
         return duration * vector_field(system, t, y, inputs)
 
@@ -166,7 +170,7 @@ class Integrand(eqx.Module):
     variables: Variables
     cost: Callable[[Any, Now], Any]
 
-    def __call__(self, node: Any, x: Array) -> Float[Array, " 1"]:
+    def __call__(self, node: Node, x: Array) -> Float[Array, " 1"]:
         _, duration = self.variables.shared(x[self.variables.n_z :])
         now = self.variables.now(node, x)
         return jnp.reshape(duration * number("cost", called("cost", self.cost, now.t, now), x.dtype), (1,))
@@ -179,7 +183,7 @@ class Path(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     path: Callable[[Any, Now], Any] | None
 
-    def __call__(self, node: Any, x: Array) -> Float[Array, " m"]:
+    def __call__(self, node: Node, x: Array) -> Float[Array, " m"]:
         now = self.variables.now(node, x)
         values = [now[name] for name in self.names]
         if self.path is not None:
@@ -200,7 +204,7 @@ class Ends(eqx.Module):
     end: tuple[str, ...] = eqx.field(static=True)
     has_constraints: bool = eqx.field(static=True)
 
-    def __call__(self, nodes: Any, x: Array) -> Float[Array, " m"]:
+    def __call__(self, nodes: tuple[Node, Node], x: Array) -> Float[Array, " m"]:
         n, shared = self.variables.n_z, x[2 * self.variables.n_z :]
         first = self.variables.now(nodes[0], jnp.concatenate([x[:n], shared]))
         last = self.variables.now(nodes[1], jnp.concatenate([x[n : 2 * n], shared]))
@@ -232,7 +236,7 @@ class Link(eqx.Module):
     linked: tuple[str, ...] = eqx.field(static=True)
     is_one_phase: bool = eqx.field(static=True)
 
-    def __call__(self, nodes: Any, x: Array) -> Float[Array, " m"]:
+    def __call__(self, nodes: tuple[Node, Node], x: Array) -> Float[Array, " m"]:
         a, b = self.before.n_z, self.after.n_z
         shared = x[a + b :]
         one = int(self.before.duration is None)
@@ -256,14 +260,14 @@ def called(label: str, f: Callable[..., Any], *args: Any) -> Any:
         return f(*args)
 
 
-def named(label: str, values: Any) -> Mapping[str, Any]:
+def named(label: str, values: object) -> Mapping[str, Any]:
     """**Raises:** `TypeError` unless the values are by name."""
     if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
         raise TypeError(f"The function `{label}` must return a dict of numbers by name, got {values!r}.")
     return values
 
 
-def number(label: str, value: Any, dtype: Any) -> Array:
+def number(label: str, value: object, dtype: DTypeLike) -> Array:
     """The number that a function of the user returned.
 
     **Raises:** `TypeError` for truth values, which have no derivative, and for anything else that is not one number.
@@ -277,13 +281,13 @@ def number(label: str, value: Any, dtype: Any) -> Array:
     return jnp.asarray(value, dtype)
 
 
-def numbers(label: str, values: Any, dtype: Any) -> dict[str, Array]:
+def numbers(label: str, values: object, dtype: DTypeLike) -> dict[str, Array]:
     """The values by name that a function of constraints returned, as numbers or as (number, lower, upper)."""
     items = {name: x[0] if isinstance(x, tuple) and x else x for name, x in named(label, values).items()}
     return {name: number(f"{label}` of `{name}", x, dtype) for name, x in items.items()}
 
 
-def bounds_of(label: str, value: Any) -> Bound:
+def bounds_of(label: str, value: Component | Sequence[float | None]) -> Bound:
     """Lower and upper bound, equal for a number.
 
     **Raises:** `ValueError` if the lower bound is greater than the upper one, or not a number.
@@ -302,7 +306,7 @@ def bounds_of(label: str, value: Any) -> Bound:
     return low, high
 
 
-def constraints_of(label: str, values: Any, is_equality: bool) -> dict[str, Bound]:
+def constraints_of(label: str, values: object, is_equality: bool) -> dict[str, Bound]:
     """The bounds of constraints by name, from what the user's function returned.
 
     **Raises:** `ValueError` or `TypeError` for bounds that are not concrete numbers.

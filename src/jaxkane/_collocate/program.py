@@ -9,19 +9,24 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from jaxtyping import Array
+from jax.typing import DTypeLike
+from jaxtyping import Array, PyTree
 
 from .._scalarjit.cache import Cache
 from .._scalarjit.cache_key import jit, kept
+from .._scalarjit.components import Numbers
 from .._scalarjit.jaxpr import patterns
 
 BlockFunction = Callable[[Any, Array], Array]
+
+Sparse: TypeAlias = Any
+"""A sparse matrix of SciPy, for which its types are incomplete."""
 
 
 class Block(NamedTuple):
@@ -55,7 +60,7 @@ class Pattern:
 _PATTERNS = Cache()
 
 
-def _pattern(function: BlockFunction, data: Any, x: Array) -> Pattern:
+def _pattern(function: BlockFunction, data: PyTree[Array], x: Array) -> Pattern:
     leaves, structure = jax.tree.flatten(data)
 
     def f(x: Array, *leaves: Any) -> Array:
@@ -66,7 +71,7 @@ def _pattern(function: BlockFunction, data: Any, x: Array) -> Pattern:
     return Pattern(*(tuple(i.tolist()) for i in places))
 
 
-def padded(x: Any) -> np.ndarray:
+def padded(x: Numbers) -> np.ndarray:
     """Rows up to the next power of two: the last one is repeated. Other sizes then use the same compiled program."""
     x = np.asarray(x)
     more = (1 << max(0, (len(x) - 1).bit_length())) - len(x)
@@ -76,7 +81,7 @@ def padded(x: Any) -> np.ndarray:
 class EvaluatedBlock:
     """A block with its pattern, and its values and derivatives at all places."""
 
-    def __init__(self, block: Block, dtype: Any = jnp.float64):
+    def __init__(self, block: Block, dtype: DTypeLike = jnp.float64):
         self.block, (self.B, n) = block, block.columns.shape
         # `padded` would hide another number of places: 27 samples were compared with those of 20 others.
         assert all(len(x) == self.B for x in jax.tree.leaves(block.data)), "The data have another number of places."
@@ -104,17 +109,17 @@ class EvaluatedBlock:
 
 
 @jit
-def _values(function: BlockFunction, data: Any, X: Array) -> Array:
+def _values(function: BlockFunction, data: PyTree[Array], X: Array) -> Array:
     return jax.vmap(function)(data, X)
 
 
 @jit
-def _jacobian(function: BlockFunction, pattern: Pattern, data: Any, X: Array) -> Array:
+def _jacobian(function: BlockFunction, pattern: Pattern, data: PyTree[Array], X: Array) -> Array:
     along = sorted({*pattern.columns})  # other columns are zero
     place = np.array([along.index(c) for c in pattern.columns], int)
     directions = np.eye(X.shape[1])[along]
 
-    def entries(data: Any, x: Array) -> Array:
+    def entries(data: PyTree[Array], x: Array) -> Array:
         columns = jax.vmap(lambda v: jax.jvp(lambda x: function(data, x), (x,), (v,))[1])(directions)
         return columns[place, np.array(pattern.rows, int)]
 
@@ -122,12 +127,12 @@ def _jacobian(function: BlockFunction, pattern: Pattern, data: Any, X: Array) ->
 
 
 @jit
-def _hessian(function: BlockFunction, pattern: Pattern, data: Any, X: Array, weights: Array) -> Array:
+def _hessian(function: BlockFunction, pattern: Pattern, data: PyTree[Array], X: Array, weights: Array) -> Array:
     along = sorted({*pattern.hessian_columns})
     place = np.array([along.index(c) for c in pattern.hessian_columns], int)
     directions = np.eye(X.shape[1])[along]
 
-    def entries(data: Any, x: Array, w: Array) -> Array:
+    def entries(data: PyTree[Array], x: Array, w: Array) -> Array:
         slope = jax.grad(lambda x: jnp.vdot(w, function(data, x)))
         columns = jax.vmap(lambda v: jax.jvp(slope, (x,), (v,))[1])(directions)
         return columns[place, np.array(pattern.hessian_rows, int)]
@@ -164,7 +169,7 @@ class NonlinearProgram:
         blocks: Sequence[EvaluatedBlock],
         weights: Sequence[np.ndarray | None],
         constraints: Sequence[Any],
-        linear: Any,
+        linear: Sparse,
         x_bounds: Bounds,
         g_bounds: Bounds,
         x_scale: np.ndarray,
@@ -284,7 +289,7 @@ class NonlinearProgram:
         return max(float(np.max(x, initial=0.0)) for pair in pairs for x in pair)
 
     def _remembered(self, evaluate: Callable[[Any, np.ndarray], np.ndarray], z: np.ndarray) -> list[np.ndarray]:
-        """The results of all blocks. Solvers ask for the cost and for the constraints at the same point."""
+        # The results of all blocks. Solvers ask for the cost and for the constraints at the same point.
         key, known = z.tobytes(), self._memory.get(evaluate)
         if known is None or known[0] != key:
             x = z * self.x_scale

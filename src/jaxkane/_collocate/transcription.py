@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
+from jaxtyping import PyTree
 
 from .._integrate.inputs import is_samples
 from .._kane.constraint_residuals import n_configuration_constraints
@@ -152,7 +153,7 @@ class Layout:
     def shared(self) -> np.ndarray:
         return np.concatenate([[] if self.duration is None else [self.duration], self.parameters]).astype(int)
 
-    def node(self, k: Any, interval: np.ndarray | None = None) -> np.ndarray:
+    def node(self, k: np.ndarray | int, interval: np.ndarray | None = None) -> np.ndarray:
         """The indices (..., n_z) of the states and controls at nodes k (...,).
 
         A control that is constant in each interval has the value of `interval` (...,), by default of the interval that
@@ -179,7 +180,7 @@ class Layout:
         return self.K * n_y + (len(self.mesh) - 1 if self.problem.is_piecewise else self.K) * n_w
 
     @property
-    def dynamics(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def dynamics(self) -> tuple[np.ndarray, ...]:
         """Where the equations of motion are evaluated.
 
         **Returns:** the nodes (B,), the variables (B, n) and, for each point of each interval, its place (N, s) among
@@ -412,7 +413,9 @@ class Transcription:
         block = EvaluatedBlock(Block(ends, data, columns, has_cost + len(items)))
         builder.constraints("conditions", p, block, items, has_cost=has_cost)
 
-    def _add_link(self, builder: Builder, i: int, how: Any, dynamics: Sequence[EvaluatedBlock]) -> None:
+    def _add_link(
+        self, builder: Builder, i: int, how: str | Callable[..., Any] | None, dynamics: Sequence[EvaluatedBlock]
+    ) -> None:
         j = (i + 1) % len(self.layouts)
         one, other = self.layouts[i], self.layouts[j]
         linked = other.problem.names
@@ -433,7 +436,9 @@ class Transcription:
         block = EvaluatedBlock(Block(link, data, columns, len(names)))
         builder.constraints("links", i, block, [(name, (0.0, 0.0)) for name in names])
 
-    def _returned(self, field: str, function: Any, data: Any, columns: np.ndarray) -> Mapping[str, Any]:
+    def _returned(
+        self, field: str, function: Path | Ends | Link, data: PyTree, columns: np.ndarray
+    ) -> Mapping[str, Any]:
         """The values by name that a function of the user returns, which is a field of the function of a block."""
         found: dict[str, Any] = {}
         f = getattr(function, field)
@@ -464,7 +469,7 @@ class Transcription:
                 )
 
     def _cost_scale(self) -> float:
-        """The size of the cost at the guess, or one third of a scale away from it: at the guess it may be zero."""
+        # The size of the cost at the guess, or one third of a scale away from it: at the guess it may be zero.
         shift = np.random.default_rng(0).uniform(-0.3, 0.3, self.n)
         z = np.clip(self.z + shift, self.program.lower, self.program.upper)
         sizes = [abs(self.program.objective(place)) for place in (self.z, z)]
@@ -485,8 +490,8 @@ class Builder:
         self.n, self.m, self.method = n, 0, method
         self.blocks: list[EvaluatedBlock] = []
         self.weights: list[np.ndarray | None] = []
-        self.entries: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = []  # rows, places of values, factors
-        self.linear: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self.entries: list[tuple[np.ndarray, ...] | None] = []  # rows, places of values, factors
+        self.linear: list[tuple[np.ndarray, ...]] = []
         self.rows: list[Row] = []
         self.user_blocks: list[tuple[EvaluatedBlock, str]] = []
         self._lower: list[np.ndarray] = []
@@ -539,7 +544,12 @@ class Builder:
         for i, (name, _) in enumerate(items):
             self.rows.append(Row(kind, p, name, rows[:, i]))
 
-    def _add(self, block: EvaluatedBlock, weights: Any, entries: Any) -> None:
+    def _add(
+        self,
+        block: EvaluatedBlock,
+        weights: np.ndarray | None,
+        entries: tuple[np.ndarray, ...] | None,
+    ) -> None:
         self.blocks.append(block)
         self.weights.append(weights)
         self.entries.append(entries)
@@ -588,7 +598,7 @@ class Builder:
         return scale
 
 
-def _sparse(entries: tuple[np.ndarray, np.ndarray, np.ndarray], shape: tuple[int, int]) -> Any:
+def _sparse(entries: tuple[np.ndarray, ...], shape: tuple[int, int]) -> Any:
     rows, columns, factors = entries
     return scipy.sparse.csr_matrix((factors, (rows, columns)), shape)
 

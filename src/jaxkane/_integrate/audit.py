@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from .._kane.constraint_residuals import configuration_residual, relative_condition
 from .._kane.contact.forces import forces_in_contact, layout_of
@@ -23,12 +24,19 @@ from .._scalarjit.scalar_function import ScalarFunction
 from .._system.kinematics import Point, Vector
 from .._system.motion import Force, Motion, ReflectedInertia, kinetic_energy_of
 from .._system.system import State, System, packed, unpacked
+from .inputs import Coordinates, Speeds
 from .trajectory import Trajectory, as_trajectory, reached_times
 
 
 @jit
-def _quantities_along(system, t, q, u, inputs):
-    def quantities(t, q, u, inputs):
+def _quantities_along(
+    system: System,
+    t: Float[Array, " n_t"],
+    q: Float[Array, "n_t n_q"],
+    u: Float[Array, "n_t n_u"],
+    inputs: dict[str, Array],
+):
+    def quantities(t: Array, q: Coordinates, u: Speeds, inputs: dict[str, Array]):
         u_dot, M = accelerations_and_mass_matrix(system, t, q, u, inputs)
         return {**_quantities(system, t, q, u, inputs, u_dot), "M": M, "u_dot": u_dot}
 
@@ -36,18 +44,18 @@ def _quantities_along(system, t, q, u, inputs):
 
 
 @jit
-def _sizes_along(system, t, q):
+def _sizes_along(system: System, t: Float[Array, " n_t"], q: Float[Array, "n_t n_q"]):
     """Sizes (h,) of the terms of the configuration constraints along a trajectory."""
     largest = jnp.max(jnp.abs(t)), jnp.maximum(jnp.max(jnp.abs(q), axis=0), SMALLEST_SIZE)
 
-    def sizes_at(t, q):
+    def sizes_at(t: Array, q: Coordinates):
         return term_sizes(lambda t, q: configuration_residual(system, t, q), t, q, sizes=largest)
 
     return jnp.max(jax.vmap(sizes_at)(t, q), axis=0)
 
 
 @ScalarFunction
-def _quantities(system, t, q, u, inputs, u_dot):
+def _quantities(system: System, t: Array, q: Coordinates, u: Speeds, inputs: dict[str, Array], u_dot: Speeds):
     equations = Reactions(system, t, q, u, inputs, u_dot)
     motion, places = equations.description, _Places()
     loads = equations.loads(motion)
@@ -70,7 +78,15 @@ def _quantities(system, t, q, u, inputs, u_dot):
 
 
 @jit
-def _powers_along(system, t, q, u, values, input_rates, contacts):
+def _powers_along(
+    system: System,
+    t: Float[Array, " n_t"],
+    q: Float[Array, "n_t n_q"],
+    u: Float[Array, "n_t n_u"],
+    values: dict[str, Array],
+    input_rates: dict[str, Array],
+    contacts: Float[Array, "n_t m"] | None,
+):
     """Powers of the loads, of prescribed motions and of contacts (n_t, l + 1 or 2), and their time derivatives.
 
     **Arguments:**
@@ -80,7 +96,7 @@ def _powers_along(system, t, q, u, values, input_rates, contacts):
     - `contacts` (n_t, m): the contact states; None if the system has no contacts.
     """
 
-    def powers(contacts, t, q, u, values):
+    def powers(contacts: Float[Array, " m"] | None, t: Array, q: Coordinates, u: Speeds, values: dict[str, Array]):
         if contacts is None:
             u_dot, of_contacts = accelerations_and_mass_matrix(system, t, q, u, values)[0], []
         else:
@@ -89,7 +105,14 @@ def _powers_along(system, t, q, u, values, input_rates, contacts):
         quantities = _quantities(system, t, q, u, values, u_dot)
         return jnp.concatenate([quantities["power"], quantities["prescribed"][None], *of_contacts])
 
-    def powers_and_rates(t, q, u, values, input_rates, contacts):
+    def powers_and_rates(
+        t: Array,
+        q: Coordinates,
+        u: Speeds,
+        values: dict[str, Array],
+        input_rates: dict[str, Array],
+        contacts: Float[Array, " m"] | None,
+    ):
         x = jnp.stack([values[name] for name in system.states]) if system.states else None
         inputs = {name: values[name] for name in input_rates}
         dot = unpacked(system, vector_field(system, t, packed(State(q, u, x, contacts)), inputs))
@@ -101,7 +124,9 @@ def _powers_along(system, t, q, u, values, input_rates, contacts):
 
 
 @ScalarFunction
-def _contact_power(system, t, q, u, values, contacts):
+def _contact_power(
+    system: System, t: Array, q: Coordinates, u: Speeds, values: dict[str, Array], contacts: Float[Array, " m"]
+):
     """Accelerations (n,) and the power of the contact forces on the mechanism [W]."""
     _, u, (forces, u_dot), terms = forces_in_contact(system, layout_of(system), t, q, u, contacts, values)
     # Without the velocity of a surface, which is v - C u
@@ -109,11 +134,10 @@ def _contact_power(system, t, q, u, values, contacts):
 
 
 def _in_N(vector: Vector) -> Triple:
-    """Components in N, computed from the components of N's unit vectors, which store every frame in which they were
-    resolved.
-
-    Resolving each vector itself would pass all frames of its chain. For all vectors the work would be of order n^2.
-    """
+    # Components in N, computed from the components of N's unit vectors, which store every frame in which they were
+    # resolved.
+    #
+    # Resolving each vector itself would pass all frames of its chain. For all vectors the work would be of order n^2.
     N, frame = vector.frame.root, vector.frame
     return tuple(dot(axis.components_in(frame), vector.components) for axis in (N.x, N.y, N.z))  # type: ignore[return-value]
 
@@ -134,11 +158,10 @@ class _Places:
 
 
 def _momenta(motion: Motion, places: _Places) -> tuple[Triple, Triple]:
-    """Linear momentum, and angular momentum about the origin, in N.
-
-    Reflected inertias are omitted. With an `armature` of 0.2 kg m^2 on a joint of a free chain, H would appear to
-    change by half of its value, although it is conserved to 1e-10.
-    """
+    # Linear momentum, and angular momentum about the origin, in N.
+    #
+    # Reflected inertias are omitted. With an `armature` of 0.2 kg m^2 on a joint of a free chain, H would appear to
+    # change by half of its value, although it is conserved to 1e-10.
     p, H = ZERO3, ZERO3
     for body in motion.bodies:
         if isinstance(body, ReflectedInertia):
@@ -388,8 +411,8 @@ def _weights(s: np.ndarray, moments: np.ndarray, rates: int = 0) -> np.ndarray:
 
 
 def _condition_of_masses(M: np.ndarray) -> np.ndarray:
-    """Condition numbers (n_t,) of mass matrices (n_t, n, n), scaled to a unit diagonal. Without scaling, different
-    units (metres and radians of a satellite) would look badly conditioned."""
+    # Condition numbers (n_t,) of mass matrices (n_t, n, n), scaled to a unit diagonal. Without scaling, different
+    # units (metres and radians of a satellite) would look badly conditioned.
     diagonal = np.sqrt(np.diagonal(M, axis1=-2, axis2=-1))
     sizes = np.where(diagonal > 0, diagonal, 1.0)
     return np.linalg.cond(M / (sizes[:, :, None] * sizes[:, None, :]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -12,10 +12,10 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from .._scalarjit.compat import Tracer, evaluated, interpret, operation_of, programs_in, types_of
+from .._scalarjit.compat import ClosedJaxpr, Equation, Tracer, evaluated, interpret, operation_of, programs_in, types_of
 from .._scalarjit.nan import nan_if_not_zero
 from .._system.system import State, System
-from .inputs import CONTROLLER, INTERVAL_OF, InputState, Samples, called, count_until, is_samples, samples_of
+from .inputs import CONTROLLER, INTERVAL_OF, InputState, Samples, Signals, called, count_until, is_samples, samples_of
 
 
 class Discontinuities(NamedTuple):
@@ -51,12 +51,12 @@ def rounding(t: Array, duration: Array) -> Array:
 
 def discontinuities_of(
     system: System,
-    signals: Any,
+    signals: Signals,
     functions: Mapping[str, Any],
     origin: Array,
     state: State,
     fixed: bool,
-    rtol: Any = 0.0,
+    rtol: Array | float = 0.0,
     given: Array | None = None,
 ) -> Discontinuities | None:
     """The discontinuities of signals, and of the samples that functions call. None if there are none.
@@ -92,17 +92,16 @@ def discontinuities_of(
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _with_one_derivative(jumps: bool, times: Array) -> Array:
-    """Times, whose derivative is NaN where several signals are discontinuous and only some are differentiated.
-
-    One step ends there, and has one derivative with respect to its end. If two signals jump and one of them has the
-    delay 0, that was the derivative of both jumps or of none: -8 or 0 instead of 2 and -10. If no signal jumps, the
-    first derivatives are right, and the second ones are NaN.
-    """
+    # Times, whose derivative is NaN where several signals are discontinuous and only some are differentiated.
+    #
+    # One step ends there, and has one derivative with respect to its end. If two signals jump and one of them has the
+    # delay 0, that was the derivative of both jumps or of none: -8 or 0 instead of 2 and -10. If no signal jumps, the
+    # first derivatives are right, and the second ones are NaN.
     return times
 
 
 @_with_one_derivative.defjvp
-def _(jumps: bool, primals: Any, tangents: Any) -> Any:
+def _(jumps: bool, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> Any:
     (times,), (times_dot,) = primals, tangents
     mixed = _difference_of_coincident(times, times_dot)
     # In reverse mode this has to be linear in the tangent.
@@ -121,7 +120,7 @@ def _zero_without_derivative(times: Array) -> Array:
 
 
 @_zero_without_derivative.defjvp
-def _(primals: Any, tangents: Any) -> Any:
+def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> Any:
     (times,), (times_dot,) = primals, tangents
     return _zero_without_derivative(times), nan_if_not_zero(_difference_of_coincident(times, times_dot), [times])
 
@@ -129,12 +128,12 @@ def _(primals: Any, tangents: Any) -> Any:
 _MANY = 8192  # with fewer samples, steps end at each: searching for smooth blocks would take as long as these steps
 
 
-def all_end_steps(signals: Any) -> bool:
+def all_end_steps(signals: Signals) -> bool:
     """Whether steps with error control end at each sample of these signals."""
     return all(x.ts.shape[-1] <= _MANY or x.zero_order_hold for x in samples_of(signals))
 
 
-def _ends_of_steps(samples: list[Samples], rtol: Any) -> Array:
+def _ends_of_steps(samples: list[Samples], rtol: Array | float) -> Array:
     """The times at which steps must end, for samples with common times; infinity for the other times."""
     ts = samples[0].ts
     if ts.shape[0] <= _MANY or any(x.zero_order_hold for x in samples):
@@ -148,9 +147,9 @@ def _needed_times(ts: Array, values: Array, rtol: Array) -> Array:
     return jnp.where(jnp.any(needed, axis=0), ts, jnp.inf)
 
 
-def _all_times(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    """If the times or values of samples are differentiated, steps end at all samples. A step over several samples would
-    evaluate only those next to its stages, and the derivatives with respect to the others would be zero."""
+def _all_times(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    # If the times or values of samples are differentiated, steps end at all samples. A step over several samples would
+    # evaluate only those next to its stages, and the derivatives with respect to the others would be zero.
     (ts, *_), (ts_dot, values_dot, _) = primals, tangents
     is_zero = [isinstance(x, SymbolicZero) for x in (ts_dot, values_dot)]
     return _needed_times(*primals) if all(is_zero) else ts, jnp.zeros_like(ts) if is_zero[0] else ts_dot
@@ -209,7 +208,9 @@ def _needed_knots(ts: Float[Array, " n_t"], values: Float[Array, " n_t"], rtol: 
     return jnp.append(jax.lax.fori_loop(0, levels, without_inner, jnp.ones(n, bool)), True)
 
 
-def _called_samples(label: str, f: Any, system: System, t: Array, state: State, fixed: bool) -> list[tuple[Array, str]]:
+def _called_samples(
+    label: str, f: Callable[..., Any], system: System, t: Array, state: State, fixed: bool
+) -> list[tuple[Array, str]]:
     """The times and kinds of the samples that a function of (t, state) calls. For a call at t - delay, the times are
     later by the delay."""
 
@@ -257,11 +258,11 @@ class _Call(NamedTuple):
     kind: str
 
 
-def _trace_calls(program: Any, inputs: list[Any], calls: list[_Call]) -> list[Any]:
+def _trace_calls(program: ClosedJaxpr, inputs: list[Any], calls: list[_Call]) -> list[Any]:
     """The outputs of a traced program for its inputs. Each of them is a known number, a `_ShiftedTime` or `_VARYING`.
     The samples that the program calls are added to `calls`."""
 
-    def results(equation: Any, xs: list[Any]) -> Any:
+    def results(equation: Equation, xs: list[Any]) -> Any:
         operation = operation_of(equation)
         is_known = [x is not _VARYING and not isinstance(x, _ShiftedTime) for x in xs]
         ys: Any = [_VARYING] * operation.results

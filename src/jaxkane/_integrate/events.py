@@ -1,4 +1,4 @@
-"""Events: functions of a system that cross zero, and the search for the first crossing.
+"""Events: functions of a system that cross zero, and the search for the first crossing; how a simulation ended.
 
 An event ends the simulation, or changes the state (`jumps.py`).
 """
@@ -6,24 +6,90 @@ An event ends the simulation, or changes the state (`jumps.py`).
 from __future__ import annotations
 
 import dataclasses
+import enum
 import functools
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._kane.arguments import is_numeric
 from .._kane.contact.forces import NO_CONTACTS, ContactLayout, layout_of
+from .._kane.contact.impulses import Impact
 from .._kane.contact.laws import OPEN
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.system import NamedVector, State, System, call_with_states, unpacked
-from .status import REASONS
+
+
+class Status(enum.IntEnum):
+    """How a simulation ended. Codes from `EVENT` on are the system's events in alphabetical order."""
+
+    COMPLETED = 0
+    """The last time was reached."""
+    SINGULAR_SPEEDS = 1
+    """The independent speeds no longer determine the dependent ones: det C_dep crossed zero."""
+    STEP_TOO_SMALL = 2
+    """The step size fell below its minimum, e.g. because a value grows without bound."""
+    MAX_STEPS = 3
+    """The solver took `max_steps` steps before the last time."""
+    INVALID = 4
+    """A parameter or an initial value was not finite, a positive parameter was not positive, a body had an impossible
+    mass or inertia, or the coordinates violated a configuration constraint. Nothing was solved."""
+    INTERRUPTED = 5
+    """A sweep was interrupted before this member was computed."""
+    NO_SOLUTION = 6
+    """The equations have no finite solution at the initial state: a speed does not move any mass, angles are in gimbal
+    lock, or the constraints have no solution for the dependent speeds. `simulate` raises an exception instead."""
+    MAX_JUMPS = 7
+    """More than `max_jumps` jumps occurred before the last time."""
+    REPEATED_JUMP = 8
+    """A jump left its own event on zero and crossing again, so it would be repeated without end."""
+    IMPOSSIBLE_JUMP = 9
+    """The state after a jump is not finite, or it violates a configuration constraint."""
+    UNDETERMINED_CONTACT = 10
+    """The laws of contact and friction have no solution, e.g. for the rod of Painleve."""
+    INVALID_COEFFICIENT = 11
+    """The restitution of a contact left the range from 0 to 1, or a friction became negative or larger than the static
+    friction."""
+    EVENT = 12
+
+
+def reason(code: int, events: tuple[str, ...]) -> str:
+    """A status code in words; `events` are the names of a system's events."""
+    name = events[code - Status.EVENT] if code >= Status.EVENT else Status(code).name.lower()
+    return name.replace("_", " ")
+
+
+REASONS = frozenset(reason(code, ()) for code in Status if code < Status.EVENT)
+_ADVICE: dict[int, str] = {
+    Status.SINGULAR_SPEEDS: "Simulate jaxkane.with_multipliers(system), or choose other dependent speeds: "
+    "see jaxkane.best_dependent_speeds(system, t, q).",
+    Status.STEP_TOO_SMALL: "A value grows without bound or is discontinuous. Plot the last samples before `t_end`.",
+    Status.MAX_JUMPS: "Increase max_jumps. If jumps accumulate at one time, end the simulation there by another event.",
+    Status.IMPOSSIBLE_JUMP: "Check `then` of the event at `t_end`. New coordinates must satisfy the constraints.",
+    Status.UNDETERMINED_CONTACT: "Rigid contacts with this friction have no solution. Reduce the friction.",
+    Status.INVALID_COEFFICIENT: "Limit the coefficients of contacts and dry friction: 0 <= restitution <= 1 and "
+    "0 <= kinetic <= static friction.",
+    Status.REPEATED_JUMP: "Let `then` move the event function away from zero, or change the direction of its rate.",
+    Status.MAX_STEPS: "Increase max_steps (an input sample needs a step), or check for stiff or discontinuous loads.",
+}
+
+
+def advice(code: int, events: tuple[str, ...]) -> str:
+    """Advice for a simulation that ended early; empty if there is none."""
+    if reason(code, events).startswith("gimbal lock"):
+        return "The angles are in gimbal lock. Use Euler parameters or another sequence of angles for the orientation."
+    return _ADVICE.get(code, "")
+
+
+Then: TypeAlias = Mapping[str, Component] | Impact | Callable[..., Any] | Sequence[Any] | None
+"""What an event does to the state, see `falling`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,12 +115,12 @@ class Crossing:
                 raise TypeError(f'rising, falling: `{name}` must be a number, such as q["angle"]; got {x!r}.')
 
 
-def rising(quantity: Component, *, then: Any = None, when: Component | None = None) -> Crossing:
+def rising(quantity: Component, *, then: Then = None, when: Component | None = None) -> Crossing:
     """For `System.events`: an event where the quantity crosses zero upwards. See `falling`."""
     return Crossing(quantity, 1, _stages(then), when)
 
 
-def falling(quantity: Component, *, then: Any = None, when: Component | None = None) -> Crossing:
+def falling(quantity: Component, *, then: Then = None, when: Component | None = None) -> Crossing:
     """For `System.events`: an event where the quantity crosses zero downwards.
 
         def events(self, t, q, u):
@@ -79,7 +145,7 @@ def falling(quantity: Component, *, then: Any = None, when: Component | None = N
     return Crossing(quantity, -1, _stages(then), when)
 
 
-def _stages(then: Any) -> tuple[Any, ...]:
+def _stages(then: Then) -> tuple[Any, ...]:
     if isinstance(then, (tuple, list)) and not then:
         raise ValueError("`then` is an empty tuple. Pass at least one stage, or omit `then` to end the simulation.")
     return tuple(then) if isinstance(then, (tuple, list)) else () if then is None else (then,)
@@ -110,7 +176,7 @@ def first_crossing(
 
 
 def _first_crossing(g0: Array, slope0: Array, g1: Array, slope1: Array, direction: Array, resolution: Array) -> Array:
-    """The first crossing of one cubic. Arguments are scalars, so that everything is one function."""
+    # The first crossing of one cubic. Arguments are scalars, so that everything is one function.
     a, b, c = 2 * (g0 - g1) + slope0 + slope1, 3 * (g1 - g0) - 2 * slope0 - slope1, slope0
 
     def p(x: Array) -> Array:
@@ -252,7 +318,14 @@ def own_events_of(system: System, t: Array, state: State) -> Events:
     )
 
 
-def crossings(system: System, t: Component, q: Any, u_all: Any, x: Any, dtype: DTypeLike) -> dict[str, Crossing]:
+def crossings(
+    system: System,
+    t: Component,
+    q: Sequence[Component],
+    u_all: Sequence[Component],
+    x: Sequence[Component],
+    dtype: DTypeLike,
+) -> dict[str, Crossing]:
     """The events by name, in alphabetical order, with floats as values.
 
     **Arguments:**
@@ -280,7 +353,7 @@ def crossings(system: System, t: Component, q: Any, u_all: Any, x: Any, dtype: D
     return found
 
 
-def _as_float(name: str, event: Any, dtype: DTypeLike, is_condition: bool = False) -> Any:
+def _as_float(name: str, event: Component, dtype: DTypeLike, is_condition: bool = False) -> Any:
     value, part = jnp.asarray(event), ": `when`" if is_condition else ""
     if value.dtype == bool:
         advice = (
@@ -386,7 +459,7 @@ class EventValues(NamedTuple):
         values = jnp.where(self.values == 0, side * jnp.finfo(side.dtype).tiny, self.values)
         return self._replace(values=jnp.where(crosses, side * jnp.abs(values), values))
 
-    def passed(self, events: Events, near: Any) -> EventValues:
+    def passed(self, events: Events, near: Sequence[Array] | Array) -> EventValues:
         """The same, with the functions that are `near` zero (n,) set to their side after the crossing, where their
         condition is not met. Otherwise the next step would find the same crossing again, and hide later ones."""
         values = list(self.values)
@@ -430,14 +503,16 @@ def event_values(system: System, t: Component, y: Array, y_dot: Array | None) ->
         u_all_dot = (*dot.u, *equations.dependent_accelerations(tuple(dot.u)))
         x_dot = () if dot.x is None else tuple(dot.x)
 
-    def read(t: Component, q: Any, u_all: Any, x: Any) -> tuple[Array, Array]:
+    def read(
+        t: Component, q: Sequence[Component], u_all: Sequence[Component], x: Sequence[Component]
+    ) -> tuple[Array, Array]:
         events = crossings(system, t, q, u_all, x, like.dtype).values()
         conditions = [event.when for event in events if event.when is not None]
         return as_vector([event.value for event in events], like), as_vector(conditions, like)
 
     point, direction = (equations.t, equations.q, equations.u_all, x), (1.0, equations.q_dot, u_all_dot, x_dot)
 
-    def as_like(xs: Any) -> Any:
+    def as_like(xs: PyTree) -> Any:
         return jax.tree.map(lambda x: jnp.asarray(x, like.dtype), xs)
 
     (values, conditions), (rates, _) = jax.jvp(read, as_like(point), as_like(direction))
@@ -521,7 +596,16 @@ class EventPoint(NamedTuple):
 
 
 @ScalarFunction.compile_cheaply
-def next_point(system: System, origin, point: EventPoint, y_dot, read_rates, reach, which, happened) -> EventPoint:
+def next_point(
+    system: System,
+    origin: Array,
+    point: EventPoint,
+    y_dot: Float[Array, " n"],
+    read_rates: Float[Array, " n"] | None,
+    reach: Array,
+    which: Array,
+    happened: Array,
+) -> EventPoint:
     """The point after a step of Newton's method towards the event `which`, a float; the same if none `happened`.
 
         t - g / g_dot,   y - (g / g_dot) y_dot

@@ -5,26 +5,35 @@ from __future__ import annotations
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._common.lookup import by_name, refuse_unknown
 from .._kane.arguments import checked_inputs, is_numeric
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import Tracer, on_device
-from .._scalarjit.components import Component, Inputs
+from .._scalarjit.components import Component, Inputs, Numbers
 from .._scalarjit.nan import nan_derivative_where
 from .._system.parameters import concrete_numbers, module_text
 from .._system.system import State, System, explain_value_of_traced, names_of
 
+Coordinates: TypeAlias = Float[Array, " n_q"]
+"""Coordinates at one time."""
 
-def real_array(value: Any, label: str, dtype: DTypeLike | None = None) -> Array:
+Speeds: TypeAlias = Float[Array, " n_u"]
+"""Independent speeds at one time, or their rates."""
+
+Signals: TypeAlias = dict[str, Any] | Callable[..., Any]
+"""Inputs as from `as_signals`: numbers, `Samples` and functions of (t, state) by name; or a function of all."""
+
+
+def real_array(value: Numbers, label: str, dtype: DTypeLike | None = None) -> Array:
     """Real numbers as a float array.
 
     **Raises:** `TypeError` for complex numbers, booleans, text and other types; `ValueError` for a masked array,
@@ -60,7 +69,7 @@ class Samples(eqx.Module):
     values: Float[Array, " n_t"]
     zero_order_hold: bool = eqx.field(static=True)
 
-    def __init__(self, ts: Any, values: Any, zero_order_hold: bool = False):
+    def __init__(self, ts: Numbers, values: Numbers, zero_order_hold: bool = False):
         if not isinstance(zero_order_hold, bool):
             raise TypeError(f"Samples: `zero_order_hold` must be True or False, got {zero_order_hold!r}.")
         self.zero_order_hold = zero_order_hold
@@ -81,7 +90,7 @@ class Samples(eqx.Module):
         size = f"{values.min():.6g} to {values.max():.6g}"
         return f"Samples({len(ts)} values from {size}, at {ts[0]:.6g} to {ts[-1]:.6g} s, {kind})"
 
-    def __call__(self, t: Component, state: Any = None) -> Component:
+    def __call__(self, t: Component, state: State | InputState | None = None) -> Component:
         return self.piece(t, t)
 
     def piece(self, t: Component, at: Component) -> Component:
@@ -118,7 +127,7 @@ def _count(ts: Array, t: Array) -> Array:
     if not _is_long(ts, t):
         return jnp.searchsorted(ts, t, side="right")
 
-    def halved(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halved(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = (low + high) // 2
         after = t < _entries(ts, middle)
@@ -136,11 +145,10 @@ def _is_long(x: Array, i: Array) -> bool:
 
 
 def _entries(x: Array, i: Array) -> Array:
-    """x[i].
-
-    A few entries of a long array are read one by one. XLA takes a gather from 512 kB for large work, although it reads
-    four numbers. Starting two threads for it in every step made a fit of 1e5 samples four times slower.
-    """
+    # x[i].
+    #
+    # A few entries of a long array are read one by one. XLA takes a gather from 512 kB for large work, although it
+    # reads four numbers. Starting two threads for it in every step made a fit of 1e5 samples four times slower.
     return jnp.stack([x[i[k]] for k in range(i.size)]) if _is_long(x, i) else x[i]
 
 
@@ -151,14 +159,14 @@ def count_until(ts: Array, t: Array) -> Array:
 
 
 @count_until.def_vmap
-def _(size: int, is_batched: Any, ts: Array, t: Array) -> tuple[Array, bool]:
+def _(size: int, is_batched: Sequence[bool], ts: Array, t: Array) -> tuple[Array, bool]:
     if is_batched[0]:
         return jax.vmap(_count, (0, 0 if is_batched[1] else None))(ts, t), True
     return count_until(ts, t), True
 
 
 def _interval(kind: str) -> Any:
-    """The index of the interval of samples that contains a time. `_trace_calls` identifies this function by name."""
+    # The index of the interval of samples that contains a time. `_trace_calls` identifies this function by name.
 
     def index(ts: Array, t: Component) -> Array:
         ts, at = jax.lax.stop_gradient((ts, jnp.asarray(t, ts.dtype)))
@@ -191,7 +199,7 @@ class InputState(eqx.Module):
 
 def inputs_at(
     system: System,
-    signals: Any,
+    signals: Signals,
     t: Component,
     state: State,
     *,
@@ -313,7 +321,7 @@ class RateArguments(eqx.Module):
 CONTROLLER = "The function of the inputs"
 
 
-def called(label: str, f: Any, t: Component, state: InputState) -> Any:
+def called(label: str, f: Callable[..., Any], t: Component, state: InputState) -> Any:
     with explain_value_of_traced(label):
         return f(t, state)
 
@@ -336,7 +344,7 @@ def as_signals(inputs: Inputs, names: Sequence[str], ts: Array, system_name: str
     return {name: _as_signal(f"The input {name!r}", value, ts) for name, value in inputs.items()}
 
 
-def _as_signal(label: str, value: Any, ts: Array) -> Any:
+def _as_signal(label: str, value: Numbers | Callable[..., Any], ts: Array) -> Any:
     if is_samples(value):
         if value.ts.ndim + value.values.ndim > 2:
             raise ValueError(f"{label} is a batch of samples: use jaxkane.sweep or jax.vmap.")
@@ -361,15 +369,15 @@ def _as_signal(label: str, value: Any, ts: Array) -> Any:
     return Samples(ts, array) if array.ndim else array
 
 
-def samples_of(signals: Any) -> list[Samples]:
+def samples_of(signals: PyTree) -> list[Samples]:
     return [x for x in jax.tree.leaves(signals, is_leaf=is_samples) if is_samples(x)]
 
 
-def is_samples(x: Any) -> bool:
+def is_samples(x: object) -> bool:
     return isinstance(x, Samples)
 
 
-def map_samples(f: Callable[[Any], Any], signals: Any) -> Any:
+def map_samples(f: Callable[[Any], Any], signals: PyTree) -> Any:
     """The signals, with `f` applied to those that are samples."""
     return jax.tree.map(lambda x: f(x) if is_samples(x) else x, signals, is_leaf=is_samples)
 
@@ -386,7 +394,7 @@ class SharedTimes(eqx.Module):
     signals: Any
 
 
-def share_times(signals: Any) -> SharedTimes:
+def share_times(signals: Signals) -> SharedTimes:
     """Replace times by indices; call `restore_times` at the beginning of the program."""
     times: dict[int, Array] = {}
 
@@ -398,7 +406,7 @@ def share_times(signals: Any) -> SharedTimes:
     return SharedTimes(tuple(times.values()), signals)
 
 
-def restore_times(signals: Any) -> Any:
+def restore_times(signals: Signals | SharedTimes) -> Any:
     """Signals with their times; shared times are the same array again."""
     if not isinstance(signals, SharedTimes):
         return signals
@@ -406,7 +414,7 @@ def restore_times(signals: Any) -> Any:
     return map_samples(lambda x: eqx.tree_at(lambda s: s.ts, x, signals.times[x.ts]), signals.signals)
 
 
-def for_fixed_steps(signals: Any) -> Any:
+def for_fixed_steps(signals: Signals) -> Any:
     """Signals for fixed steps, whose derivative with respect to the times of a zero-order hold is NaN.
 
     A jump inside a step acts from the next stage on. The trajectory is piecewise constant in the time of the jump, and
@@ -422,7 +430,7 @@ def for_fixed_steps(signals: Any) -> Any:
     return map_samples(checked, signals)
 
 
-def since(origin: Any, signals: Any, dtype: DTypeLike) -> Any:
+def since(origin: Numbers, signals: Signals, dtype: DTypeLike) -> Any:
     """The same signals with times since `origin` [s]. Samples that share their times still do."""
     times: dict[int, Array] = {}
 
@@ -435,7 +443,7 @@ def since(origin: Any, signals: Any, dtype: DTypeLike) -> Any:
     return map_samples(relative, signals)
 
 
-def times_since(origin: Any, ts: Any, dtype: DTypeLike) -> Array:
+def times_since(origin: Numbers, ts: Numbers, dtype: DTypeLike) -> Array:
     """Times since `origin` [s], of any shape.
 
     Concrete numbers are subtracted in float64, because float32 resolves a POSIX time only to 128 s.
@@ -446,7 +454,7 @@ def times_since(origin: Any, ts: Any, dtype: DTypeLike) -> Array:
     return on_device(np.asarray(ts, np.float64) - np.float64(origin), dtype)
 
 
-def time_array(ts: Any, label: str, dtype: DTypeLike | None = None) -> Any:
+def time_array(ts: Numbers, label: str, dtype: DTypeLike | None = None) -> Any:
     """Times as an array of a dtype; as a float64 array of NumPy if this dtype cannot resolve neighbouring times."""
     array = real_array(ts, label, dtype)
     if isinstance(ts, jax.Array) or array.size < 2:  # also traced times
@@ -461,7 +469,7 @@ def is_coarse(ts: np.ndarray, dtype: DTypeLike) -> bool:
     return bool(jnp.finfo(dtype).eps * np.max(np.abs(ts)) > 1e-3 * shortest)
 
 
-def inputs_are_valid(signals: Any) -> Array:
+def inputs_are_valid(signals: Signals) -> Array:
     """Whether all samples and numbers are finite, and the samples' times increase. Checks outside cannot see traced
     values."""
     # One reduction; the barrier keeps XLA from splitting it. Increasing times are finite if the first and the last are.
@@ -473,11 +481,11 @@ def inputs_are_valid(signals: Any) -> Array:
     return jnp.all(jax.lax.optimization_barrier(jnp.concatenate(conditions))) if conditions else jnp.array(True)
 
 
-def mask_invalid_inputs(signals: Any, valid: Array) -> Any:
+def mask_invalid_inputs(signals: Signals, valid: Array) -> Any:
     """The signals if they are valid, else finite signals of the same shapes, which do not make derivatives NaN."""
     times: dict[int, Array] = {}  # signals that share their times must continue to share them: see `discontinuities_of`
 
-    def masked(x: Any) -> Any:
+    def masked(x: Numbers) -> Any:
         if is_samples(x):
             indices = jnp.arange(x.ts.shape[0], dtype=x.ts.dtype)
             ts = times.setdefault(id(x.ts), jnp.where(valid, x.ts, indices))
@@ -489,7 +497,7 @@ def mask_invalid_inputs(signals: Any, valid: Array) -> Any:
     return signals | {name: masked(x) for name, x in _without_functions(signals).items()}
 
 
-def _without_functions(signals: Any) -> dict[str, Any]:
-    """Samples and numbers. Functions are omitted, because their numbers may be infinite on purpose, e.g. a controller's
-    limits."""
+def _without_functions(signals: Signals) -> dict[str, Any]:
+    # Samples and numbers. Functions are omitted, because their numbers may be infinite on purpose, e.g. a controller's
+    # limits.
     return {} if callable(signals) else {k: x for k, x in signals.items() if is_samples(x) or not callable(x)}

@@ -12,7 +12,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float, PyTree
 
 from .._kane.api import _kinetic_energy
 from .._kane.checks import bodies_are_possible
@@ -30,7 +30,7 @@ from .._kane.contact.states_after_jump import (
 from .._kane.kanes_method import KaneEquations
 from .._kane.right_hand_side import outputs_at, outputs_in_contact, rates_are_native, values_of, vector_field
 from .._scalarjit.cache_key import captured_tracers, captures_any, jit
-from .._scalarjit.components import as_vector
+from .._scalarjit.components import Component, Numbers, as_vector
 from .._scalarjit.jaxpr import LARGEST_SUM
 from .._scalarjit.nan import (
     all_finite,
@@ -45,12 +45,13 @@ from .._scalarjit.scalar_function import Packed, ScalarFunction, tree_of
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
 from .discontinuities import Discontinuities, all_end_steps, discontinuities_of, rounding
-from .events import EventPoint, Events, EventValues, event_values, events_of, moved_to_event, next_point
+from .events import EventPoint, Events, EventValues, Status, event_values, events_of, moved_to_event, next_point
 from .inputs import (
     InputState,
     RateArguments,
     Samples,
     SharedTimes,
+    Signals,
     for_fixed_steps,
     inputs_are_valid,
     inputs_at,
@@ -61,9 +62,15 @@ from .inputs import (
 )
 from .jumps import JumpTable, impulses_at, stages_of, state_after, without_derivative_at
 from .loop import Jump, Steps, diffrax_loop, fast_loop, is_supported
-from .settings import Settings, with_scan_kind, with_tolerances
-from .solvers import UnrolledERK, is_explicit, last_stage_is_spare, with_stepwise_inputs
-from .status import Status
+from .settings import (
+    Settings,
+    UnrolledERK,
+    is_explicit,
+    last_stage_is_spare,
+    with_scan_kind,
+    with_stepwise_inputs,
+    with_tolerances,
+)
 from .step_control import FEWEST_STEPS, SHARE, StepSizeController, evenly_spread, first_step
 from .tangents import Probing, as_integers, direction_of, generic, with_own_tangents
 from .trajectory import InputDiscontinuities, Trajectory
@@ -75,10 +82,10 @@ def solve(
     state: State,
     origin: Array,
     taus: Array,
-    signals: Any,
+    signals: Signals | SharedTimes,
     settings: Settings,
     discontinuities: Array | None = None,
-    closures: Any = (),
+    closures: PyTree = (),
 ) -> Trajectory:
     """`simulate` without its checks: one compiled program.
 
@@ -100,7 +107,7 @@ def solve(
     if closures:
         signals = _with_captured_numbers(system, state, origin, signals)
 
-    def run(arguments: Any, moved: Any, reverse: bool) -> Trajectory:
+    def run(arguments: tuple[Any, ...], moved: PyTree, reverse: bool) -> Trajectory:
         given, (settings, closures) = arguments
         adjoint = diffrax.RecursiveCheckpointAdjoint() if reverse else diffrax.ForwardMode()
         settings = dataclasses.replace(settings, adjoint=adjoint, progress=settings.progress and moved is None)
@@ -113,13 +120,13 @@ def solve(
     return dataclasses.replace(with_own_tangents(run, arguments, (settings, closures)), adjoint=how)
 
 
-def _with_captured_numbers(system: System, state: State, t: Array, signals: Any) -> Any:
+def _with_captured_numbers(system: System, state: State, t: Array, signals: Signals | SharedTimes) -> Any:
     """The signals. Traced numbers in the closure of an input function become numbers of its signal."""
     if isinstance(signals, SharedTimes):
         return dataclasses.replace(signals, signals=_with_captured_numbers(system, state, t, signals.signals))
     context = _with_arrays(InputState(state.q, state.u, state.x, t, system))
 
-    def converted(f: Any) -> Any:
+    def converted(f: Component | Callable[..., Any]) -> Any:
         if not callable(f) or is_samples(f):
             return f
         return _Converted(eqx.filter_closure_convert(f, t, context))
@@ -128,8 +135,7 @@ def _with_captured_numbers(system: System, state: State, t: Array, signals: Any)
 
 
 class _Converted(eqx.Module):
-    """An input function whose captured numbers are leaves. Its arguments must have the types of its tracing."""
-
+    # An input function whose captured numbers are leaves. Its arguments must have the types of its tracing.
     f: Any
 
     def __call__(self, t: Array, state: InputState) -> Any:
@@ -137,7 +143,7 @@ class _Converted(eqx.Module):
 
 
 def _with_arrays(state: InputState) -> InputState:
-    """The state, with arrays instead of Python floats in its system. A system that is not traced may contain both."""
+    # The state, with arrays instead of Python floats in its system. A system that is not traced may contain both.
     as_array = lambda x: jnp.asarray(x, state.q.dtype) if isinstance(x, float) else x  # noqa: E731
     return dataclasses.replace(state, system=jax.tree.map(as_array, state.system))
 
@@ -147,16 +153,16 @@ def _solved(
     state: State,
     origin: Array,
     taus: Array,
-    signals: Any,
+    shared_signals: Signals | SharedTimes,
     discontinuities: Array | None,
-    closures: Any,
+    closures: PyTree,
     settings: Settings,
-    moved: Any = None,
+    moved: PyTree = None,
 ) -> Trajectory:
     """`solve` with an adjoint of diffrax. `moved`: the arguments with True for each number that is differentiated, if
     the errors of tangents are controlled."""
     # Here, not before: as arguments of an operation, shared times would no longer be the same array.
-    signals, fixed = restore_times(signals), settings.step is not None
+    signals, fixed = restore_times(shared_signals), settings.step is not None
     signals = for_fixed_steps(signals) if fixed else signals
     follows_from = parts_of((system, state, origin, taus, signals, discontinuities, closures))
     others_are_valid = inputs_are_valid(signals)
@@ -273,7 +279,7 @@ class Problem(NamedTuple):
         state = unpacked(self.system, self.start)
         return has_configuration_constraints(self.system, self.args.origin, state.q)
 
-    def rates(self, forward: bool | None = None) -> Callable[..., Any]:
+    def rates(self, forward: bool | None = None) -> Callable[..., Array]:
         settings = self.settings
         forward = settings.is_forward if forward is None else forward
         return _rates(settings.stabilize if self.constrained else 0.0, forward)
@@ -287,8 +293,9 @@ class Problem(NamedTuple):
         trial_rates = functools.partial(derivative_free_where_not_finite, rates)
         solver = _solver_for(settings, self.args.system, self.args.origin, self.start, self.args.signals)
         how = rates if settings.is_forward else trial_rates, solver, controller, self.start, self.args, self.taus
-        limits = settings.adjoint, settings.max_steps, self.valid
-        if is_supported(solver, controller, settings.adjoint, settings.progress):
+        adjoint: Any = settings.adjoint  # not None: `solve` replaces None before it comes here
+        limits = adjoint, settings.max_steps, self.valid
+        if is_supported(solver, controller, adjoint, settings.progress):
             jumps = (self.jump, settings.max_jumps) if self.events.continue_ else None
             return fast_loop(*how, *limits, jumps, errors=self.errors_of_tangent(solver, controller, jumps))
         if self.events.continue_:
@@ -299,7 +306,12 @@ class Problem(NamedTuple):
             )
         return diffrax_loop(*how, *limits, settings.progress)
 
-    def errors_of_tangent(self, solver: Any, controller: StepSizeController, jumps: Any) -> Array | None:
+    def errors_of_tangent(
+        self,
+        solver: diffrax.AbstractSolver,
+        controller: StepSizeController,
+        jumps: tuple[Callable[..., Jump], int] | None,
+    ) -> Array | None:
         """The errors of a tangent in all steps, None if they are not controlled."""
         if self.args_dot is None:
             return None
@@ -337,7 +349,7 @@ class Problem(NamedTuple):
             inner=settings.controller,
         )
 
-    def located(self, end: End, y_dot: Any, reach: Array) -> End:
+    def located(self, end: End, y_dot: Float[Array, " n"] | None, reach: Array) -> End:
         """The same, at the time of the event if an event ended the simulation."""
         # Members without an event are evaluated at the start, where all rates are finite.
         t, y = jnp.where(end.by_event, constant(end.t), 0.0), jnp.where(end.by_event, end.y, self.start)
@@ -345,7 +357,9 @@ class Problem(NamedTuple):
         t, y = (jnp.where(end.by_event, new, old) for new, old in ((point.t, end.t), (point.y, end.y)))
         return end._replace(t=t, y=y, smooth=end.smooth | (end.by_event & point.smooth))
 
-    def event_point(self, t: Array, y: Array, y_dot: Any, event: Array, reach: Array, happened: Array) -> EventPoint:
+    def event_point(
+        self, t: Array, y: Array, y_dot: Float[Array, " n"] | None, event: Array, reach: Array, happened: Array
+    ) -> EventPoint:
         """The time and the state at an event, from a time and a state near it.
 
         A step ends so near to the event that the first step of Newton's method is exact. The second step has the
@@ -472,11 +486,11 @@ def _end(
     return End(status, t, jnp.where(valid, y, start), completed, by_event)
 
 
-def _is_small(x: Any) -> bool:
+def _is_small(x: Numbers) -> bool:
     return eqx.is_inexact_array(x) and 0 < x.size <= LARGEST_SUM
 
 
-def is_valid(system: System, y: Array, t: Array, signals: Any) -> Array:
+def is_valid(system: System, y: Array, t: Array, signals: Signals) -> Array:
     """Whether a simulation can start at `t`, with a packed state."""
     system, y, t = constant((system, y, t))
     return initial_check(system, y, t, inputs_are_valid(signals))[0]
@@ -527,7 +541,13 @@ def _harmless(system: System, y: Array, valid: Array, is_chosen: Callable[[Any],
 
 
 def one_step(
-    system: System, y: Array, t0: Array, t1: Array, signals: Any, settings: Settings, disturbance: Any = None
+    system: System,
+    y: Array,
+    t0: Array,
+    t1: Array,
+    signals: Signals,
+    settings: Settings,
+    disturbance: Callable[..., Any] | None = None,
 ) -> Array:
     """The packed state after one step of the solver from `t0` to `t1`, without checks, events and outputs.
 
@@ -543,7 +563,7 @@ def one_step(
     return jnp.where(result == diffrax.RESULTS.successful, y1, jnp.nan)
 
 
-def _solver_for(settings: Settings, system: Any, t: Array, y: Array, signals: Any) -> Any:
+def _solver_for(settings: Settings, system: Any, t: Array, y: Array, signals: Signals) -> Any:
     solver: Any = settings.solver
     if is_explicit(solver):
         tree = tree_of(system)
@@ -552,7 +572,7 @@ def _solver_for(settings: Settings, system: Any, t: Array, y: Array, signals: An
     return with_stepwise_inputs(with_tolerances(solver, settings.rtol, settings.atol))
 
 
-def ends_between(system: System, t0: Array, y0: Array, t1: Array, y1: Array, signals: Any) -> Array:
+def ends_between(system: System, t0: Array, y0: Array, t1: Array, y1: Array, signals: Signals) -> Array:
     """The status if an event or singular speeds end a simulation between two packed states, one step apart."""
     t0, y0, t1, y1 = jax.lax.stop_gradient((t0, y0, t1, y1))
     status, events = jnp.int32(Status.COMPLETED), events_of(system, t0, unpacked(system, y0))
@@ -590,7 +610,7 @@ def refuse_captured(system: System) -> None:
         )
 
 
-def _rates(stabilize: float, forward: bool = False) -> Callable[..., Any]:
+def _rates(stabilize: float, forward: bool = False) -> Callable[..., Array]:
     """(t, y, args) -> y_dot. `stabilize` [1/s]: decay rate of constraint residuals; `forward`: see `vector_field`."""
 
     def rates(t: Array, y: Array, args: RateArguments) -> Array:

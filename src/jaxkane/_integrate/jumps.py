@@ -79,7 +79,7 @@ class JumpTable(eqx.Module):
 
 
 @ScalarFunction
-def state_after(system: System, t: Component, y: Array, event: Array, which: Any) -> Array:
+def state_after(system: System, t: Component, y: Array, event: Array, which: StagesOf) -> Array:
     """The packed state after the jump of an event, from the state before it.
 
     **Arguments:**
@@ -95,7 +95,7 @@ def state_after(system: System, t: Component, y: Array, event: Array, which: Any
 
 
 @ScalarFunction
-def impulses_at(system: System, t: Component, y: Array, event: Array, which: Any) -> Array:
+def impulses_at(system: System, t: Component, y: Array, event: Array, which: StagesOf) -> Array:
     """The impulses (r,) of the first impact among the stages of an event. Arguments as `state_after`."""
     rows = {i: after_stages(system, t, y, i, which)[1] for i in range(len(which.names)) if which.stages[i]}
     width = max(len(row) for row in rows.values())
@@ -106,7 +106,7 @@ def impulses_at(system: System, t: Component, y: Array, event: Array, which: Any
     return impulses
 
 
-def after_stages(system: System, t: Component, y: Array, event: int, which: Any) -> tuple[Array, Sequence[Array]]:
+def after_stages(system: System, t: Component, y: Array, event: int, which: StagesOf) -> tuple[Array, Sequence[Array]]:
     """The packed state after all stages of an event, and the impulses of its first impact."""
     impulses: Sequence[Array] = ()
     for stage in range(which.stages[event]):
@@ -161,8 +161,7 @@ def _after_stage(system: System, t: Component, y: Array, name: str, stage: int) 
     x = () if state.x is None else tuple(state.x)
     kane = KaneEquations(system, t, state.q, state.u)
 
-    def then_at(t: Component, q: Any, u_all: Any) -> Any:
-        """The stage, evaluated at a state."""
+    def then_at(t: Component, q: Sequence[Component], u_all: Sequence[Component]) -> Any:
         then = crossings(system, t, q, u_all, x, y.dtype)[name].stages[stage]
         if callable(then):
             u_names = (*system.speeds, *system.dependent_speeds)
@@ -195,11 +194,10 @@ def _after_stage(system: System, t: Component, y: Array, name: str, stage: int) 
 
 
 def _onto_constraints(system: System, t: Component, y: Array, names: Sequence[str]) -> Array:
-    """For a system with multipliers, the state with speeds that satisfy its constraints; NaN if no such speeds exist.
-
-    Only speeds in `names` change. If the system without multipliers has dependent speeds, only these change. The change
-    has the smallest kinetic energy.
-    """
+    # For a system with multipliers, the state with speeds that satisfy its constraints; NaN if no such speeds exist.
+    #
+    # Only speeds in `names` change. If the system without multipliers has dependent speeds, only these change. The
+    # change has the smallest kinetic energy.
     state, n_q = unpacked(system, y), len(system.coordinates)
     kane = KaneEquations(system, t, state.q, state.u)
     permanent = Permanent.of(kane)
@@ -227,7 +225,7 @@ def without_derivative_at(near: Array, values: Array, times: Array) -> Array:
 
 
 @without_derivative_at.defjvp
-def _(primals: Any, tangents: Any) -> Any:
+def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> Any:
     (near, values, times), (_, values_dot, times_dot) = primals, tangents
     undefined = jnp.broadcast_to(nan_if_not_zero(times_dot, [times])[None], near.shape)
     extra = jnp.sum(jnp.where(near, undefined, jnp.zeros_like(undefined)), axis=1)

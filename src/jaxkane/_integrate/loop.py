@@ -13,13 +13,13 @@ import diffrax
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float, PyTree
 
 from .._scalarjit.nan import constant
 from .discontinuities import rounding
-from .settings import with_scan_kind
-from .solvers import rates_at_ends
-from .status import Status
+from .events import Status
+from .inputs import RateArguments
+from .settings import rates_at_ends, with_scan_kind
 from .step_control import ControllerState, StepSizeController
 from .tangents import Probe, Probing, read_errors
 
@@ -107,7 +107,9 @@ class Carry(NamedTuple):
     probe: Probe | None
 
 
-def is_supported(solver: Any, controller: StepSizeController, adjoint: Any, progress: bool) -> bool:
+def is_supported(
+    solver: diffrax.AbstractSolver, controller: StepSizeController, adjoint: diffrax.AbstractAdjoint, progress: bool
+) -> bool:
     return type(adjoint) in _KINDS and solver.term_structure is diffrax.AbstractTerm and not (
         progress or controller.inner
     )  # fmt: skip
@@ -118,9 +120,9 @@ def fast_loop(
     solver: Any,
     controller: StepSizeController,
     y0: Array,
-    args: Any,
+    args: RateArguments,
     ts: Array,
-    adjoint: Any,
+    adjoint: diffrax.AbstractAdjoint,
     max_steps: int | None,
     may_begin: Array,
     jumps: tuple[Callable[[Array, Array, Array, Array], Jump], int] | None,
@@ -156,7 +158,7 @@ def fast_loop(
     )  # fmt: skip
     n_events = len(controller.events.names)
 
-    def motion_of(y: Any) -> Any:
+    def motion_of(y: Float[Array, "*two n"]) -> Any:
         return y if probing is None else y[..., 0, :]
 
     def step(c: Carry) -> Carry:
@@ -174,7 +176,7 @@ def fast_loop(
             c.controller_state, error_of_tangent,
         )  # fmt: skip
 
-        def chosen(new: Any, old: Any) -> Any:
+        def chosen(new: PyTree, old: PyTree) -> Any:
             return jax.tree.map(functools.partial(jnp.where, keep), new, old)
 
         k: Any = constant(motion_of(dense["k"])) if needs_rates else None
@@ -237,7 +239,14 @@ def fast_loop(
             steps=steps, motion=motion, count=count, probe=probe,
         )  # fmt: skip
 
-    def loop(condition: Any, body: Any, carry: Any, most: int | None, checkpoints: int | None, buffers: Any) -> Any:
+    def loop(
+        condition: Callable[..., Array],
+        body: Callable[..., PyTree],
+        carry: PyTree,
+        most: int | None,
+        checkpoints: int | None,
+        buffers: Callable[..., PyTree],
+    ) -> Any:
         # The loop of diffrax counts its steps if the derivative requires it.
         more: dict[str, Any] = {} if kind == "lax" else {"max_steps": most}
         more |= {"checkpoints": checkpoints} if kind == "checkpointed" else {}
@@ -260,12 +269,12 @@ def fast_loop(
 
 def diffrax_loop(
     rates: Callable[..., Array],
-    solver: Any,
+    solver: diffrax.AbstractSolver,
     controller: StepSizeController,
     y0: Array,
-    args: Any,
+    args: RateArguments,
     ts: Array,
-    adjoint: Any,
+    adjoint: diffrax.AbstractAdjoint,
     max_steps: int | None,
     may_begin: Array,
     progress: bool,

@@ -1,11 +1,13 @@
-"""The options of `simulate`, and their checks."""
+"""The options of `simulate` and their checks; solvers with unrolled stages and one-sided look-up of inputs."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+import operator
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -14,8 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.typing import DTypeLike
+from jaxtyping import Array, PyTree
 
 from .._scalarjit.compat import Tracer
+from .._scalarjit.components import Bool, Component
+from .inputs import RateArguments
 
 ADJOINTS = "auto", "reverse", "forward", "both"
 """All four mean the same, because every simulation supports both modes. The last three are from earlier versions."""
@@ -153,7 +158,7 @@ def settings_for(
     )
 
 
-def with_tolerances(solver: Any, rtol: Any, atol: Any) -> Any:
+def with_tolerances(solver: diffrax.AbstractSolver, rtol: Array | float, atol: Array | float) -> Any:
     """An implicit solver whose equations are solved with the tolerances of the steps. Other solvers do not change."""
 
     def changes(method: Any) -> dict[str, Any]:
@@ -162,14 +167,13 @@ def with_tolerances(solver: Any, rtol: Any, atol: Any) -> Any:
     return _changed(solver, lambda method: changes(method) if _takes_tolerances(method) else {})
 
 
-def with_scan_kind(solver: Any, kind: str) -> Any:
+def with_scan_kind(solver: diffrax.AbstractSolver, kind: str) -> Any:
     """A solver whose loop over its stages has derivatives in forward mode. A solver without such a loop does not
     change."""
     return _changed(solver, lambda method: {"scan_kind": kind} if getattr(method, "scan_kind", kind) is None else {})
 
 
 def _takes_tolerances(method: Any) -> bool:
-    """Whether a solver takes the tolerances of its equations from those of the steps."""
     of_steps = type(diffrax.with_stepsize_controller_tols(diffrax.VeryChord)().rtol)
     return isinstance(getattr(getattr(method, "root_finder", None), "rtol", None), of_steps)
 
@@ -183,14 +187,16 @@ def _changed(solver: Any, changes: Callable[[Any], dict[str, Any]]) -> Any:
     return dataclasses.replace(solver, **fields) if fields else solver
 
 
-def _check_kind(label: str, value: Any, kind: Any, expected: str, may_be_omitted: bool = True) -> None:
+def _check_kind(
+    label: str, value: object, kind: type | tuple[type, ...], expected: str, may_be_omitted: bool = True
+) -> None:
     if isinstance(value, type) and issubclass(value, kind):
         raise TypeError(f"`{label}` must be an instance, not a class: {label}=diffrax.{value.__name__}().")
     if not isinstance(value, kind) and not (value is None and may_be_omitted):
         raise TypeError(f"`{label}` must be {expected}; got {value!r}.")
 
 
-def _check_number(label: str, value: Any, is_allowed: Callable[[float], bool], allowed: str) -> None:
+def _check_number(label: str, value: Component, is_allowed: Callable[[float], bool], allowed: str) -> None:
     try:
         number = math.nan if isinstance(value, (bool, np.bool_, str)) else float(value)
     except (TypeError, ValueError):
@@ -209,3 +215,137 @@ def with_array_tolerances(settings: Settings, dtype: DTypeLike) -> Settings:
         if x is not None
     }
     return dataclasses.replace(settings, **arrays)
+
+
+def is_explicit(solver: diffrax.AbstractSolver) -> bool:
+    """Whether this is an explicit Runge-Kutta method of diffrax. A `HalfSolver` passes `isinstance` but is not one."""
+    return isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.HalfSolver)
+
+
+def rates_at_ends(solver: Any) -> bool:
+    """Whether the first and the last stage k_i = h f_i of a step are evaluated at its start and its end."""
+    method = solver.method if isinstance(solver, UnrolledERK) else solver
+    tableau: Any = method.tableau if is_explicit(method) else None
+    return tableau is not None and tableau.fsal
+
+
+def last_stage_is_spare(solver: Any) -> bool:
+    """Whether the last stage of a step is only used as the first stage of the next step, as with Bosh3."""
+    tableau: Any = solver.tableau if is_explicit(solver) else None
+    return tableau is not None and tableau.fsal and not np.any((tableau.c == 1) & (tableau.b_sol[1:] != 0))
+
+
+@functools.cache
+def _stepwise(kind: type[diffrax.AbstractSolver]) -> Any:
+    class StepwiseInputs(kind):
+        def init(
+            self, terms: diffrax.AbstractTerm, t0: Component, t1: Component, y0: PyTree[Array], args: RateArguments
+        ) -> Any:
+            return super().init(terms, t0, t1, y0, args.in_step(t0, t1))
+
+        def step(
+            self,
+            terms: diffrax.AbstractTerm,
+            t0: Component,
+            t1: Component,
+            y0: PyTree[Array],
+            args: RateArguments,
+            solver_state: PyTree[Array],
+            made_jump: Bool,
+        ) -> Any:
+            return super().step(terms, t0, t1, y0, args.in_step(t0, t1), solver_state, made_jump)
+
+    return StepwiseInputs
+
+
+def with_stepwise_inputs(solver: diffrax.AbstractSolver) -> Any:
+    """The solver, whose stages use the piece of each input that lies inside the step (see `RateArguments.in_step`).
+
+    A solver of diffrax passes only the time to the right-hand side. At the end of a step, the time does not determine
+    the side of a discontinuity.
+    """
+    stepwise = object.__new__(_stepwise(type(solver)))
+    for field in dataclasses.fields(solver):
+        object.__setattr__(stepwise, field.name, getattr(solver, field.name))
+    return stepwise
+
+
+class UnrolledERK(diffrax.AbstractAdaptiveSolver[Any]):
+    """An explicit Runge-Kutta method of diffrax with unrolled stages.
+
+        y_i = y0 + sum_j a_ij k_j,   k_i = h f(t0 + c_i h, y_i),   y1 = y0 + sum_i b_i k_i
+
+    diffrax evaluates the stages in a loop, so that the right-hand side is compiled once. A native kernel is already
+    compiled, so unrolled stages take no longer to compile and are faster: the loop carries all stages in one array,
+    which XLA transposes in every pass. Samples are looked up at the times of all stages together. The results are equal
+    to those of `method` within rounding.
+    """
+
+    method: diffrax.AbstractERK
+    term_structure = diffrax.AbstractTerm
+    always_succeeds: ClassVar[bool] = True
+
+    @property
+    def interpolation_cls(self) -> Any:  # type: ignore[override]
+        return self.method.interpolation_cls
+
+    def order(self, terms: diffrax.AbstractTerm) -> int | None:
+        return self.method.order(terms)
+
+    def error_order(self, terms: diffrax.AbstractTerm) -> Any:
+        return self.method.error_order(terms)
+
+    def func(self, terms: diffrax.AbstractTerm, t0: Component, y0: PyTree[Array], args: RateArguments) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def init(
+        self, terms: diffrax.AbstractTerm, t0: Component, t1: Component, y0: PyTree[Array], args: RateArguments
+    ) -> Any:
+        """The rates at the start if the last stage of a step is the first of the next, else None."""
+        tableau: Any = self.method.tableau
+        return terms.vf(t0, y0, _in_step(args, t0, t1)) if tableau.fsal else None
+
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Component,
+        t1: Component,
+        y0: PyTree[Array],
+        args: RateArguments,
+        solver_state: PyTree[Array],
+        made_jump: Bool,
+    ) -> Any:
+        tableau: Any = self.method.tableau
+        args = _in_step(args, t0, t1)
+        h, times = terms.contr(t0, t1), [t0, *(t1 if c == 1 else t0 + float(c) * (t1 - t0) for c in tableau.c)]
+        sampled = args.sampled(jnp.stack(times)) if isinstance(args, RateArguments) else {}
+
+        @jax.jit
+        def rates_at(t: Array, y: Array, numbers: dict[str, Array]) -> Array:
+            return terms.vf(t, y, dataclasses.replace(args, signals=args.signals | numbers) if numbers else args)
+
+        def rates(i: int, y: Array) -> Array:
+            return rates_at(times[i], y, {name: x[i] for name, x in sampled.items()})
+
+        if solver_state is None:
+            f = rates(0, y0)
+        elif made_jump is False:
+            f = solver_state
+        else:
+            f = jax.lax.cond(made_jump, lambda: rates(0, y0), lambda: solver_state)
+        k, y = [terms.prod(f, h)], y0
+        for i, a in enumerate(tableau.a_lower, start=1):
+            y = y0 + _weighted(a, k)
+            f = rates(i, y)
+            k.append(terms.prod(f, h))
+        y1 = y if tableau.ssal else y0 + _weighted(tableau.b_sol, k)
+        dense = {"y0": y0, "y1": y1, "k": jnp.stack(k)}
+        return y1, _weighted(tableau.b_error, k), dense, f if tableau.fsal else None, diffrax.RESULTS.successful
+
+
+def _in_step(args: object, t0: Component, t1: Component) -> Any:
+    return args.in_step(t0, t1) if isinstance(args, RateArguments) else args
+
+
+def _weighted(weights: np.ndarray, values: list[Any]) -> Any:
+    return functools.reduce(operator.add, [float(w) * x for w, x in zip(weights, values, strict=True) if w != 0])

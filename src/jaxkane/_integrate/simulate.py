@@ -23,11 +23,12 @@ from .._kane.contact.forces import layout_of
 from .._kane.right_hand_side import reads_time, values_of, vector_field
 from .._scalarjit.cache_key import captured_tracers
 from .._scalarjit.compat import Tracer, on_device
-from .._scalarjit.components import Inputs
+from .._scalarjit.components import Component, Inputs, Numbers
 from .._scalarjit.configure import warn_of_float32
 from .._system.system import State, System, packed, unpacked
-from .events import events_of
+from .events import Status, events_of
 from .inputs import (
+    Signals,
     as_signals,
     check_finite,
     inputs_at,
@@ -40,14 +41,13 @@ from .inputs import (
 )
 from .integrate import refuse_captured, solve
 from .settings import settings_for, with_array_tolerances
-from .status import Status
 from .trajectory import Trajectory
 
 
 def simulate(
     system: System,
     state: State,
-    ts: Any,
+    ts: Numbers,
     inputs: Inputs = None,
     *,
     rtol: float | None = None,
@@ -56,7 +56,7 @@ def simulate(
     step: float | None = None,
     max_step: float | None = None,
     controller: diffrax.AbstractStepSizeController | None = None,
-    discontinuities: Any = None,
+    discontinuities: Numbers = None,
     project: bool = False,
     stabilize: float = 0.0,
     adjoint: Literal["auto", "reverse", "forward", "both"] | diffrax.AbstractAdjoint = "auto",
@@ -151,7 +151,7 @@ def simulate(
     return trajectory
 
 
-def checked_times(ts: Any, dtype: DTypeLike) -> Any:
+def checked_times(ts: Numbers, dtype: DTypeLike) -> Any:
     """Times as an array of a type; in float64 of NumPy if this type would blur them.
 
     **Raises:** `ValueError` unless there are at least two times, finite and increasing.
@@ -169,7 +169,7 @@ def checked_times(ts: Any, dtype: DTypeLike) -> Any:
     return ts
 
 
-def clock_of(ts: Any, dtype: DTypeLike) -> tuple[Array, Array]:
+def clock_of(ts: Numbers, dtype: DTypeLike) -> tuple[Array, Array]:
     """The start of a simulation [s], and times (n_t,) since then.
 
     The start is zero for times that the type of the state cannot resolve: code that reads the time is refused there.
@@ -180,12 +180,12 @@ def clock_of(ts: Any, dtype: DTypeLike) -> tuple[Array, Array]:
     return on_device(start if isinstance(ts, jax.Array) else 0.0, dtype), times_since(start, ts, dtype)
 
 
-def first_of(ts: Any) -> Any:
+def first_of(ts: Numbers) -> Any:
     """The first of times that may be traced. NumPy compiles nothing for that."""
     return ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
 
 
-def checked_discontinuities(times: Any, start: Any, dtype: DTypeLike) -> Array | None:
+def checked_discontinuities(times: Numbers, start: Component, dtype: DTypeLike) -> Array | None:
     """Times since the start of the simulation [s]. **Raises:** `ValueError` for times that are not finite."""
     if times is None:
         return None
@@ -196,7 +196,7 @@ def checked_discontinuities(times: Any, start: Any, dtype: DTypeLike) -> Array |
     return times_since(start, times, dtype)
 
 
-def refuse_coarse_times(system: System, ts: Any, dtype: DTypeLike, signals: Any) -> None:
+def refuse_coarse_times(system: System, ts: Numbers, dtype: DTypeLike, signals: Signals) -> None:
     """**Raises:** `ValueError` for code that uses a time which the type of the state cannot resolve.
 
     The integration and samples are not affected, because they use the time since the start.
@@ -219,12 +219,12 @@ def refuse_coarse_times(system: System, ts: Any, dtype: DTypeLike, signals: Any)
         )
 
 
-def on_clock(ts: Any, trajectory: Trajectory) -> dict[str, Any]:
+def on_clock(ts: Numbers, trajectory: Trajectory) -> dict[str, Any]:
     """Times of a trajectory on the clock of `ts`: in float64 of NumPy if its own type could not resolve them."""
     if isinstance(ts, jax.Array):
         return {"t": ts}
 
-    def on(since: Any) -> Any:  # a traced number keeps its own type
+    def on(since: Component) -> Any:  # a traced number keeps its own type
         return ts[0].astype(since.dtype) + since if isinstance(since, Tracer) else ts[0] + np.asarray(since, np.float64)
 
     own: dict[str, Any] = {"t": ts, "t_end": on(trajectory.t_end)}
@@ -233,7 +233,7 @@ def on_clock(ts: Any, trajectory: Trajectory) -> dict[str, Any]:
     return own
 
 
-def checked_state(system: System, state: Any) -> State:
+def checked_state(system: System, state: object) -> State:
     """A state of the right shape for a system. In a batch, the member's status reports values that are not finite."""
     check_is_system(system)
     name = type(system).__name__
@@ -314,7 +314,7 @@ def ode_term(system: System, inputs: Inputs = None) -> tuple[diffrax.ODETerm, An
     no_times: Any = np.zeros(0)
     signals = as_signals(inputs, system.inputs, no_times, type(system).__name__)
 
-    def rates(t: Any, y: State, args: Any) -> State:
+    def rates(t: Component, y: State, args: tuple[System, Signals]) -> State:
         system, signals = args
         t = jnp.asarray(t, y.q.dtype)
         return unpacked(system, vector_field(system, t, packed(y), inputs_at(system, signals, t, y)))

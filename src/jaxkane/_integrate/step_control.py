@@ -17,14 +17,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
+from .._scalarjit.components import Component
 from .._scalarjit.jaxpr import LARGEST_SUM
 from .._scalarjit.nan import constant
 from .._scalarjit.scalar_function import ScalarFunction
 from .discontinuities import Discontinuities, rounding
-from .events import Events, EventValues, first_event, is_at_start
-from .status import Status
+from .events import Events, EventValues, Status, first_event, is_at_start
+from .inputs import RateArguments
 
 
 class ControllerState(NamedTuple):
@@ -113,11 +114,19 @@ class StepSizeController(diffrax.AbstractAdaptiveStepSizeController[Array, None]
     inner: diffrax.AbstractStepSizeController | None = None
     norm: Callable[[Any], Any] = eqx.field(static=True, default=optx.rms_norm)
 
-    def wrap(self, direction: Any) -> StepSizeController:
+    def wrap(self, direction: Component) -> StepSizeController:
         return self if self.inner is None else dataclasses.replace(self, inner=self.inner.wrap(direction))
 
     def init(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any
+        self,
+        terms: Any,
+        t0: Component,
+        t1: Component,
+        y0: Array,
+        dt0: Component,
+        args: RateArguments,
+        func: Callable[..., Array],
+        error_order: Component,
     ) -> tuple[Array, Any]:
         """The end of the first step, and the state of the controller."""
         contacts = constant(y0) if self.events.layout.names else None
@@ -129,14 +138,14 @@ class StepSizeController(diffrax.AbstractAdaptiveStepSizeController[Array, None]
 
     def adapt_step_size(
         self,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        y1_candidate: Any,
-        args: Any,
-        y_error: Any,
-        error_order: Any,
-        controller_state: Any,
+        t0: Component,
+        t1: Component,
+        y0: Array,
+        y1_candidate: Array,
+        args: RateArguments,
+        y_error: Array | None,
+        error_order: Component,
+        controller_state: PyTree[Array],
         error_of_tangent: Array | None = None,
     ) -> tuple[Any, Array, Array, Any, Any, diffrax.RESULTS]:
         """Whether a step from (t0, y0) to (t1, y1_candidate) is accepted, and the next step: see diffrax.
@@ -160,7 +169,7 @@ class StepSizeController(diffrax.AbstractAdaptiveStepSizeController[Array, None]
         state = (decision.state, inner_state)
         return decision.keep, decision.t0, decision.t1, decision.jumped if restart else False, state, result
 
-    def after_jump(self, state: Any, t: Array, y: Array, args: Any) -> tuple[Array, Any]:
+    def after_jump(self, state: PyTree[Array], t: Array, y: Array, args: RateArguments) -> tuple[Array, Any]:
         """The end of the step that begins after a jump to (t, y), and the state of the controller."""
         t, state = constant((t, state[0]))
         # If an input is discontinuous here, its event is still due: the value is that at the end of the last step.
@@ -176,7 +185,7 @@ class StepSizeController(diffrax.AbstractAdaptiveStepSizeController[Array, None]
             return None
         return self.discontinuities.after(t, self.duration)
 
-    def _values(self, t0: Array, t1: Array, y1: Array, args: Any) -> EventValues | None:
+    def _values(self, t0: Array, t1: Array, y1: Array, args: RateArguments) -> EventValues | None:
         # The end of a step has no derivative here: `Problem.located` differentiates the event itself.
         if self.event_values is None:
             return None
@@ -214,7 +223,7 @@ def evenly_spread(duration: Array, step: Array) -> Array:
 
 
 def _shortest(t: Array, duration: Array) -> Array:
-    """The shortest step [s]. The length of a shorter step would consist of rounding errors."""
+    # The shortest step [s]. The length of a shorter step would consist of rounding errors.
     return 16 * rounding(t, duration)
 
 
@@ -264,11 +273,10 @@ def _after_jump(
 
 
 def _clipped(t0: Array, t1: Array, stop: Array) -> Array:
-    """The end of a step that would end at t1, if steps must end at `stop`.
-
-    The distance to `stop` is covered in one step or split in half. A very short remainder would make the next proposal
-    fall below the shortest step, which ends the simulation. Only an end at `stop` is differentiated.
-    """
+    # The end of a step that would end at t1, if steps must end at `stop`.
+    #
+    # The distance to `stop` is covered in one step or split in half. A very short remainder would make the next
+    # proposal fall below the shortest step, which ends the simulation. Only an end at `stop` is differentiated.
     t1, halfway = jax.lax.stop_gradient((t1, t0 + 0.5 * (stop - t0)))
     return jnp.where(t1 >= stop, stop, jnp.minimum(t1, halfway))
 
@@ -334,10 +342,9 @@ def _decide(
 
 
 def _to_next(step: Array, t: Array) -> Array:
-    """The length from a time to the next end of a fixed step.
-
-    The ends are multiples of the step. Neither rounding errors nor a step that was halved can shift them.
-    """
+    # The length from a time to the next end of a fixed step.
+    #
+    # The ends are multiples of the step. Neither rounding errors nor a step that was halved can shift them.
     return step * (jnp.floor(t / step + 0.01) + 1.0) - t
 
 

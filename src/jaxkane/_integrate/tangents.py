@@ -25,9 +25,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array
+from jax.typing import DTypeLike
+from jaxtyping import Array, PyTree
 
 from .._scalarjit.compat import as_lowering, is_no_tangent, is_undefined_primal, new_primitive
+from .._scalarjit.components import Component, Numbers
 from .._scalarjit.nan import constant
 from .._scalarjit.scalar_function import Packed, tree_of
 from .inputs import RateArguments, is_samples
@@ -37,7 +39,7 @@ Run = Callable[..., Any]
 for the value alone. `reverse`: whether the result supports reverse mode, else forward mode."""
 
 
-def with_own_tangents(run: Run, arguments: Any, constants: Any) -> Any:
+def with_own_tangents(run: Run, arguments: PyTree, constants: PyTree) -> Any:
     """`run((arguments, constants), None, False)`, which can be differentiated with respect to `arguments` in both
     modes. A forward-mode derivative can be differentiated again in forward mode. `run` must not use traced numbers of
     a closure."""
@@ -67,7 +69,7 @@ def with_own_tangents(run: Run, arguments: Any, constants: Any) -> Any:
         return [_in_one_batch.bind(*floats, *moving, *fixed, n=len(floats)), integers]
 
     @functools.partial(value.defjvp, symbolic_zeros=True)
-    def _(primals: Any, tangents: Any) -> Any:
+    def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> Any:
         moving, fixed = primals
         moved = tuple(not isinstance(x_dot, SymbolicZero) for x_dot in tangents[0])
         floats, integers = value(moving, fixed)
@@ -139,15 +141,15 @@ class Batch(NamedTuple):
         return [jnp.sum(x, 0) if dim is None else jnp.moveaxis(x, 0, dim) for x, dim in of_dots]
 
 
-def _evaluated(*args: Any, simulated: Any, n: int) -> list[Any]:
+def _evaluated(*args: Any, simulated: Simulated | Batch, n: int) -> list[Any]:
     return simulated.tangents(args[:n], args[n:])
 
 
-def _shapes(*args: Any, simulated: Any, n: int) -> list[Any]:
+def _shapes(*args: Any, simulated: Simulated | Batch, n: int) -> list[Any]:
     return [*simulated.types]
 
 
-def _jvp(primals: Any, tangents: Any, *, simulated: Any, n: int) -> Any:
+def _jvp(primals: Sequence[Array], tangents: Sequence[Array], *, simulated: Simulated | Batch, n: int) -> Any:
     places = [i for i, x_dot in enumerate(tangents) if not is_no_tangent(x_dot)]
 
     def floats_dot(*moving: Any) -> list[Any]:
@@ -159,13 +161,13 @@ def _jvp(primals: Any, tangents: Any, *, simulated: Any, n: int) -> Any:
     return found, [_forward_only.bind(x)[0] for x in found_dot]
 
 
-def _transpose(cts: Any, *args: Any, simulated: Any, n: int) -> Any:
+def _transpose(cts: Sequence[Array], *args: Any, simulated: Simulated | Batch, n: int) -> Any:
     values = [_once(x) if eqx.is_inexact_array(x) else x for x in args[:n]]
     found = iter(simulated.cotangents(values, [None if is_no_tangent(ct) else _once(ct) for ct in cts]))
     return [None] * n + [next(found) for x in args[n:] if is_undefined_primal(x)]
 
 
-def _batch(args: Any, dims: Any, *, simulated: Any, n: int) -> Any:
+def _batch(args: Sequence[Array], dims: Sequence[int | None], *, simulated: Simulated | Batch, n: int) -> Any:
     sizes = {x.shape[dim] for x, dim in zip(args, dims, strict=True) if dim is not None}
     batch = Batch(simulated, tuple(dims), n, sizes.pop())
     return _tangents.bind(*args, simulated=batch, n=n), [0] * len(batch.types)
@@ -179,8 +181,8 @@ def _refused(*_: Any) -> Any:
 
 
 @jax.custom_jvp
-def _once(x: Any) -> Any:
-    """`x`, which cannot be differentiated: JAX's own message would name its loop."""
+def _once(x: Array) -> Any:
+    # `x`, which cannot be differentiated: JAX's own message would name its loop.
     return x
 
 
@@ -197,7 +199,7 @@ _tangents: Any = new_primitive(
 )
 
 
-def _same(x: Any) -> list[Any]:
+def _same(x: Array) -> list[Any]:
     return [x]
 
 
@@ -218,7 +220,7 @@ def _first(*args: Any, n: int) -> list[Any]:
     return [*args[:n]]
 
 
-def _batch_all(args: Any, dims: Any, *, n: int) -> Any:
+def _batch_all(args: Sequence[Array], dims: Sequence[int | None], *, n: int) -> Any:
     size = next(x.shape[dim] for x, dim in zip(args, dims, strict=True) if dim is not None)
     pairs = zip(args[:n], dims[:n], strict=True)
     first = [jnp.broadcast_to(x, (size, *x.shape)) if dim is None else jnp.moveaxis(x, dim, 0) for x, dim in pairs]
@@ -316,7 +318,7 @@ def as_integers(errors: Array) -> Array:
     return jax.lax.bitcast_convert_type(errors, jnp.int32)
 
 
-def read_errors(errors: Array, i: Array, dtype: Any) -> Array:
+def read_errors(errors: Array, i: Array, dtype: DTypeLike) -> Array:
     """The error in the step i, from recorded errors as integers."""
     return jax.lax.bitcast_convert_type(errors[i], jnp.float32).astype(dtype)
 
@@ -333,7 +335,7 @@ def _factors(n: int) -> np.ndarray:
     return random.uniform(0.5, 1.5, n) * random.choice([-1.0, 1.0], n)
 
 
-def direction_of(args: RateArguments, moved: Any, signals_move: bool) -> Any:
+def direction_of(args: RateArguments, moved: PyTree[bool], signals_move: bool) -> Any:
     """A generic tangent of the arguments of the rates, None for those that are not differentiated.
 
     `moved`: the system with True for each number that is differentiated. The tangent of a number is proportional to its
@@ -354,7 +356,7 @@ def direction_of(args: RateArguments, moved: Any, signals_move: bool) -> Any:
         )  # fmt: skip
         system_dot = Packed.of(everywhere, args.system.numbers.dtype)
 
-    def of_signal(x: Any) -> Any:
+    def of_signal(x: Numbers) -> Any:
         if not is_samples(x):
             return _along(signals_move, x, 1.0)
         size = _along(signals_move, x.values, 1.0)
@@ -365,12 +367,12 @@ def direction_of(args: RateArguments, moved: Any, signals_move: bool) -> Any:
     return dataclasses.replace(nowhere, system=system_dot, signals=signals_dot)
 
 
-def _along(moves: bool, x: Any, factor: Any) -> Array | None:
+def _along(moves: bool, x: Numbers, factor: Component) -> Array | None:
     if not moves or not eqx.is_inexact_array(x):
         return None
     size = constant(jnp.where(jnp.isfinite(x), jnp.abs(x), 0.0))
     return jnp.asarray(factor, x.dtype) * jnp.where(jnp.any(size > 0), size, 1.0)
 
 
-def _is_none(x: Any) -> bool:
+def _is_none(x: object) -> bool:
     return x is None

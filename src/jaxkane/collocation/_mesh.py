@@ -16,6 +16,7 @@ from .._collocate.functions import Integrand, Now
 from .._collocate.lobatto import Lobatto
 from .._collocate.program import Block, EvaluatedBlock, padded
 from .._collocate.transcription import Layout, Motion
+from .._integrate.inputs import InputState, Signals
 from .._integrate.simulate import simulate
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Component
@@ -34,7 +35,7 @@ class ControlPolynomial(eqx.Module):
     mesh: Float[Array, " N_1"]
     coefficients: Float[Array, "N s"]
 
-    def __call__(self, t: Component, state: Any = None) -> Array:
+    def __call__(self, t: Component, state: State | InputState | None = None) -> Array:
         i, u = place_in_mesh(jnp.asarray(self.mesh), t)
         value = jnp.zeros_like(u)
         for k in range(self.coefficients.shape[1] - 1, -1, -1):
@@ -103,8 +104,8 @@ _CHUNK = 64  # intervals that are simulated together, so that every mesh uses th
 @jit
 def _simulated(
     system: System,
-    signals: Any,
-    controls: Any,
+    signals: Signals,
+    controls: tuple[str, ...],
     times: Array,
     starts: Array,
     coefficients: Array,
@@ -165,12 +166,12 @@ def _events_along(system: System, t: Array, Y: Array) -> dict[str, tuple[Array, 
     return jax.vmap(at)(t, Y)
 
 
-def with_controls(signals: Any, polynomials: dict[str, Any]) -> Any:
+def with_controls(signals: Signals, polynomials: dict[str, Any]) -> Any:
     """Other inputs together with controls, as `simulate` takes them."""
     if not callable(signals):
         return {**signals, **polynomials}
 
-    def every(t: Any, state: Any) -> dict[str, Any]:
+    def every(t: Component, state: InputState) -> dict[str, Any]:
         others: Any = signals(t, state)
         return {**others, **{name: f(t, state) for name, f in polynomials.items()}}
 

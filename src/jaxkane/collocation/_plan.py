@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import UserDict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,15 +17,16 @@ from jaxtyping import Array, Float
 from .._collocate.lobatto import Lobatto
 from .._collocate.program import padded
 from .._collocate.transcription import Motion
-from .._integrate.inputs import inputs_at
+from .._integrate.events import Status
+from .._integrate.inputs import InputState, Signals, inputs_at
 from .._integrate.simulate import simulate
-from .._integrate.status import Status
 from .._integrate.trajectory import Trajectory
 from .._kane.api import _dependent_speeds
 from .._kane.constraint_residuals import configuration_residual
 from .._kane.right_hand_side import outputs_at, values_of, vector_field
 from .._scalarjit.cache_key import jit
 from .._scalarjit.compat import on_device
+from .._scalarjit.components import Component, Numbers
 from .._system.parameters import wrapped
 from .._system.system import State, System, has_outputs, names_of, units_of, unpacked
 from ._mesh import ControlPolynomial, coefficients_of, interpolated, place_in_mesh, with_controls, without_events
@@ -131,7 +133,7 @@ class Plan:
         polynomials = {name: ControlPolynomial(mesh, jnp.asarray(C[:, :, i])) for i, name in enumerate(controls)}
         return with_controls(self.problem.signals, polynomials)
 
-    def at(self, ts: Any) -> dict[str, np.ndarray]:
+    def at(self, ts: Numbers) -> dict[str, np.ndarray]:
         """States and controls by name at other times. They are interpolated by one polynomial for each interval.
 
         Between the nodes, the states are less accurate than at the nodes. For "hermite-simpson", the polynomials are
@@ -149,7 +151,9 @@ class Plan:
         names = (*self.problem.names, *self.problem.bounds_of_controls)
         return dict(zip(names, np.concatenate([found.Y, found.W], axis=1).T, strict=True))
 
-    def replay(self, ts: Any = None, *, feedback: bool = False, rtol: float = 1e-8, atol: float = 1e-8) -> Trajectory:
+    def replay(
+        self, ts: Numbers = None, *, feedback: bool = False, rtol: float = 1e-8, atol: float = 1e-8
+    ) -> Trajectory:
         """Simulate the whole plan from its first state with its inputs.
 
         If the motion is unstable, rounding errors grow and the simulation diverges from the plan. With `feedback`, a
@@ -237,7 +241,7 @@ class Plan:
         return text
 
 
-class Multipliers(Mapping[str, Any]):
+class Multipliers(UserDict[str, Any]):
     """Derivatives of the least cost, by the names of states, controls, conditions and path constraints.
 
     - `multipliers["roll"]` (K,): the derivative with respect to a shift of the bound of this state or control at each
@@ -249,19 +253,11 @@ class Multipliers(Mapping[str, Any]):
     """
 
     def __init__(self, values: Mapping[str, Any], costate: Mapping[str, np.ndarray]):
-        self._values, self.costate = dict(values), dict(costate)
-
-    def __getitem__(self, name: str) -> Any:
-        return self._values[name]
-
-    def __iter__(self) -> Any:
-        return iter(self._values)
-
-    def __len__(self) -> int:
-        return len(self._values)
+        super().__init__(values)
+        self.costate = dict(costate)
 
     def __repr__(self) -> str:
-        return f"Multipliers({', '.join(self._values)})"
+        return f"Multipliers({', '.join(self)})"
 
 
 class Regulator(eqx.Module):
@@ -274,7 +270,7 @@ class Regulator(eqx.Module):
     signals: Any
     controls: tuple[str, ...] = eqx.field(static=True)
 
-    def __call__(self, t: Any, state: Any) -> dict[str, Any]:
+    def __call__(self, t: Component, state: InputState) -> dict[str, Any]:
         i, u = place_in_mesh(self.mesh, t)
         powers = jnp.stack([u**k for k in range(self.Y.shape[1])])  # an array of integers would be promoted
         x = () if state.x is None else (jnp.asarray(state.x),)
@@ -310,9 +306,7 @@ def _gains(plan: Plan) -> np.ndarray:
 
 
 @jit
-def _linear(system: System, signals: Any, controls: tuple[str, ...], ts: Array, Y: Array, W: Array) -> Any:
-    """d y_dot / d y and d y_dot / d w along a plan."""
-
+def _linear(system: System, signals: Signals, controls: tuple[str, ...], ts: Array, Y: Array, W: Array) -> Any:
     def rates(y: Array, w: Array, t: Array) -> Array:
         given = inputs_with(system, signals, controls, t, y, w)
         return vector_field(system, t, y, given)
@@ -320,7 +314,9 @@ def _linear(system: System, signals: Any, controls: tuple[str, ...], ts: Array, 
     return jax.vmap(jax.jacfwd(rates, argnums=(0, 1)))(Y, W, ts)
 
 
-def inputs_with(system: System, signals: Any, controls: Sequence[str], t: Array, y: Array, w: Array) -> dict[str, Any]:
+def inputs_with(
+    system: System, signals: Signals, controls: Sequence[str], t: Array, y: Array, w: Array
+) -> dict[str, Any]:
     """All inputs by name. Those that are neither signals nor controls are zero."""
     others = inputs_at(system, signals, t, unpacked(system, y), all_of_them=True)
     return others | {name: w[i] for i, name in enumerate(controls)}
@@ -348,7 +344,7 @@ def trajectory_of(system: System, problem: Problem, motion: Motion) -> Trajector
 
 
 @jit
-def _along(system: System, signals: Any, controls: tuple[str, ...], ts: Array, Y: Array, W: Array) -> Any:
+def _along(system: System, signals: Signals, controls: tuple[str, ...], ts: Array, Y: Array, W: Array) -> Any:
     def at(t: Array, y: Array, w: Array) -> Any:
         state = unpacked(system, y)
         inputs = inputs_with(system, signals, controls, t, y, w)

@@ -5,23 +5,26 @@ from __future__ import annotations
 import dataclasses
 import numbers
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._collocate.lobatto import Lobatto, lobatto
 from .._collocate.program import NonlinearProgram
-from .._collocate.second_order import refused_unless_minimum
-from .._collocate.solvers import INTERRUPTED, NOT_FINITE, Solution, Solver, default_solver, run
+from .._collocate.solvers import INTERRUPTED, NOT_FINITE, Solution, Solver, default_solver, refused_unless_minimum, run
 from .._collocate.transcription import Motion, Transcription, nodes_of, system_at
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
-from ._guess import detoured, detours, guess_of
+from .._scalarjit.components import Component
 from ._mesh import interpolated, jumps_inside, local_errors, quadrature_errors, refined, switch_errors
 from ._plan import Multipliers, Plan, trajectory_of
-from ._problem import Phases, Problem
+from ._problem import Phases, Problem, detoured, detours, guess_of
+
+Guess: TypeAlias = Plan | Trajectory | Mapping[str, Any] | Sequence[Any] | None
+"""A guess of a motion, or a sequence of guesses."""
 
 MAX_MESHES = 10
 COARSE = 1e-2
@@ -30,7 +33,7 @@ COARSE = 1e-2
 
 def solve(
     problem: Problem | Phases,
-    guess: Any = None,
+    guess: Guess = None,
     *,
     intervals: int = 50,
     method: str = "hermite-simpson",
@@ -108,7 +111,7 @@ def solve(
 
 
 def continuation(
-    make: Callable[[Any], Problem | Phases], values: Iterable[Any], guess: Any = None, **arguments: Any
+    make: Callable[[Any], Problem | Phases], values: Iterable[Any], guess: Guess = None, **arguments: Any
 ) -> list[Plan]:
     """Solve a family of problems one after another. Each solution is the guess of the next problem.
 
@@ -133,7 +136,12 @@ def continuation(
 
 
 def check_derivatives(
-    problem: Problem | Phases, guess: Any = None, *, intervals: int = 2, method: str = "hermite-simpson", seed: int = 0
+    problem: Problem | Phases,
+    guess: Guess = None,
+    *,
+    intervals: int = 2,
+    method: str = "hermite-simpson",
+    seed: int = 0,
 ) -> dict[str, float]:
     """Compare the sparse derivatives with dense derivatives computed by JAX, on a small mesh at a point near the guess.
 
@@ -155,7 +163,7 @@ def check_derivatives(
     z = np.clip(transcription.z + 0.1 * rng.normal(size=program.n), program.lower, program.upper)
     weights = rng.normal(size=program.m)
 
-    def lagrangian(z: Any) -> Any:
+    def lagrangian(z: Array) -> Any:
         cost, g = program.in_jax(z)
         return cost + jnp.asarray(weights) @ g
 
@@ -176,8 +184,7 @@ def check_derivatives(
     }
 
 
-def _integer(name: str, value: Any, least: int, most: int | None = None) -> int:
-    """**Raises:** `ValueError` unless the value is an integer within the bounds."""
+def _integer(name: str, value: Component, least: int, most: int | None = None) -> int:
     is_integer = isinstance(value, numbers.Integral) and not isinstance(value, bool)
     if not is_integer or int(value) < least or (most is not None and int(value) > most):
         bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
@@ -185,7 +192,7 @@ def _integer(name: str, value: Any, least: int, most: int | None = None) -> int:
     return int(value)
 
 
-def _guesses(problem: Problem | Phases, guess: Any, starts: int, seed: int) -> list[list[tuple[Any, Any]]]:
+def _guesses(problem: Problem | Phases, guess: Guess, starts: int, seed: int) -> list[list[tuple[Any, Any]]]:
     """For each start, for each phase: the guess, and the detour that is added."""
     problems = problem.phases if isinstance(problem, Phases) else (problem,)
     if isinstance(problem, Phases):
@@ -283,7 +290,13 @@ class _Search:
         solution = dataclasses.replace(solution, ok=False, status=reason)
         return self._plan(transcription, solution, errors, costs, iterations, False)
 
-    def _transcribed(self, meshes: Any, motions: Any, theta: np.ndarray, sizes: Any) -> Transcription:
+    def _transcribed(
+        self,
+        meshes: Sequence[np.ndarray],
+        motions: Sequence[Motion],
+        theta: np.ndarray,
+        sizes: Sequence[np.ndarray | None],
+    ) -> Transcription:
         phases, links = self.phases.phases, self.phases.links
         return Transcription(phases, links, meshes, self.method, motions, theta, sizes=sizes)
 
@@ -347,7 +360,13 @@ class _Search:
         return plans[0] if len(plans) == 1 and not self.phases.links else _joined(plans)
 
     def _plan_of_phase(
-        self, transcription: Transcription, solution: Solution, x: np.ndarray, p: int, errors: Any, common: Any
+        self,
+        transcription: Transcription,
+        solution: Solution,
+        x: np.ndarray,
+        p: int,
+        errors: np.ndarray | None,
+        common: dict[str, Any],
     ) -> Plan:
         layout, motion = transcription.layouts[p], transcription.motions(x)[p]
         system = system_at(transcription, p, x)
@@ -373,13 +392,13 @@ class _Search:
         )
 
 
-def _is_similar(problem: Problem, guess: Any) -> bool:
+def _is_similar(problem: Problem, guess: Guess) -> bool:
     """Whether a guess is a plan with the same states and controls."""
     both = [(*p.names, *p.bounds_of_controls) for p in (problem, getattr(guess, "problem", None)) if p is not None]
     return isinstance(guess, Plan) and not guess.phases and both[0] == both[1]
 
 
-def _guessed(problem: Problem, guess: Any, s: np.ndarray, detour: Any) -> Motion:
+def _guessed(problem: Problem, guess: Any, s: np.ndarray, detour: np.ndarray | None) -> Motion:
     if _is_similar(problem, guess):
         found = interpolated(guess.motion, guess.mesh / guess.duration, guess.method, s)
         low, high = problem.durations
@@ -389,7 +408,7 @@ def _guessed(problem: Problem, guess: Any, s: np.ndarray, detour: Any) -> Motion
     return found if detour is None else detoured(problem, found, detour)
 
 
-def _theta(problem: Problem, guess: Any) -> np.ndarray:
+def _theta(problem: Problem, guess: Guess) -> np.ndarray:
     """The free parameters of a plan, if it has the same ones; else their own initial guesses."""
     parameters = problem.parameters
     if parameters is None:

@@ -15,15 +15,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._common.files import write_file
 from .._common.lookup import real_number
+from .._integrate.inputs import Coordinates, Speeds
 from .._kane.arguments import is_concrete
 from .._kane.constraint_residuals import coordinate_weights
 from .._kane.expression_graph import Formulas, Function
 from .._kane.kanes_method import motion_rates_by_matrix
 from .._kane.right_hand_side import rates
 from .._scalarjit.graph import NotScalarError
+from .._system.system import System
 from .._version import __version__
 from ..estimate import Belief, Filter, predict, update
 from ..estimate._filter import sensed
@@ -101,8 +104,6 @@ def c_filter(
 
 
 class _FilterText(CText):
-    """The texts of the files of a filter."""
-
     def __init__(self, filter: Filter, belief: Belief, name: str, dtype: str):
         self.filter, self.belief, system = filter, belief, filter.system
         more = {"all_rates": Function(("rate",), all_rates)}
@@ -269,7 +270,7 @@ def _template(*sections: str) -> Template:
     return Template("".join(by_name[name] for name in sections))
 
 
-def all_rates(system, t, q, u, w, _):
+def all_rates(system: System, t: Array, q: Coordinates, u: Speeds, w: dict[str, Array], _: Array):
     """Rates of coordinates, independent speeds and first-order states, as one vector."""
     rows = [*motion_rates_by_matrix(system, t, q, u, w)]
     if system.states:

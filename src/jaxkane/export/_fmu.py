@@ -167,7 +167,6 @@ def _model(system: System, path: Path, step: float, state: State | None) -> FMUM
 
 
 def _compiled(source: str, name: str) -> tuple[bytes | None, str]:
-    """A shared library, or None and the reason."""
     command = shlex.split(os.environ.get("CC", "")) or [x for x in ("cc", "gcc", "clang") if shutil.which(x)][:1]
     if not command:
         return None, "There is no C compiler ($CC, cc, gcc or clang)."
@@ -193,7 +192,6 @@ def _suffix() -> str:
 
 
 def _platform(fmi: str) -> str:
-    """The name of the folder of the binary."""
     system, machine = platform.system().lower(), platform.machine().lower()
     machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(machine, machine)
     if fmi == "3.0":

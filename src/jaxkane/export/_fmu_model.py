@@ -16,8 +16,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._integrate.events import Events, event_values, own_events_of
+from .._integrate.inputs import Coordinates, Speeds
 from .._integrate.jumps import after_stages, stages_of
 from .._kane.api import dependent_speeds
 from .._kane.expression_graph import Formulas, Function
@@ -113,7 +115,6 @@ class FMUModel(CText):
         return by_node
 
     def _write_formulas(self) -> None:
-        """All functions as nodes."""
         formulas, empty = self.formulas, np.zeros(0, np.int64)
 
         def nodes_of(function: str, n: int) -> list[np.ndarray]:
@@ -145,7 +146,7 @@ class FMUModel(CText):
         self.slopes = {"rate": slopes_of("motion"), "sensed": slopes_of("outputs")}
         self.slopes["g"] = slopes_of("event functions")[: len(self.g)]
 
-    def _reads(self, nodes: Any) -> set[str]:
+    def _reads(self, nodes: np.ndarray | int) -> set[str]:
         """The C expressions of the inputs of some nodes."""
         graph = self.formulas.graph.nodes
         found = needed(graph, [np.atleast_1d(np.asarray(nodes, np.int64))])
@@ -169,7 +170,7 @@ class FMUModel(CText):
             role = GUESSED_STATE if is_solved else STATE
             variables.append(Variable(name, role, units[name], text, float(self.start[i])))
 
-        def computed(name: str, role: Role, unit: str, text: str, node: Any, state: int | None = None) -> Variable:
+        def computed(name: str, role: Role, unit: str, text: str, node: int, state: int | None = None) -> Variable:
             read = sorted(places[word] for word in self._reads(node) if word in places)
             return Variable(name, role, unit, text, derivative=state, dependencies=tuple(read))
 
@@ -275,12 +276,14 @@ def _functions_of(system: System, events: Events, outputs: Sequence[str]) -> dic
     """The functions that an FMU needs, by name. Events without a function do not exist."""
     which = stages_of(events)
 
-    def sensed(system, t, q, u, w, _):
+    def sensed(system: System, t: Array, q: Coordinates, u: Speeds, w: dict[str, Array], _: Array):
         values = outputs_at(system, t, q, u, w) if outputs else {}
         u_dep = dependent_speeds(system, t, q, u) if system.dependent_speeds else ()
         return (jnp.stack([*u_dep, *(values[name] for name in outputs)]),)
 
-    def after(event: int, system: System, t: Any, q: Any, u: Any, w: Any, _: Any) -> tuple[Any, ...]:
+    def after(
+        event: int, system: System, t: Array, q: Coordinates, u: Speeds, w: dict[str, Array], _: Array
+    ) -> tuple[Any, ...]:
         return (after_stages(system, t, _packed(system, q, u, w), event, which)[0],)
 
     functions = {"motion": Function(("rate",), all_rates)}
@@ -295,11 +298,11 @@ def _functions_of(system: System, events: Events, outputs: Sequence[str]) -> dic
     return functions
 
 
-def _packed(system: System, q: Any, u: Any, w: Any) -> jax.Array:
+def _packed(system: System, q: Coordinates, u: Speeds, w: dict[str, Array]) -> jax.Array:
     return packed(State(q, u, jnp.stack([w[name] for name in system.states]) if system.states else None))
 
 
-def _events(system, t, q, u, w, _):
+def _events(system: System, t: Array, q: Coordinates, u: Speeds, w: dict[str, Array], _: Array):
     """Event functions and det C_dep, their rates, and the conditions. The rate of det C_dep is not needed."""
     values = event_values(system, t, _packed(system, q, u, w), all_rates(system, t, q, u, w, _)[0])
     if not system.dependent_speeds:

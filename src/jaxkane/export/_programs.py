@@ -10,8 +10,10 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from .._common.files import write_file
+from .._integrate.inputs import Coordinates, Speeds
 from .._integrate.jumps import warn_of_jumps
 from .._kane.expression_graph import Formulas
 from .._scalarjit.graph import OPERATORS, NotScalarError, needed
@@ -69,7 +71,7 @@ def casadi(system: System, function: str = "rates", *, name: str | None = None) 
     return ca.Function(label, [ca.vertcat(*x) for x in columns.values()], outputs, [*columns], [*by_output])
 
 
-def _checked_formulas(system: System, dtype: str, function: Any, exporter: str) -> Formulas:
+def _checked_formulas(system: System, dtype: str, function: object, exporter: str) -> Formulas:
     """The formulas of a system. A value that is not the name of one function is refused."""
     warn_of_jumps(system, f"jaxkane.export.{exporter}")
     formulas = Formulas(system, dtype)
@@ -164,7 +166,7 @@ def stablehlo(
         raise kind(f"`platforms` must be a sequence of some of {', '.join(_PLATFORMS)}; got {platforms!r}.")
     u_dep = np.zeros(len(formulas.names("u_dep")), formulas.dtype)  # the functions of `OFFERED` do not use them
 
-    def of_one_state(t, q, u, inputs, parameters):
+    def of_one_state(t: Array, q: Coordinates, u: Speeds, inputs: Float[Array, " n_w"], parameters: dict[str, Array]):
         return formulas.by_jax(
             function, t, q, u, inputs, u_dep, *(parameters[a.name] for a in formulas.of_kind("parameters"))
         )

@@ -20,6 +20,7 @@ from .._common.files import write_file
 from .._common.lookup import refuse_unknown
 from .._integrate.jumps import warn_of_jumps
 from .._kane.expression_graph import JACOBIANS, OFFERED, Formulas
+from .._scalarjit.components import Numbers
 from .._scalarjit.graph import DTYPES, LIBRARY, needed
 from .._scalarjit.source import (
     ARITHMETIC,
@@ -124,14 +125,14 @@ def words_by_node(formulas: Formulas, words: Mapping[str, Iterable[str]]) -> dic
 
 
 def _is_read(word: str, text: str) -> bool:
-    """Whether source code uses a variable; members of other objects may have the same name."""
+    # Whether source code uses a variable; members of other objects may have the same name.
     return re.search(rf"(?<![\w.>]){re.escape(word)}(?!\w)", text) is not None
 
 
 def _constant(false_true: Sequence[str], nan: str, infinity: str, single: str = "") -> Callable[[Any, str], str]:
     """The form of numbers in a language; `single` is the suffix of those in single precision."""
 
-    def constant(value: Any, dtype: str) -> str:
+    def constant(value: float, dtype: str) -> str:
         if dtype == "bool":
             return false_true[bool(value)]
         if not np.isfinite(value):
@@ -310,7 +311,7 @@ class CText:
         ]
         self.input_words = words_by_node(formulas, {"t": ["t"], **texts, "parameters": of_parameters})
 
-    def constant(self, x: Any) -> str:
+    def constant(self, x: float) -> str:
         return C.constant(x, self.formulas.dtype)
 
     def struct(self) -> list[str]:
@@ -345,7 +346,7 @@ class CText:
     def array(self, name: str, numbers: np.ndarray) -> str:
         return f"static const {self.type} {name}[] = {{\n    {self.numbers(numbers)}\n}};"
 
-    def numbers(self, numbers: Any) -> str:
+    def numbers(self, numbers: Numbers) -> str:
         return six_a_line([self.constant(x) for x in np.ravel(numbers)] or ["0"])
 
     def declaration(self, name: str, arguments: Iterable[str], by_output: Iterable[str]) -> str:
@@ -368,8 +369,6 @@ class CText:
 
 
 class _CModule(CText):
-    """The contents of the files for some functions of a system."""
-
     def __init__(self, formulas: Formulas, functions: tuple[str, ...], name: str):
         super().__init__(formulas, name)
         self.functions, self.nodes = functions, {function: formulas.nodes(function) for function in functions}
@@ -445,7 +444,7 @@ def _state_and_outputs(formulas: Formulas, functions: Iterable[str]) -> tuple[di
     for seed in range(20):
         rng = np.random.default_rng(seed)
 
-        def draw(n: Any, rng: Any = rng) -> np.ndarray:
+        def draw(n: int | tuple[()], rng: np.random.Generator = rng) -> np.ndarray:
             return rng.uniform(0.2, 0.8, n).astype(formulas.dtype)
 
         state = {"t": draw(()), **{kind: draw(len(formulas.names(kind))) for kind in ("q", "u", "inputs", "u_dep")}}
@@ -603,7 +602,6 @@ def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str
 
 
 def _nested(elements: Sequence[str], shape: tuple[int, ...]) -> str:
-    """Elements as nested lists of this shape."""
     if not shape:
         return elements[0]
     step = int(np.prod(shape[1:]))

@@ -40,8 +40,15 @@ from jaxtyping import Array, Float, PyTree
 from .._collocate.functions import bounds_of
 from .._collocate.lobatto import lobatto
 from .._collocate.program import NonlinearProgram
-from .._collocate.second_order import BandedFactors, refused_unless_minimum
-from .._collocate.solvers import INTERRUPTED, Solution, Solver, default_solver, run
+from .._collocate.solvers import (
+    INTERRUPTED,
+    BandedFactors,
+    Solution,
+    Solver,
+    default_solver,
+    refused_unless_minimum,
+    run,
+)
 from .._collocate.transcription import Layout, Transcription
 from .._common.lookup import positive_number, refuse_unknown
 from .._integrate.jumps import refuse_jumps

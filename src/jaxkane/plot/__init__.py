@@ -11,9 +11,9 @@ from ._fits import fits as fits
 from ._fits import profiles as profiles
 from ._fits import residuals as residuals
 from ._fits import selection_path as selection_path
-from ._stability import eigenvalues as eigenvalues
-from ._stability import frequency_response as frequency_response
-from ._stability import mode_shapes as mode_shapes
-from ._stability import root_locus as root_locus
-from ._trajectories import audit as audit
-from ._trajectories import trajectories as trajectories
+from ._motions import audit as audit
+from ._motions import eigenvalues as eigenvalues
+from ._motions import frequency_response as frequency_response
+from ._motions import mode_shapes as mode_shapes
+from ._motions import root_locus as root_locus
+from ._motions import trajectories as trajectories

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from .._common.lookup import as_names, hint, label_of, refuse_unknown
+from .._scalarjit.components import Numbers
 from .._system.system import refuse_no_angle, unit_of, units_of
-from ._trajectories import SOFT, Axes, finish, panels, scale_of
+from ._motions import SOFT, Axes, finish, panels, scale_of
+
+Fit: TypeAlias = Any
+"""A `jaxkane.fit.Fit`. This package does not import `jaxkane.fit`, which draws its reports with it."""
 
 _TRIALS = 3
 
 
 def fits(
-    fit: Any,
+    fit: Fit,
     trials: Sequence[str | int] | None = None,
     channels: Sequence[str] | None = None,
     *,
     residuals: bool = True,
     degrees: bool = False,
     units: Mapping[str, str] | None = None,
-    axes: Any = None,
+    axes: Axes = None,
 ) -> np.ndarray:
     """Measured (dots) and simulated (line) by channel and trial; below each, the residuals in standard deviations.
 
@@ -97,13 +101,13 @@ def _number(names: list[str], trial: str | int) -> int:
 
 
 def residuals(
-    fit: Any,
+    fit: Fit,
     over: str | Callable[[Any], Any] = "t",
     channels: Sequence[str] | None = None,
     trials: Sequence[str | int] | None = None,
     *,
     bins: int = 20,
-    axes: Any = None,
+    axes: Axes = None,
 ) -> np.ndarray:
     """Residuals of all samples over any quantity (dots), with the mean in bins of equally many samples (line).
 
@@ -145,8 +149,7 @@ def residuals(
     return axes
 
 
-def _quantity(fit: Any, over: str | Callable[[Any], Any]) -> dict[str, np.ndarray]:
-    """Samples (n_t,) by trial."""
+def _quantity(fit: Fit, over: str | Callable[[Any], Any]) -> dict[str, np.ndarray]:
     pairs = list(zip(fit.trial_names, fit.problem.trials, strict=True))
     if not isinstance(over, str):
         return {name: np.broadcast_to(np.asarray(over(trial), float), trial.t.shape) for name, trial in pairs}
@@ -164,7 +167,7 @@ def _quantity(fit: Any, over: str | Callable[[Any], Any]) -> dict[str, np.ndarra
     return nothing
 
 
-def costs(fit: Any, *, ax: Axes = None) -> Axes:
+def costs(fit: Fit, *, ax: Axes = None) -> Axes:
     """A heat map of the mean squared residual by trial and channel. It is one if `sigma` and the model are right.
 
     **Arguments:**
@@ -192,7 +195,7 @@ def costs(fit: Any, *, ax: Axes = None) -> Axes:
     return ax
 
 
-def estimates(fits: Any, *, start: bool = False, ax: Axes = None) -> Axes:
+def estimates(fits: Fit | Mapping[str, Fit], *, start: bool = False, ax: Axes = None) -> Axes:
     """A forest plot: estimates with their 95 % intervals, as differences from the first fit in per cent of its value.
 
         jk.plot.estimates({"Monday": one, "Tuesday": other})
@@ -212,7 +215,7 @@ def estimates(fits: Any, *, start: bool = False, ax: Axes = None) -> Axes:
     rows = {name: i for i, name in enumerate(reference)}
     ax = panels(ax, 1, size=(8.0, 0.9 + (0.3 + 0.15 * len(named)) * len(rows)))[0, 0]
 
-    def percent(name: str, x: Any) -> Any:
+    def percent(name: str, x: Numbers) -> Any:
         return (x - reference[name]) / (abs(reference[name]) or 1.0) * 100
 
     for j, (label, fit) in enumerate(named.items()):
@@ -233,7 +236,7 @@ def estimates(fits: Any, *, start: bool = False, ax: Axes = None) -> Axes:
     return ax
 
 
-def profiles(fit: Any, profiles: Sequence[Any], *, axes: Any = None) -> np.ndarray:
+def profiles(fit: Fit, profiles: Sequence[Any], *, axes: Axes = None) -> np.ndarray:
     """Profile likelihoods (dots), the parabola of the linearized problem (dashed), and their intervals.
 
     **Arguments:**

@@ -18,7 +18,7 @@ from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Numbers
 from .._system.parameters import text_of, wrapped
 from .._system.system import System, names_of, unit_of, units_of
-from ._steady import SteadyEquations, SteadyMotion, as_motion, jacobian, quantity, row_sizes
+from ._steady import SteadyArguments, SteadyEquations, SteadyMotion, as_motion, jacobian, quantity, row_sizes
 
 
 class Family(eqx.Module):
@@ -86,11 +86,11 @@ class SolutionCurve:
         self.scale, self.until, self.eps = scale, dict(until), eps
         self.first = np.asarray(z) / scale
 
-    def equations(self, y) -> tuple[Any, Any, Any, Any]:
+    def equations(self, y: np.ndarray) -> tuple[Any, Any, Any, Any]:
         """F, dF/dy, and the quantities g of `until` with dg/dy."""
         raise NotImplementedError
 
-    def evaluate(self, y):
+    def evaluate(self, y: np.ndarray):
         """F, dF/dy, limits g, dg/dy, all relative to their sizes."""
         F, J, g, G = self.equations(y)
         limits = np.array(list(self.until.values()), float)
@@ -98,7 +98,7 @@ class SolutionCurve:
         size = np.where(size > 0, size, 1.0)
         return F, J, (g - limits) / size, G / size[:, None]
 
-    def tangent(self, y, before: Any) -> Any:
+    def tangent(self, y: np.ndarray, before: np.ndarray | None) -> Any:
         J = self.evaluate(y)[1]
         if not np.all(np.isfinite(J)):
             return None
@@ -147,23 +147,23 @@ class SolutionCurve:
         reason = reason or (f"{steps} steps" if len(points) > steps else self.stuck)
         return np.array(points) * self.scale, arc, reason
 
-    def accepts(self, y, tangent, z, new, met: int | None) -> bool:
+    def accepts(self, y: np.ndarray, tangent: np.ndarray, z: np.ndarray, new: np.ndarray, met: int | None) -> bool:
         """Whether the step from y to z is kept. Otherwise it is repeated with half of its length.
 
         `new`: the tangent at z. `met`: the limit that ends the curve at z, or None.
         """
         return True
 
-    def tangent_ahead(self, y, new) -> Any:
+    def tangent_ahead(self, y: np.ndarray, new: np.ndarray) -> Any:
         return new
 
-    def _passed(self, y, z) -> list[int]:
+    def _passed(self, y: np.ndarray, z: np.ndarray) -> list[int]:
         """The limits that change sign between two points. A limit that is zero at the first point is not counted
         again."""
         before, after = self.evaluate(y)[2], self.evaluate(z)[2]
         return [int(i) for i in np.nonzero((before < 0) != (after < 0))[0] if abs(before[i]) > 4e6 * self.eps]
 
-    def correct(self, y, tangent):
+    def correct(self, y: np.ndarray, tangent: np.ndarray):
         start = y
         for k in range(12):
             F, J, _, _ = self.evaluate(y)
@@ -176,7 +176,7 @@ class SolutionCurve:
                 return (y, k <= 4) if np.all(np.isfinite(F)) and np.abs(F).max() < self.eps**0.5 else None
         return None
 
-    def land(self, a, b, tangent, i: Numbers) -> Any:
+    def land(self, a: np.ndarray, b: np.ndarray, tangent: np.ndarray, i: Numbers) -> Any:
         """The point between a and b at which the i-th limit is met."""
         y = a
         for _ in range(20):  # follow the curve: another one may cross it at the limit
@@ -189,10 +189,10 @@ class SolutionCurve:
                 return None
             # Take 0.9 of a long step: at a crossing, Newton's method may converge to the other curve.
             attempt = self.correct(y + (ds if abs(ds) < 1e-5 else 0.9 * ds) * tangent, tangent)
-            tangent = None if attempt is None else self.tangent(attempt[0], tangent)
-            if attempt is None or tangent is None:
+            ahead = None if attempt is None else self.tangent(attempt[0], tangent)
+            if attempt is None or ahead is None:
                 return None
-            y = attempt[0]
+            y, tangent = attempt[0], ahead
         F, J, g, G = self.evaluate(y)
         bordered = np.vstack([J, G[[i]]])
         if np.linalg.svd(bordered, compute_uv=False)[-1] > 1e-7:
@@ -205,7 +205,14 @@ class SteadyCurve(SolutionCurve):
 
     stuck = "no further motion was found: equations or coordinates become singular, or a contact closes"
 
-    def __init__(self, system: System, start: SteadyMotion, hold: tuple[str, ...], find: tuple[str, ...], until: Any):
+    def __init__(
+        self,
+        system: System,
+        start: SteadyMotion,
+        hold: tuple[str, ...],
+        find: tuple[str, ...],
+        until: Mapping[str, float],
+    ):
         q, t, find = start.q, jnp.asarray(start.t, start.q.dtype), (*find, *system.states)
         inputs = {**start.inputs, **{name: start.x[i] for i, name in enumerate(system.states)}}
         self.steady, self.hold = SteadyEquations(system, find, tuple(hold)), hold
@@ -216,7 +223,7 @@ class SteadyCurve(SolutionCurve):
         z = self.steady.unknowns(q, start.u, inputs)
         super().__init__(z, np.asarray(_scale(self.steady, z, self.args)), until, float(jnp.finfo(q.dtype).eps))
 
-    def equations(self, y):
+    def equations(self, y: np.ndarray):
         scale = jnp.asarray(self.scale)
         found = _residual_and_slope(self.steady, jnp.asarray(y) * scale, self.args, scale, tuple(self.until))
         F, J, g, G = map(np.asarray, found)
@@ -248,7 +255,7 @@ class SteadyCurve(SolutionCurve):
 
         @jax.jit
         @jax.vmap
-        def members(z):
+        def members(z: Float[Array, " n"]):
             r = jnp.max(jnp.abs(_residual_and_slope(self.steady, z, self.args, jnp.asarray(self.scale), ())[0]))
             motion = as_motion(system, t, *self.steady.parts(z, q, u, inputs), r)
             trim = {k: motion.inputs[k] for k in self.steady.find if k in motion.inputs}
@@ -261,11 +268,17 @@ class SteadyCurve(SolutionCurve):
 
 
 @jit
-def _residual_and_slope(equations: SteadyEquations, z, args, scale, names: tuple[str, ...]):
+def _residual_and_slope(
+    equations: SteadyEquations,
+    z: Float[Array, " n"],
+    args: SteadyArguments,
+    scale: Float[Array, " n"],
+    names: tuple[str, ...],
+):
     """Residuals F (m,) relative to the sizes of their terms, quantities g by name, and the derivatives of both."""
     system, t, q, u, inputs, _ = args
 
-    def both(z):
+    def both(z: Float[Array, " n"]):
         at = equations.parts(z, q, u, inputs)[:2]
         g = [quantity(system, t, *at, k) for k in names]
         return equations.residual(z, args), jnp.stack(g) if g else jnp.zeros(0, z.dtype)
@@ -278,7 +291,7 @@ def _residual_and_slope(equations: SteadyEquations, z, args, scale, names: tuple
 
 
 @jit
-def _scale(equations: SteadyEquations, z, args):
+def _scale(equations: SteadyEquations, z: Float[Array, " n"], args: SteadyArguments):
     """The scale (n,) of each unknown, in its unit, for the arclength.
 
     1 for an angle; the value itself for speeds and inputs. For lengths and small values, the scale is the change that

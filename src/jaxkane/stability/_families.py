@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from .._common.lookup import not_there, refuse_unknown
 from .._integrate.trajectory import refuse_other_system
 from .._scalarjit.cache_key import jit
+from .._scalarjit.components import Component
 from .._system.parameters import parameters_in, with_parameters
 from .._system.system import System, packed
 from ._continuation import Family, SolutionCurve, SteadyCurve
@@ -213,7 +214,13 @@ class _OrbitCurve(SolutionCurve):
     stuck = "Newton's method, which found no further orbit"
 
     def __init__(
-        self, equations: OrbitEquations, parameter: str, args: OrbitArguments, z: Array, until: Any, label: str
+        self,
+        equations: OrbitEquations,
+        parameter: str,
+        args: OrbitArguments,
+        z: Array,
+        until: Mapping[str, float],
+        label: str,
     ):
         self.orbit, self.parameter, self.args = equations, parameter, args
         entries = (*args.system.coordinates, *args.system.speeds, *args.system.states)
@@ -230,7 +237,7 @@ class _OrbitCurve(SolutionCurve):
         self.found: list[tuple[str, Any]] = []  # kinds and places of the bifurcations so far
         super().__init__(z, sizes, until, max(float(jnp.finfo(z.dtype).eps), equations.rtol))
 
-    def _all(self, y) -> Any:
+    def _all(self, y: np.ndarray) -> Any:
         key = y.tobytes()
         if key not in self._memory:
             if len(self._memory) > 8:
@@ -239,13 +246,13 @@ class _OrbitCurve(SolutionCurve):
             self._memory[key] = tuple(map(np.asarray, found))
         return self._memory[key]
 
-    def equations(self, y):
+    def equations(self, y: np.ndarray):
         F, J, rows, _, _ = self._all(y)
         G = np.diag(self.scale)[np.array([self.places[key] for key in self.until], int)]
         return F / rows, J * self.scale / rows[:, None], G @ y, G
 
-    def move_phase(self, y) -> None:
-        """Let the phase condition contain the orbit's own start, so that it stays transversal along the family."""
+    def move_phase(self, y: np.ndarray) -> None:
+        # Let the phase condition contain the orbit's own start, so that it stays transversal along the family.
         if self.orbit.autonomous and not self.orbit.section:
             center, normal = _phase(self.orbit, self.parameter, jnp.asarray(y * self.scale), self.args)
             self.args = self.args._replace(center=center, normal=normal)
@@ -253,14 +260,14 @@ class _OrbitCurve(SolutionCurve):
         if self.orbit.jumps:
             self.args = self.args._replace(period=jnp.asarray(self._all(y)[4][0]))
 
-    def member(self, y) -> tuple[Any, ...]:
+    def member(self, y: np.ndarray) -> tuple[Any, ...]:
         """The value of the parameter, the period, the packed state and the multipliers."""
         *_, M, (T, *state) = self._all(y)
         values = np.linalg.eigvals(M) if np.all(np.isfinite(M)) else np.full(len(M), np.nan)
         values = values[np.argsort(-np.abs(values), kind="stable")].astype(complex)
         return float(y[-1] * self.scale[-1] if self.parameter else T), float(T), np.array(state), values
 
-    def tests(self, y, tangent) -> dict[str, float]:
+    def tests(self, y: np.ndarray, tangent: np.ndarray) -> dict[str, float]:
         """Functions that change their sign at a bifurcation.
 
         Products of multipliers are used, because a single multiplier cannot be followed where two of them meet.
@@ -276,23 +283,25 @@ class _OrbitCurve(SolutionCurve):
             found["branch point"] = np.linalg.det(M - np.eye(len(M)))
         return found
 
-    def accepts(self, y, tangent, z, new, met: int | None) -> bool:
+    def accepts(self, y: np.ndarray, tangent: np.ndarray, z: np.ndarray, new: np.ndarray, met: int | None) -> bool:
         new = new if met is None else self.tangent(z, tangent)
         special = None if new is None else self._between(y, tangent, z, new)
         self.found += special or []
         return special is not None
 
-    def tangent_ahead(self, y, new) -> Any:
+    def tangent_ahead(self, y: np.ndarray, new: np.ndarray) -> Any:
         self.move_phase(y)
         return self.tangent(y, new)
 
-    def _between(self, y, tangent, z, new) -> list[tuple[str, Any]] | None:
+    def _between(
+        self, y: np.ndarray, tangent: np.ndarray, z: np.ndarray, new: np.ndarray
+    ) -> list[tuple[str, Any]] | None:
         """Kinds and places of the bifurcations between y and z, in their order. None if the search for one fails."""
         before, after = self.tests(y, tangent), self.tests(z, new)
         length, found = float(tangent @ (z - y)), []
         for kind in [kind for kind in before if before[kind] * after[kind] < 0]:
 
-            def test(s, kind=kind):
+            def test(s: float, kind: str = kind):
                 if s in (0.0, length):
                     return before[kind] if s == 0.0 else after[kind]
                 attempt = self.correct(y + s * tangent, tangent)
@@ -326,7 +335,7 @@ def _value(args: OrbitArguments, name: str) -> Any:
     return args.inputs[name]
 
 
-def _with_value(args: OrbitArguments, name: str, value: Any) -> OrbitArguments:
+def _with_value(args: OrbitArguments, name: str, value: Component) -> OrbitArguments:
     if any(key == name for key, _, _ in parameters_in(args.system)):
         return args._replace(system=with_parameters(args.system, {name: value}))
     return args._replace(inputs={**args.inputs, name: value})

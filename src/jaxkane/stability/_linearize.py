@@ -5,15 +5,16 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._common.lookup import as_names, refuse_unknown
+from .._integrate.inputs import Coordinates, Speeds
 from .._integrate.trajectory import refuse_other_system
 from .._kane.api import dependent_speeds, diagnosis
 from .._kane.arguments import (
@@ -28,11 +29,12 @@ from .._kane.arguments import (
 from .._kane.checks import check_system
 from .._kane.constraint_residuals import SINGULAR_ROUNDING, configuration_residual
 from .._kane.contact.forces import has_contacts
-from .._kane.right_hand_side import has_outputs, output_names, outputs_at, rates, values_of
+from .._kane.right_hand_side import MeasurementContext, has_outputs, output_names, outputs_at, rates, values_of
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Component, Numbers, solve, stack
 from .._scalarjit.nan import nan_where
 from .._scalarjit.scalar_function import ScalarFunction
+from .._system.motion import Motion
 from .._system.parameters import concrete_numbers, parameters_in, text_of, wrapped
 from .._system.system import NamedVector, State, System, call_with_states
 from ._matrix_eigenvalues import Eig, eig, eigenvalues_text, eigvals
@@ -45,6 +47,9 @@ from ._steady import (
     is_not_steady,
     jacobian,
 )
+
+Place: TypeAlias = tuple[System, Array, Coordinates, Speeds, Float[Array, " n_x"], Float[Array, " m"]]
+"""System, time, coordinates, speeds, first-order states and inputs about which to linearize."""
 
 Outputs = Sequence[str] | Mapping[str, Callable[..., Any]] | None
 
@@ -175,7 +180,7 @@ def linearize(
     return LinearModel(A, B, C, D, states, tuple(system.inputs), rows)
 
 
-def _no_linear_model(origin: Any, dependent: tuple[str, ...], follows: bool) -> str:
+def _no_linear_model(origin: Place, dependent: tuple[str, ...], follows: bool) -> str:
     system, t, q, u, x, w = origin
     name = type(system).__name__
     if not follows:
@@ -209,9 +214,11 @@ class _ModelNames(eqx.Module):
 
 
 @jit
-def _derivatives(origin, wrong, model_names: _ModelNames, functions: dict[str, Callable[..., Any]]):
+def _derivatives(
+    origin: Place, wrong: Bool[Array, ""], model_names: _ModelNames, functions: dict[str, Callable[..., Any]]
+):
     # Replace NaN by numbers: NaN would reach the gradients of callers who do not use the result (0 * NaN).
-    at = (origin[0], *(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in origin[1:]))
+    at: Any = (origin[0], *(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in origin[1:]))
     q, w = at[2], at[5]
     T = _tangents(*at[:3], model_names)
     x = jnp.zeros(len(model_names.states), q.dtype)
@@ -223,7 +230,14 @@ def _derivatives(origin, wrong, model_names: _ModelNames, functions: dict[str, C
     return nan_where(wrong | ~follows, (A, B, C, D), origin), follows
 
 
-def _at_deviation(x, w, at, T, model_names: _ModelNames, functions: dict[str, Callable[..., Any]]):
+def _at_deviation(
+    x: Float[Array, " n"],
+    w: Float[Array, " m"],
+    at: Place,
+    T: Float[Array, "n_q n_q"],
+    model_names: _ModelNames,
+    functions: dict[str, Callable[..., Any]],
+):
     """Rates of the states (n,) and the outputs (p,), for deviations x (n,) of the states and inputs w (m,)."""
     system, t, q, u, x1, _ = at
     names, speeds = system.coordinates, (*system.speeds, *system.dependent_speeds)
@@ -254,7 +268,7 @@ def _at_deviation(x, w, at, T, model_names: _ModelNames, functions: dict[str, Ca
 
 
 @ScalarFunction
-def _tangents(system: System, t, q, model_names: _ModelNames):
+def _tangents(system: System, t: Array, q: Coordinates, model_names: _ModelNames):
     """T (n_q, n_q): column i contains the changes of all coordinates with the i-th one; zero for dependent ones."""
     names = system.coordinates
     d = [names.index(k) for k in model_names.dependent]
@@ -271,8 +285,6 @@ def _tangents(system: System, t, q, model_names: _ModelNames):
 
 
 class _WithSpeeds(System):
-    """A system with other independent speeds."""
-
     inner: System
     independent: tuple[str, ...] = eqx.field(static=True)
     dependent: tuple[str, ...] = eqx.field(static=True)
@@ -281,32 +293,40 @@ class _WithSpeeds(System):
         names = (*self.inner.speeds, *self.inner.dependent_speeds, *self.inner.auxiliary_speeds)
         return NamedVector([u[name] for name in names], names)
 
-    def _of_inner(self, now: Any) -> Any:
+    def _of_inner(self, now: MeasurementContext) -> Any:
         """`now` with the accelerations in the order of the inner system's speeds."""
         names = (*self.inner.speeds, *self.inner.dependent_speeds)
         now, u_dot = copy.copy(now), now.u_dot
         now.u_dot = NamedVector([u_dot[name] for name in names], names)
         return now
 
-    def q_dot(self, t, q, u):
+    def q_dot(self, t: Component, q: NamedVector, u: NamedVector):
         return self.inner.q_dot(t, q, self._in_order(u))
 
-    def motion(self, t, q, u):
+    def motion(self, t: Component, q: NamedVector, u: NamedVector):
         return self.inner.motion(t, q, self._in_order(u))
 
-    def loads(self, t, q, u, motion, inputs):
+    def loads(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, inputs: Mapping[str, Component]):
         return self.inner.loads(t, q, self._in_order(u), motion, inputs)
 
-    def state_rates(self, t, q, u, x, motion, now):
+    def state_rates(
+        self,
+        t: Component,
+        q: NamedVector,
+        u: NamedVector,
+        x: NamedVector | tuple[()],
+        motion: Motion,
+        now: MeasurementContext,
+    ):
         return self.inner.state_rates(t, q, self._in_order(u), x, motion, self._of_inner(now))
 
-    def configuration_constraints(self, t, q):
+    def configuration_constraints(self, t: Component, q: NamedVector):
         return self.inner.configuration_constraints(t, q)
 
-    def implied_constraints(self, t, q):
+    def implied_constraints(self, t: Component, q: NamedVector):
         return self.inner.implied_constraints(t, q)
 
-    def events(self, t, q, u, x=()):
+    def events(self, t: Component, q: NamedVector, u: NamedVector, x: NamedVector | tuple[()] = ()):
         return call_with_states(self.inner.events, t, q, self._in_order(u), x)
 
 
@@ -317,7 +337,7 @@ setattr(_WithSpeeds, "dependent_speeds", property(lambda self: self.dependent)) 
 
 
 class _WithSpeedsAndOutputs(_WithSpeeds):
-    def outputs(self, t, q, u, motion, now):
+    def outputs(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion, now: MeasurementContext):
         return self.inner.outputs(t, q, self._in_order(u), motion, self._of_inner(now))
 
 
@@ -354,9 +374,9 @@ def with_speeds(system: System, speeds: Sequence[str]) -> System:
 
 @functools.lru_cache(maxsize=1000)
 def _class_with(inner: Any, base: Any, contacts: bool) -> Any:
-    """A subclass with the name of the inner class, which messages show."""
+    # A subclass with the name of the inner class, which messages show.
 
-    def contacts_of_inner(self, t, q, u, motion):
+    def contacts_of_inner(self, t: Component, q: NamedVector, u: NamedVector, motion: Motion):
         return self.inner.contacts(t, q, self._in_order(u), motion)
 
     own = {"contacts": contacts_of_inner} if contacts else {}

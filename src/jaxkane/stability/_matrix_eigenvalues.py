@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from .._scalarjit import native
 from .._scalarjit.components import Numbers
@@ -49,10 +49,10 @@ def qr_eigenvalues(A: Float[Array, "n n"]) -> Complex[Array, " n"]:
     """
     H, size, unfinished = _hessenberg(A)
 
-    def going(carry):
+    def going(carry: tuple[Array, Array, Array]):
         return carry[1] & (carry[2] < _MOST_STEPS * len(A))
 
-    def steps(carry):
+    def steps(carry: tuple[Array, Array, Array]):
         H, _, k = carry
         return *_steps(H, k % _PATIENCE == _PATIENCE - _at_once(H)), k + _at_once(H)
 
@@ -62,7 +62,7 @@ def qr_eigenvalues(A: Float[Array, "n n"]) -> Complex[Array, " n"]:
 
 
 @ScalarFunction
-def _hessenberg(A):
+def _hessenberg(A: Float[Array, "n n"]):
     """Reduce A to Hessenberg form.
 
     **Returns:** H (n, n), similar to A / size and zero below its subdiagonal; size; whether a block is larger than 2 x
@@ -96,19 +96,19 @@ def _hessenberg(A):
     return H, jnp.where(finite, size, jnp.nan), unfinished
 
 
-def _at_once(H) -> int:
+def _at_once(H: Float[Array, "n n"]) -> int:
     # Loading and storing a small matrix costs as much as half a step. Two steps of a large one take seconds to compile.
     return 2 if len(H) <= 4 else 1
 
 
 @ScalarFunction
-def _steps(H, exceptional):
+def _steps(H: Float[Array, "n n"], exceptional: Bool):
     for _ in range(_at_once(H) - 1):
         H, _ = _step(H, False)
     return _step(H, exceptional)
 
 
-def _step(H, exceptional):
+def _step(H: Numbers, exceptional: Bool):
     """One double-shift step on the last block that is larger than 2 x 2. Small subdiagonal entries are then set to
     zero."""
     n, H = len(H), [list(row) for row in H]
@@ -125,7 +125,7 @@ def _step(H, exceptional):
     # The shifts are the eigenvalues of the last two rows [[a, b], [c, d]]; `bc` is the product b c.
     zero = jnp.zeros_like(H[0][0])
 
-    def at_end(entries):
+    def at_end(entries: Sequence[Array]):
         return _sum([jnp.where(is_last, x, 0.0) for is_last, x in zip(last[1:], entries, strict=True)])
 
     ends = range(1, n - 1)
@@ -152,7 +152,7 @@ def _step(H, exceptional):
     return _deflated(H)
 
 
-def _deflated(H):
+def _deflated(H: list[list[Array]]):
     """H without the subdiagonal entries that are rounding errors (Ahues and Tisseur 1997, as LAPACK's dlahqr)."""
     n, info = len(H), jnp.finfo(H[0][0].dtype)
     eps, tiny = float(info.eps), float(info.tiny) ** 0.5
@@ -174,7 +174,7 @@ def _deflated(H):
 
 
 @ScalarFunction
-def _of_blocks(H, size):
+def _of_blocks(H: Float[Array, "n n"], size: Array):
     """Real and imaginary parts (n,) of the eigenvalues of `size` H, whose blocks have one or two rows."""
     n = len(H)
     real, imaginary = [H[k][k] for k in range(n)], [jnp.zeros_like(H[0][0])] * n
@@ -196,7 +196,7 @@ def _sum(x: Sequence[Any]) -> Numbers:
     return functools.reduce(operator.add, x)
 
 
-def _reflector(x: Sequence[Any], active: Any) -> tuple[Any, list[Any], list[Any]]:
+def _reflector(x: Sequence[Any], active: Bool) -> tuple[Any, list[Any], list[Any]]:
     """Householder's reflection 1 - w v^T that maps x to (length, 0, ..., 0), or the identity."""
     square = _sum([x_i * x_i for x_i in x])
     active = active & (square > 0)
@@ -265,7 +265,7 @@ def eigvals(A: Float[Array, "*batch n n"]) -> Complex[Array, "*batch n"]:
 
 
 @jax.jit
-def _condition(values, left, right):
+def _condition(values: Complex[Array, " n"], left: Complex[Array, "n n"], right: Complex[Array, "n n"]):
     s = jnp.abs(jnp.sum(left.conj() * right, axis=-2))
     far = jax.lax.stop_gradient(jnp.abs(values[..., :, None] - values[..., None, :]))
     far = jnp.where(jnp.eye(values.shape[-1], dtype=bool), jnp.inf, far)
@@ -280,31 +280,31 @@ def _condition(values, left, right):
 
 @jax.custom_jvp
 @jax.custom_batching.sequential_vmap
-def _decomposed(A):
+def _decomposed(A: Float[Array, "n n"]):
     values, Y, X = jax.lax.linalg.eig(A, compute_left_eigenvectors=True, compute_right_eigenvectors=True)
     order = jnp.lexsort(_keys(values))
     return values[order], Y[:, order], X[:, order]
 
 
 @jax.custom_batching.custom_vmap
-def _values_alone(A):
+def _values_alone(A: Float[Array, "n n"]):
     return _in_order(jax.lax.linalg.eig(A, compute_left_eigenvectors=False, compute_right_eigenvectors=False)[0])
 
 
 @_values_alone.def_vmap
-def _(axis_size, is_batched, A):
+def _(axis_size: int, is_batched: Sequence[bool], A: Float[Array, "n n"]):
     if native.is_on() and axis_size >= CHUNK and A.shape[-1] in SIZES:  # compiling takes a second
         return jax.lax.map(lambda A: _in_order(qr_eigenvalues(A)), A, batch_size=CHUNK), True
     return jax.lax.map(_values_alone, A), True
 
 
-def _keys(values):
+def _keys(values: Complex[Array, " n"]):
     # Sort by frequency first: the real part of a neutral mode is a rounding error, which differs between algorithms.
     return -values.imag, -values.real, jnp.abs(values.imag)
 
 
 @jax.jit
-def _in_order(values):
+def _in_order(values: Complex[Array, " n"]):
     return values[jnp.lexsort(_keys(values))]
 
 
@@ -312,7 +312,7 @@ _values = jax.custom_jvp(_values_alone)
 
 
 @_decomposed.defjvp
-def _(primals, tangents):
+def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]):
     (A,), (dA,) = primals, tangents
     values, Y, X = _decomposed(A)
     lost = ~(jax.lax.stop_gradient(_condition(values, Y, X)) < MOST_CONDITION)
@@ -329,22 +329,28 @@ def _(primals, tangents):
 
 
 @_values.defjvp
-def _(primals, tangents):
+def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]):
     values = _values(*primals)
     decomposed, slopes = jax.jvp(lambda A: _decomposed(A)[0], primals, tangents)
     same = jnp.argmin(jnp.abs(values[:, None] - decomposed[None, :]), axis=1)
     return values, slopes[same]
 
 
-def _turned(A, dA, values, X, lost):
-    """dX (n, n) of the eigenvectors in the columns of X, of unit length and with a real largest entry, as LAPACK's.
+def _turned(
+    A: Float[Array, "n n"],
+    dA: Complex[Array, "n n"],
+    values: Complex[Array, " n"],
+    X: Complex[Array, "n n"],
+    lost: Bool[Array, " n"],
+):
+    # dX (n, n) of the eigenvectors in the columns of X, of unit length and with a real largest entry, as LAPACK's.
+    #
+    #     (lambda - A) dx + d lambda x = dA x,   x^H dx = 0,   and a rotation i x that keeps the largest entry real
+    #
+    # A sum over the other eigenvectors would fail where some of these coalesce. This form needs only that x is
+    # separated.
 
-        (lambda - A) dx + d lambda x = dA x,   x^H dx = 0,   and a rotation i x that keeps the largest entry real
-
-    A sum over the other eigenvectors would fail where some of these coalesce. This form needs only that x is separated.
-    """
-
-    def one(value, x, lost):
+    def one(value: Array, x: Complex[Array, " n"], lost: Array):
         bordered = jnp.block([[value * jnp.eye(len(A), dtype=x.dtype) - A, x[:, None]], [x.conj()[None], 0j]])
         bordered = jnp.where(lost, jnp.eye(len(A) + 1, dtype=x.dtype), bordered)
         dx = jnp.linalg.solve(bordered, jnp.append(dA @ x, jnp.zeros(1, x.dtype)))[:-1]

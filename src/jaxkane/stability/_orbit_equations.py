@@ -12,13 +12,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float, PyTree
 
-from .._integrate.events import event_values, events_of, own_events_of
-from .._integrate.inputs import Samples, as_signals, inputs_at, samples_of
+from .._integrate.events import Status, event_values, events_of, own_events_of
+from .._integrate.inputs import Samples, Signals, as_signals, inputs_at, samples_of
 from .._integrate.jumps import stages_of, state_after
 from .._integrate.simulate import simulate
-from .._integrate.status import Status
 from .._integrate.trajectory import Trajectory
 from .._kane.arguments import is_concrete
 from .._kane.constraint_residuals import configuration_residual, coordinate_units, projected
@@ -28,8 +28,8 @@ from .._kane.kanes_method import KaneEquations
 from .._kane.right_hand_side import reads_time, values_of, vector_field
 from .._scalarjit.cache_key import captures_any, jit
 from .._scalarjit.compat import concretely, depends_on
-from .._scalarjit.components import as_vector
-from .._system.system import System, call_with_states, packed_motion, unpacked, with_class
+from .._scalarjit.components import Component, as_vector
+from .._system.system import NamedVector, System, call_with_states, packed_motion, unpacked, with_class
 from ._steady import cyclic_coordinates
 
 
@@ -160,7 +160,7 @@ class OrbitEquations(eqx.Module):
         if self.returns == 1:
             return self.until_jump(args, y, t, longest)
 
-        def step(carry, _):
+        def step(carry: tuple[Array, Array], _: None):
             y, elapsed = carry
             after, duration = self.until_jump(args, y, t + elapsed, longest)
             return (after, elapsed + duration), None
@@ -194,9 +194,9 @@ class OrbitEquations(eqx.Module):
         options = {"rtol": self.rtol, "atol": self.atol, "solver": self.solver, "max_steps": self.max_steps}
         return simulate(system, unpacked(system, y), ts, args.inputs, **options)
 
-    def _ends(self, f: Any, segments: Array) -> Any:
-        """f(segment, last) of all segments. They share one program, but the last one has its own if it ends by a
-        jump."""
+    def _ends(self, f: Callable[..., PyTree], segments: Array) -> Any:
+        # f(segment, last) of all segments. They share one program, but the last one has its own if it ends by a
+        # jump.
         if not self.jumps:
             return jax.lax.map(lambda segment: f(segment, False), segments)
         end = jax.tree.map(lambda x: x[None], f(segments[-1], True))
@@ -206,7 +206,6 @@ class OrbitEquations(eqx.Module):
         return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), others, end)
 
     def _targets(self, z: Array, args: OrbitArguments) -> Array:
-        """The closed entries (K, n) at which the segments must end."""
         return jnp.roll(self.rows(z), -1, axis=0).at[-1].add(args.advance[self.places])
 
     def _conditions(self, z: Array, args: OrbitArguments) -> Array:
@@ -246,22 +245,22 @@ class OrbitEquations(eqx.Module):
         def at(z_p: Array) -> tuple[Array, OrbitArguments]:
             return z_p[: z.size], args if args_at is None else args_at(z_p[z.size :])
 
-        def with_slope(segment, last):
-            def twice(segment):
+        def with_slope(segment: Float[Array, " n_segment"], last: bool):
+            def twice(segment: Float[Array, " n_segment"]):
                 end = self._segment_end(segment, at(jnp.append(z, segment[segment.size - n_p :]))[1], last)
                 return end, end
 
             return jax.jacfwd(twice, has_aux=True)(segment)
 
-        def starts(z_p):
+        def starts(z_p: Float[Array, " n_z+n_p"]):
             return jnp.concatenate(
                 [self._segment_starts(*at(z_p)), jnp.tile(z_p[z.size :], (self.segments, 1))], axis=1
             )
 
-        def targets(z_p):
+        def targets(z_p: Float[Array, " n_z+n_p"]):
             return self._targets(*at(z_p))
 
-        def conditions(z_p):
+        def conditions(z_p: Float[Array, " n_z+n_p"]):
             return self._conditions(*at(z_p))
 
         z_p = jnp.append(z, extra)
@@ -324,10 +323,9 @@ class OrbitEquations(eqx.Module):
         return jnp.prod(jnp.sum(after * along, axis=1) / jnp.sum(after**2, axis=1))
 
     def _basis(self, args: OrbitArguments, y: Array, t: Array, f: Array, size: Array) -> Array:
-        """An orthonormal basis (n, m) of the scaled changes of a state that remain, in its columns.
-
-        Householder's reflections depend smoothly on the state. The factor of `jnp.linalg.qr` has no derivative here.
-        """
+        # An orthonormal basis (n, m) of the scaled changes of a state that remain, in its columns.
+        #
+        # Householder's reflections depend smoothly on the state. The factor of `jnp.linalg.qr` has no derivative here.
         vectors = []
         if self.constrained:
             n_q = len(args.system.coordinates)
@@ -345,7 +343,7 @@ class OrbitEquations(eqx.Module):
         return basis[:, len(vectors) :]
 
 
-def closing_tolerance(dtype: Any) -> float:
+def closing_tolerance(dtype: DTypeLike) -> float:
     """An orbit closes if its residuals are below this part of the amplitude. Newton's method reaches 1e-12 or fails."""
     return max(1e-6, float(jnp.finfo(dtype).eps) ** 0.5)
 
@@ -373,9 +371,9 @@ def with_section(system: System, section: str, jumps: bool) -> System:
 
 
 @functools.cache
-def _with_section(kind: Any, section: str, jumps: bool) -> Any:
+def _with_section(kind: type[System], section: str, jumps: bool) -> Any:
     class WithSection(kind):
-        def events(self, t, q, u, x):
+        def events(self, t: Component, q: NamedVector, u: NamedVector, x: NamedVector):
             events = call_with_states(super().events, t, q, u, x)
             ending = {section: dataclasses.replace(events[section], stages=())} if jumps else {}
             return {name: event for name, event in events.items() if name != section} | ending
@@ -384,7 +382,7 @@ def _with_section(kind: Any, section: str, jumps: bool) -> Any:
     return WithSection
 
 
-def drifting_coordinates(system: System, inputs: Any, y: Array) -> set[str]:
+def drifting_coordinates(system: System, inputs: Signals, y: Array) -> set[str]:
     """Names of the cyclic coordinates that need not be periodic: no event, no contact, no input function and no
     periodic coordinate uses them. They are detected with random parameters near one, also under a trace."""
     names, cyclic = system.coordinates, cyclic_coordinates(system)
@@ -392,7 +390,7 @@ def drifting_coordinates(system: System, inputs: Any, y: Array) -> set[str]:
         return set()
     rng, slopes = np.random.default_rng(0), [np.array(np.nan)] * 3
 
-    def trial(x: Any) -> Any:
+    def trial(x: Array) -> Any:
         return jnp.asarray(rng.uniform(0.5, 1.5, x.shape), x.dtype) if eqx.is_inexact_array(x) else x
 
     with concretely():
@@ -414,12 +412,12 @@ def drifting_coordinates(system: System, inputs: Any, y: Array) -> set[str]:
 
 
 @jit
-def _slopes_of_used(system: System, inputs: Any, y: Array) -> tuple[Array, ...]:
+def _slopes_of_used(system: System, inputs: Signals, y: Array) -> tuple[Array, ...]:
     n_q, t = len(system.coordinates), jnp.zeros((), y.dtype)
     return jax.jacfwd(lambda q: _used_quantities(system, inputs, t, y.at[:n_q].set(q)))(y[:n_q])
 
 
-def _used_quantities(system: System, inputs: Any, t: Array, y: Array) -> tuple[Array, Array, Array]:
+def _used_quantities(system: System, inputs: Signals, t: Array, y: Array) -> tuple[Array, Array, Array]:
     """What determines the motion in addition to the accelerations.
 
     - (m,): inputs, event functions, their conditions, new speeds and states after their jumps.
@@ -442,7 +440,7 @@ def _used_quantities(system: System, inputs: Any, t: Array, y: Array) -> tuple[A
     return jnp.concatenate(found), jnp.concatenate(of_contacts), jnp.stack(of_coordinates)
 
 
-def uses_time(system: System, inputs: Any, y: Array) -> tuple[bool, bool]:
+def uses_time(system: System, inputs: Signals, y: Array) -> tuple[bool, bool]:
     """Whether the rates and inputs use the time, and whether events, jumps and contacts do."""
     t, state = jnp.zeros((), y.dtype), unpacked(system, y)
     program = jax.make_jaxpr(lambda t: [*inputs_at(system, inputs, t, state).values()])(t)
@@ -453,7 +451,7 @@ def uses_time(system: System, inputs: Any, y: Array) -> tuple[bool, bool]:
 
 
 @jit
-def repeats(system: System, inputs: Any, t: Array, y: Array, period: Array, skipped: Array) -> Array:
+def repeats(system: System, inputs: Signals, t: Array, y: Array, period: Array, skipped: Array) -> Array:
     """Whether the equations near a packed state are the same at random times, one `period` later, and `skipped` [s]
     later. True with `Samples`, which need not continue after one period. Samples that an input function evaluates must
     continue, because the function may delay them."""

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from .._common.lookup import as_names, by_name, refuse_unknown
 from .._integrate.events import event_values, own_events_of
@@ -24,6 +24,7 @@ from .._kane.checks import check_system
 from .._kane.constraint_residuals import check_state, has_configuration_constraints
 from .._kane.scaling import least_norm, rank_tolerance
 from .._scalarjit.cache_key import captured_tracers, jit
+from .._scalarjit.components import Component, Inputs
 from .._scalarjit.nan import constant, nan_where
 from .._system.system import State, System, packed_motion, unpacked
 from ._matrix_eigenvalues import eigvals
@@ -117,10 +118,10 @@ class Orbit(eqx.Module):
 def periodic(
     system: System,
     guess: State | Trajectory | Orbit,
-    inputs: Any = None,
+    inputs: Inputs = None,
     *,
     section: str | None = None,
-    period: Any = None,
+    period: Component | Callable[[System], Component] | None = None,
     autonomous: bool = True,
     hold: Sequence[str] | Mapping[str, Any] = (),
     advance: Mapping[str, Any] | None = None,
@@ -227,14 +228,14 @@ def periodic(
 def orbit_equations(
     system: System,
     y: Array,
-    inputs: Any = None,
+    inputs: Inputs = None,
     *,
     hold: Sequence[str] | Mapping[str, Any] = (),
     advance: Mapping[str, Any] | None = None,
     section: str | None = None,
     segments: int = 1,
     returns: int = 1,
-    t: Any = 0.0,
+    t: Component = 0.0,
     rtol: float | None = None,
     atol: float | None = None,
     solver: diffrax.AbstractSolver | None = None,
@@ -256,13 +257,13 @@ def orbit_equations(
     advances = dict(advance or {})
     refuse_unknown(advances, system.coordinates, f"{name}: `advance` must name coordinates; unknown:")
     change = jnp.stack([jnp.asarray(advances.get(key, 0.0), y.dtype) for key in entries])
-    inputs = as_signals(inputs, system.inputs, t[None], name)
-    if captured_tracers(inputs):
+    signals = as_signals(inputs, system.inputs, t[None], name)
+    if captured_tracers(signals):
         raise TypeError(
             f"{name}: an input function uses a traced number from a closure. Make it a parameter of the system, or "
             "pass jax.tree_util.Partial(lambda number, t, state: ..., number)."
         )
-    drifting = drifting_coordinates(system, inputs, y).difference(advances)
+    drifting = drifting_coordinates(system, signals, y).difference(advances)
     default = 1e-12 if y.dtype == jnp.float64 else 1e-6
     equations = OrbitEquations(
         closed=tuple(i for i, key in enumerate(entries) if key not in drifting),
@@ -281,10 +282,10 @@ def orbit_equations(
     )
     times = (jnp.zeros_like(t), t) if autonomous else (t, jnp.zeros_like(t))
     data = jnp.ones((), y.dtype), y, change, targets, y, jnp.zeros_like(y)
-    return equations, OrbitArguments(system, inputs, *times, *data)
+    return equations, OrbitArguments(system, signals, *times, *data)
 
 
-def _checked_guess(name: str, system: System, guess: Any, segments: int, t: Any) -> tuple[Array, Any, Any]:
+def _checked_guess(name: str, system: System, guess: object, segments: int, t: Component) -> tuple[Array, Any, Any]:
     """The packed state of a guess, its period, and the states (K, n_y) at the starts of its segments; None if
     unknown."""
     check_time(name, t)
@@ -406,7 +407,7 @@ def _first_return(name: str, equations: OrbitEquations, args: OrbitArguments, y:
     )
 
 
-def _crossing(g, taus, ys, i: int) -> tuple[Any, Any]:
+def _crossing(g: np.ndarray, taus: np.ndarray, ys: np.ndarray, i: int) -> tuple[Any, Any]:
     part = g[i] / (g[i] - g[i + 1])
     return taus[i] + part * (taus[i + 1] - taus[i]), ys[i] + part * (ys[i + 1] - ys[i])
 
@@ -496,7 +497,7 @@ def _shots(equations: OrbitEquations, args: OrbitArguments, y: Array, T: Array) 
         return y[None]
     duration = T / equations.segments
 
-    def shot(carry, _):
+    def shot(carry: tuple[Any, ...], _: None):
         y, t = carry
         end = equations.flow(args, y, t, duration)
         return (jnp.where(jnp.all(jnp.isfinite(end)), end, y), t + duration), y
@@ -525,7 +526,7 @@ def _root(equations: OrbitEquations, guess: Array, args: OrbitArguments) -> tupl
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     zero, one = jnp.zeros((), guess.dtype), jnp.ones((), guess.dtype)
 
-    def step(carry):
+    def step(carry: tuple[Any, ...]):
         z, at, inverse, dz, damping, k = carry
         trial = z + damping * sizes * dz
         new = equations.evaluate(trial, args)
@@ -562,7 +563,7 @@ def _scaled_svd(equations: OrbitEquations, at: Evaluation, sizes: Array) -> tupl
 
 
 @_root.def_jvp
-def _root_jvp(primals, tangents):
+def _root_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]):
     equations, guess, args = primals
     z, at = _root(equations, guess, args)
     _, _, moved = tangents
@@ -571,19 +572,18 @@ def _root_jvp(primals, tangents):
     return (z, at), (slopes @ directions, none)
 
 
-def _moving(args: OrbitArguments, tangents: Any) -> tuple[Callable[[Array], Any], Array, Array]:
-    """The arguments as a function of one array of all numbers that have tangents; these numbers; and their tangents.
-
-    A matrix of derivatives with respect to these numbers is computed in forward mode. Its product with the tangents can
-    be transposed, so that reverse mode works. A simulation in forward mode could not be transposed.
-    """
+def _moving(args: OrbitArguments, tangents: PyTree) -> tuple[Callable[[Array], Any], Array, Array]:
+    # The arguments as a function of one array of all numbers that have tangents; these numbers; and their tangents.
+    #
+    # A matrix of derivatives with respect to these numbers is computed in forward mode. Its product with the tangents
+    # can be transposed, so that reverse mode works. A simulation in forward mode could not be transposed.
     leaves, structure = jax.tree.flatten(args)
     moved = jax.tree.flatten(tangents, is_leaf=lambda x: x is None)[0]
     which = [i for i, dx in enumerate(moved) if dx is not None]
     numbers, unravel = ravel_pytree([leaves[i] for i in which])
     directions, _ = ravel_pytree([moved[i] for i in which])
 
-    def at(numbers):
+    def at(numbers: Float[Array, " n_p"]):
         new = list(leaves)
         for i, x in zip(which, unravel(numbers), strict=True):
             new[i] = x
@@ -592,14 +592,14 @@ def _moving(args: OrbitArguments, tangents: Any) -> tuple[Callable[[Array], Any]
     return at, numbers, directions
 
 
-def _slopes(equations: OrbitEquations, at: Evaluation, z: Array, args: OrbitArguments, tangents: Any):
+def _slopes(equations: OrbitEquations, at: Evaluation, z: Array, args: OrbitArguments, tangents: PyTree):
     """dz / dp (n_z, n_p) with respect to all numbers p that have tangents, and these tangents (n_p,).
 
     dF/dz dz + dF/dp dp = 0
     """
     args_at, numbers, directions = _moving(args, tangents)
 
-    def along(direction):
+    def along(direction: Float[Array, " n_p"]):
         return jax.jvp(lambda p: equations.residual(z, args_at(p)), (numbers,), (direction,))[1]
 
     F_p = jax.lax.map(along, jnp.eye(numbers.size, dtype=z.dtype))  # (n_p, m)
@@ -621,17 +621,17 @@ def _return_matrix(equations: OrbitEquations, segments: Array, z: Array, args: O
 
 
 @_return_matrix.def_jvp
-def _return_matrix_jvp(primals, tangents):
+def _return_matrix_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]):
     equations, _, z, args = primals
     at = equations.evaluate(z, args)
     args_at, numbers, _ = _moving(args, tangents[3])
     slopes, directions = _slopes(equations, at, z, args, tangents[3])
 
-    def matrix(z, p):
+    def matrix(z: Float[Array, " n_z"], p: Float[Array, " n_p"]):
         args = args_at(p)
         return equations.return_matrix(equations.evaluate(z, args).segments, z, args)
 
-    def along(direction):
+    def along(direction: Float[Array, " n_p"]):
         return jax.jvp(matrix, (z, numbers), (slopes @ direction, direction))[1]
 
     columns = jax.lax.map(along, jnp.eye(numbers.size, dtype=z.dtype))  # (n_p, m, m)

@@ -7,18 +7,21 @@ with g / l, the acceleration by the weight without the constraint force.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, PyTree
 
+from .._integrate.inputs import Coordinates, Speeds
 from .._kane.arguments import Row, as_row
 from .._kane.constraint_residuals import coordinate_units, residual_sizes
 from .._kane.kanes_method import KaneEquations, unit
 from .._kane.right_hand_side import first_order_rates
 from .._kane.scaling import SMALLEST_SIZE, term_sizes
-from .._scalarjit.components import Numbers, as_vector, dot, is_written_out, mul, stack, total
+from .._scalarjit.components import Component, Numbers, as_vector, dot, is_written_out, mul, stack, total
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.system import System
 
@@ -49,7 +52,9 @@ def coordinate_sizes(system: System, q: Numbers) -> Numbers:
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
-def sizes_of(system: System, t: Any, q: Numbers, u: Numbers, values: Numbers, sizes: Any, still: Any) -> Sizes:
+def sizes_of(
+    system: System, t: Component, q: Numbers, u: Numbers, values: Numbers, sizes: PyTree, still: np.ndarray
+) -> Sizes:
     """The sizes of all terms at a state, computed by NumPy if the arrays are NumPy arrays. Sizes are not
     differentiated.
 
@@ -84,10 +89,10 @@ def sizes_of(system: System, t: Any, q: Numbers, u: Numbers, values: Numbers, si
     return Sizes(of_u, xp.maximum(q_dot, of_u @ xp.abs(D)), f, x_dot, h, u_dep)
 
 
-def _term_sizes(system, t, q, u, values, sizes):
+def _term_sizes(system: System, t: Component, q: Coordinates, u: Speeds, values: Mapping[str, Array], sizes: PyTree):
     """Sizes of q_dot and u_dep, and of the vectors that are projected onto speeds: rates of momenta, then forces."""
 
-    def terms(system, t, q, u, values):
+    def terms(system: System, t: Component, q: Coordinates, u: Speeds, values: Mapping[str, Array]):
         kane = KaneEquations(system, t, q, u, values)
         rates = [x for pair in kane.momentum_rates() for vector in pair for x in vector]
         vectors = [*rates, *(x for force in kane.force_components() for x in force)]
@@ -110,7 +115,7 @@ def _projected(kane: KaneEquations, vectors: Numbers, direction: Row) -> tuple[A
 
 
 @ScalarFunction
-def _all_sizes(system, t, q, u, values, sizes):
+def _all_sizes(system: System, t: Component, q: Coordinates, u: Speeds, values: Mapping[str, Array], sizes: PyTree):
     kane = KaneEquations(system, t, q, u, values)
     terms = _term_sizes(system, t, q, u, values, sizes)
     rows = [_projected(kane, terms[2], unit(kane.n, r)) for r in range(kane.n)]
@@ -119,18 +124,30 @@ def _all_sizes(system, t, q, u, values, sizes):
 
 
 @ScalarFunction
-def _sizes_of_terms(system, t, q, u, values, sizes):
+def _sizes_of_terms(
+    system: System, t: Component, q: Coordinates, u: Speeds, values: Mapping[str, Array], sizes: PyTree
+):
     return _term_sizes(system, t, q, u, values, sizes)
 
 
 @ScalarFunction
-def _along(system, t, q, u, values, vectors, direction):
+def _along(
+    system: System,
+    t: Component,
+    q: Coordinates,
+    u: Speeds,
+    values: Mapping[str, Array],
+    vectors: Float[Array, " m"],
+    direction: Speeds,
+):
     kane = KaneEquations(system, t, q, u, values)
     force, mass, rates = _projected(kane, vectors, as_row(direction, system.speeds, "direction"))
     return as_vector([force], q)[0], as_vector([mass], q)[0], as_vector(rates, q)
 
 
 @ScalarFunction
-def _sizes_of_state_rates(system, t, q, u, values, sizes):
+def _sizes_of_state_rates(
+    system: System, t: Component, q: Coordinates, u: Speeds, values: Mapping[str, Array], sizes: PyTree
+):
     zero = jnp.zeros_like(u)
     return term_sizes(first_order_rates, system, t, q, u, values, zero, sizes=(None, None, *sizes, zero))

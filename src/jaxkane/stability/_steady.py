@@ -5,15 +5,16 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from .._common.lookup import as_names, by_name, refuse_unknown
+from .._integrate.inputs import Coordinates, Speeds
 from .._kane.api import dependent_speeds, diagnosis
 from .._kane.arguments import (
     as_array,
@@ -48,6 +49,9 @@ _INPUTS = (1.0, 30.0, 1000.0)  # sizes of trial inputs
 
 
 Hold = Sequence[str] | Mapping[str, Any]
+
+SteadyArguments: TypeAlias = tuple[System, Array, Coordinates, Speeds, dict[str, Array], Array]
+"""System, time, coordinates, speeds, inputs with first-order states by name, and values of the held speeds."""
 
 
 class SteadyMotion(eqx.Module):
@@ -187,7 +191,7 @@ def steady_turn(
     return motion
 
 
-def quantity(system: System, t, q, u, name: str):
+def quantity(system: System, t: Array, q: Coordinates, u: Speeds, name: str):
     if name in system.coordinates:
         return q[system.coordinates.index(name)]
     if name in system.speeds:
@@ -230,17 +234,17 @@ class SteadyEquations(eqx.Module):
         self.find = find
         self.hold = tuple(k for k in hold if k in system.dependent_speeds)
 
-    def unknowns(self, q, u, inputs) -> Array:
+    def unknowns(self, q: Coordinates, u: Speeds, inputs: dict[str, Array]) -> Array:
         trim = [jnp.reshape(inputs[k], (1,)) for k in self.find]
         return jnp.concatenate([q[np.array(self.q_free, int)], u[np.array(self.u_free, int)], *trim])
 
-    def parts(self, z, q, u, inputs):
+    def parts(self, z: Float[Array, " n_z"], q: Coordinates, u: Speeds, inputs: dict[str, Array]):
         n_q, n_u = len(self.q_free), len(self.u_free)
         trim = {k: z[n_q + n_u + i] for i, k in enumerate(self.find)}
         q = q.at[np.array(self.q_free, int)].set(z[:n_q])
         return q, u.at[np.array(self.u_free, int)].set(z[n_q : n_q + n_u]), {**inputs, **trim}
 
-    def residual(self, z, args) -> Array:
+    def residual(self, z: Float[Array, " n_z"], args: SteadyArguments) -> Array:
         """F (m,): forces f = M u_dot, rates of the non-cyclic coordinates and of the states at u_dot = 0, constraints
         and held quantities."""
         system, t, q, u, inputs, targets = args
@@ -249,7 +253,9 @@ class SteadyEquations(eqx.Module):
         held = [quantity(system, t, q, u, k) - target for k, target in zip(self.hold, targets, strict=True)]
         return jnp.concatenate([f, q_dot[np.array(self.still, int)], x_dot, h, *(jnp.reshape(x, (1,)) for x in held)])
 
-    def sizes(self, z, largest, args) -> tuple[Array, Array]:
+    def sizes(
+        self, z: Float[Array, " n_z"], largest: Float[Array, " n_z"], args: SteadyArguments
+    ) -> tuple[Array, Array]:
         """The sizes of the terms of each equation (m,) and of each unknown (n,), whose values were up to `largest`."""
         system, t, q, u, inputs, targets = args
         of_q, of_u, of_inputs = self.parts(largest, coordinate_sizes(system, q), abs(u), jax.tree.map(abs, inputs))
@@ -279,7 +285,7 @@ def row_sizes(J: Array, sizes: tuple[Array, Array]) -> Array:
     return jnp.where(size > 0, size, 1.0)
 
 
-def _imbalance(system, t, q, u, values):
+def _imbalance(system: System, t: Array, q: Coordinates, u: Speeds, values: dict[str, Array]):
     """The zeros of a steady motion: q_dot (n_q,), f = M u_dot (n,), x_dot (n_x,) at u_dot = 0, and h (h,)."""
     q_dot, f = rates_and_forcing(system, t, q, u, values)
     x_dot = first_order_rates(system, t, q, u, values, jnp.zeros_like(u)) if system.states else jnp.zeros(0, q.dtype)
@@ -287,7 +293,7 @@ def _imbalance(system, t, q, u, values):
 
 
 @jit
-def _solve(equations: SteadyEquations, args):
+def _solve(equations: SteadyEquations, args: SteadyArguments):
     system, t, q, u, known, _ = args
     guess = equations.unknowns(q, u, known)
     z = levenberg_marquardt(equations, guess, args)
@@ -310,7 +316,16 @@ def _by_columns(J: Array) -> tuple[Array, Array]:
     return J / size[None, :], size
 
 
-def as_motion(system, t, q, u, inputs, residual, missing=None, origin=()) -> SteadyMotion:
+def as_motion(
+    system: System,
+    t: Array,
+    q: Coordinates,
+    u: Speeds,
+    inputs: dict[str, Array],
+    residual: Array,
+    missing: Bool[Array, ""] | None = None,
+    origin: PyTree = (),
+) -> SteadyMotion:
     """A `SteadyMotion`, NaN with its derivatives by `origin` where it is `missing`."""
     u_dep = dependent_speeds(system, t, q, u) if system.dependent_speeds else jnp.zeros(0, q.dtype)
     if missing is not None:
@@ -321,7 +336,9 @@ def as_motion(system, t, q, u, inputs, residual, missing=None, origin=()) -> Ste
     return SteadyMotion(q, u, u_dep, x, of_system, t, residual, names_of(system), units)
 
 
-def _no_steady_motion(name: str, equations: SteadyEquations, held: tuple[str, ...], r: float, slopes, J) -> str:
+def _no_steady_motion(
+    name: str, equations: SteadyEquations, held: tuple[str, ...], r: float, slopes: Numbers, J: Numbers
+) -> str:
     slopes, J = np.asarray(slopes), np.asarray(J)
     if r < 1e-6 and np.all(np.isfinite(J)):
         free = int((slopes <= 1e-9).sum())
@@ -340,7 +357,7 @@ def _no_steady_motion(name: str, equations: SteadyEquations, held: tuple[str, ..
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def levenberg_marquardt(equations: SteadyEquations, guess: Array, args: Any) -> Array:
+def levenberg_marquardt(equations: SteadyEquations, guess: Array, args: SteadyArguments) -> Array:
     """z (n,) with equations.residual(z, args) = 0 (m >= n equations), by Levenberg and Marquardt's method from a guess.
 
     Differentiable in `args`, any number of times, both modes:  dz = -F_z^+ F_args dargs. The result need not be a
@@ -353,14 +370,14 @@ def levenberg_marquardt(equations: SteadyEquations, guess: Array, args: Any) -> 
         return guess
     eps = float(jnp.finfo(guess.dtype).eps)
 
-    def F(z):
+    def F(z: Float[Array, " n_z"]):
         return equations.residual(z, args)
 
-    def cost(r, sizes):
+    def cost(r: Float[Array, " m"], sizes: Float[Array, " m"]):
         r = r / sizes
         return jnp.where(jnp.all(jnp.isfinite(r)), jnp.sum(r**2), jnp.inf)
 
-    def step(carry):
+    def step(carry: tuple[Any, ...]):
         z, r, largest, damping, small, k = carry
         J = jacobian(F, z)
         finite = jnp.all(jnp.isfinite(J))
@@ -378,10 +395,10 @@ def levenberg_marquardt(equations: SteadyEquations, guess: Array, args: Any) -> 
         damping = jnp.where(better, damping * jnp.where(damping < 1e-6, 0.0, 0.03), 10 * jnp.maximum(damping, 1e-14))
         return z, r, largest, damping, small, k + 1
 
-    def going(carry):
+    def going(carry: tuple[Any, ...]):
         return (carry[4] == 0) & (carry[5] < _MAX_STEPS)
 
-    def search(carry):
+    def search(carry: tuple[Any, ...]):
         _, damping, _ = carry
         counters = jnp.zeros((), int), jnp.zeros((), int)
         z, r, largest, *_ = jax.lax.while_loop(going, step, (guess, F(guess), jnp.abs(guess), damping, *counters))
@@ -400,7 +417,7 @@ def levenberg_marquardt(equations: SteadyEquations, guess: Array, args: Any) -> 
 
 
 @levenberg_marquardt.defjvp
-def _levenberg_marquardt_jvp(equations, primals, tangents):
+def _levenberg_marquardt_jvp(equations: SteadyEquations, primals: tuple[Any, ...], tangents: tuple[Any, ...]):
     guess, args = primals
     z = levenberg_marquardt(equations, guess, args)
     if not z.size:
@@ -438,13 +455,13 @@ def cyclic_coordinates(system: System) -> tuple[str, ...]:
         return _CYCLIC.get(key, lambda: _search_cyclic(system, leaves, treedef))
 
 
-def _search_cyclic(system: System, leaves: list, treedef) -> tuple[str, ...]:
+def _search_cyclic(system: System, leaves: list, treedef: Any) -> tuple[str, ...]:
     names, n_q = system.coordinates, len(system.coordinates)
     rng = np.random.default_rng(0)
     dtype = jnp.result_type(*leaves) if leaves else jnp.zeros(()).dtype
 
     @jax.jit
-    def all_rates(trial, q, t, u, w):
+    def all_rates(trial: System, q: Coordinates, t: Array, u: Speeds, w: dict[str, Array]):
         rate = rates(trial, t, q, u, w)
         of_states = [] if rate.x is None else [rate.x]
         return rate.q, jnp.concatenate([rate.u, configuration_residual(trial, t, q), *of_states])
@@ -463,7 +480,7 @@ def _search_cyclic(system: System, leaves: list, treedef) -> tuple[str, ...]:
         w = {name: size * rng.choice([-1, 1]) * rng.uniform(0.5, 1.5) for name in names_of_inputs}
         others = jax.tree.map(lambda x: jnp.asarray(x, dtype), (rng.uniform(0.0, 2.0), u, w))
 
-        def rates_at(q, trial=trial, others=others):
+        def rates_at(q: np.ndarray, trial: System = trial, others: tuple[Any, ...] = others):
             return [*map(np.asarray, all_rates(trial, jnp.asarray(q, dtype), *others))]
 
         before = rates_at(q)
@@ -489,19 +506,18 @@ def _changed_rates(before: list[np.ndarray], after: list[np.ndarray], rounding: 
     """Which rates of the coordinates (n_q,) differ beyond rounding; the last entry is for all other rates."""
     tolerance = float(np.finfo(before[0].dtype).eps) ** 0.6 * rounding
 
-    def changed(a, b):
+    def changed(a: np.ndarray, b: np.ndarray):
         # If a rate is not finite after the shift of a cyclic coordinate, it was not finite before.
         return not np.all(np.abs(b - a) <= tolerance * (1.0 + np.abs(a).max(initial=0.0)))
 
     return np.array([*map(changed, before[0], after[0]), changed(before[1], after[1])])
 
 
-def inputs_by_name(system: System, w) -> dict[str, Any]:
+def inputs_by_name(system: System, w: Float[Array, " n_w"]) -> dict[str, Any]:
     return {k: w[i] for i, k in enumerate(system.inputs)}
 
 
 def _non_cyclic(system: System) -> np.ndarray:
-    """Indices of the coordinates that are constant in a steady motion."""
     cyclic = cyclic_coordinates(system)
     return np.array([i for i, k in enumerate(system.coordinates) if k not in cyclic], int)
 
@@ -522,7 +538,9 @@ _STEADY = 0.4
 """A force or a rate is regarded as zero if it is below eps**0.4 = 5e-7 times the size of its own terms."""
 
 
-def _relative_imbalance(system: System, t, q, u, values, still):
+def _relative_imbalance(
+    system: System, t: Array, q: Coordinates, u: Speeds, values: dict[str, Array], still: Sequence[int] | np.ndarray
+):
     """|f| (n,), |q_dot| (n_q,), |x_dot| (n_x,) and |h| (h,) relative to the sizes of their terms."""
     sizes = coordinate_sizes(system, q), abs(u), jax.tree.map(abs, values)
     size = sizes_of(system, t, q, u, values, sizes, np.array(still, int))
@@ -539,7 +557,9 @@ def _relative_imbalance(system: System, t, q, u, values, still):
 _relative_imbalance_by_jax = jit(_relative_imbalance)
 
 
-def is_not_steady(system: System, t, q, u, x, w, steady: bool):
+def is_not_steady(
+    system: System, t: Array, q: Coordinates, u: Speeds, x: Float[Array, " n_x"], w: Float[Array, " n_w"], steady: bool
+):
     """Whether a state violates the constraints, is not finite, has closed contacts or, with `steady`, is not
     steady."""
     values, still = values_of(system, x, inputs_by_name(system, w)), _non_cyclic(system)
@@ -549,7 +569,9 @@ def is_not_steady(system: System, t, q, u, x, w, steady: bool):
     return jax.lax.stop_gradient(~(fine & jnp.all(jnp.isfinite(jnp.concatenate([q, u, x, w, t[None]])))))
 
 
-def check_steady(system: System, t, q, u, x, w, steady: bool) -> None:
+def check_steady(
+    system: System, t: Array, q: Coordinates, u: Speeds, x: Float[Array, " n_x"], w: Float[Array, " n_w"], steady: bool
+) -> None:
     """Raise the exception that belongs to `is_not_steady`, for concrete numbers."""
     name, inputs, still = type(system).__name__, inputs_by_name(system, w), _non_cyclic(system)
     names = (*system.coordinates, *system.speeds, *system.states, *system.inputs, "t")

@@ -92,7 +92,7 @@ def grid(**axes: Any) -> Table:
     return Table(columns, tuple(rows), tuple(len(row) for row in rows.values()))
 
 
-def as_table(table: Any) -> Table | None:
+def as_table(table: Table | Mapping[str, Any] | None) -> Table | None:
     """A `Table` from a `Table`, columns by name, a DataFrame, or None."""
     if table is None or isinstance(table, Table):
         return table
@@ -175,7 +175,12 @@ class Row(UserDict[str, Any]):
 
 
 def members_of(
-    system: Any, state: Any, inputs: Inputs, table: Table | None, ts: Numbers, dtype: DTypeLike
+    system: System | Callable[[Row], System],
+    state: State | Callable[[System, Row], State],
+    inputs: Inputs,
+    table: Table | None,
+    ts: Numbers,
+    dtype: DTypeLike,
 ) -> tuple[Any, Any, int]:
     """Split the data of a sweep.
 
@@ -234,7 +239,7 @@ def start_of(own: PyTree, shared: PyTree, t: Component) -> State:
     return _start(system, state, Row(columns), t)
 
 
-def _system(system: System, row: Row) -> tuple[System, dict[str, Any]]:
+def _system(system: System | Callable[[Row], System], row: Row) -> tuple[System, dict[str, Any]]:
     """The system of a row, and the parameters that were set by name."""
     read: set[str] = set()
     if not isinstance(system, System):
@@ -245,7 +250,7 @@ def _system(system: System, row: Row) -> tuple[System, dict[str, Any]]:
     return with_parameters(system, parameters), parameters
 
 
-def _start(system: System, state: Any, row: Row, t: Component) -> State:
+def _start(system: System, state: State | Callable[[System, Row], State], row: Row, t: Component) -> State:
     system, parameters = _system(system, row)
     read: set[str] = set()
     if not isinstance(state, State):
@@ -274,7 +279,7 @@ def _start(system: System, state: Any, row: Row, t: Component) -> State:
 def _check(members: PyTree, shared: PyTree, t: Component, table: Table | None) -> None:
     """Make one member with abstract values, and refuse data that do not match the system."""
 
-    def trial(own):
+    def trial(own: PyTree):
         system, state, signals, columns = eqx.combine(own, shared)
         row = Row(columns)
         start = _start(system, state, row, t)
@@ -330,8 +335,8 @@ def _check(members: PyTree, shared: PyTree, t: Component, table: Table | None) -
 
 
 def _check_description(members: PyTree, shared: PyTree, t: Component) -> None:
-    """Refuse a contradictory system. The first member is checked, and also the last one, because checks of contacts
-    depend on numbers. An impossible body makes only its member invalid."""
+    # Refuse a contradictory system. The first member is checked, and also the last one, because checks of contacts
+    # depend on numbers. An impossible body makes only its member invalid.
     if any(x.shape[0] == 0 for x in jax.tree.leaves(members)):
         return
     for i in (0, -1):
@@ -349,7 +354,7 @@ def _check_description(members: PyTree, shared: PyTree, t: Component) -> None:
         check_contacts(system, t, q, may_penetrate=True)
 
 
-def _signals(inputs: Inputs, system: System, columns: dict[str, Any], ts: Numbers) -> Any:
+def _signals(inputs: Inputs, system: System | Callable[[Row], System], columns: dict[str, Any], ts: Numbers) -> Any:
     """Signals as in `simulate`; samples may have a leading axis of members."""
     if not isinstance(system, System):  # a function of the row: only its names are needed
         row = {name: jnp.zeros(x.shape[1:]) for name, x in columns.items()}
@@ -380,7 +385,7 @@ def _signals(inputs: Inputs, system: System, columns: dict[str, Any], ts: Number
     return known | samples
 
 
-def _batches(places: Any, dims: Sequence[int]) -> dict[int, str]:
+def _batches(places: PyTree[int], dims: Sequence[int]) -> dict[int, str]:
     """The names of the leaves that have a leading axis of members, by index.
 
     `places`: system, state, signals and columns, with indices as leaves. `dims`: the numbers of axes of the leaves.

@@ -17,18 +17,17 @@ from jaxtyping import PyTree
 from tqdm import tqdm
 
 from .._common.lookup import not_there, refuse_unknown
+from .._integrate.events import Status, reason
 from .._integrate.integrate import refuse_captured
 from .._integrate.settings import settings_for
 from .._integrate.simulate import as_state, checked_times, clock_of
-from .._integrate.status import Status, reason
 from .._integrate.trajectory import Trajectory
 from .._kane.arguments import is_concrete
 from .._scalarjit.cache_key import captured_tracers
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Inputs, Numbers
 from .._system.system import State, System
-from ._chunks import GROUP, ChunkResult, Task, mesh_of, on_cluster, trace
-from ._files import Folder, manifest_of
+from ._chunks import GROUP, ChunkResult, Folder, Task, manifest_of, mesh_of, on_cluster, trace
 from ._members import Row, Table, as_table, members_of
 
 _OPTIONS = (
@@ -51,7 +50,7 @@ def sweep(
     ts: Numbers,
     inputs: Inputs = None,
     *,
-    table: Any = None,
+    table: Table | Mapping[str, Any] | None = None,
     reduce: Callable[[Trajectory], Any] | None = None,
     chunk: int | None = None,
     folder: str | os.PathLike[str] | None = None,

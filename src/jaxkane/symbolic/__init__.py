@@ -4,6 +4,6 @@ The formulas are written from the graph of scalars that the library computes wit
 """
 
 from ._equations import Equations as Equations
+from ._equations import LinearEquations as LinearEquations
 from ._equations import equations as equations
-from ._linear import LinearEquations as LinearEquations
-from ._linear import linearize as linearize
+from ._equations import linearize as linearize

@@ -112,7 +112,7 @@ class SymbolicModel:
     name: str
     replacements: tuple[tuple[Any, Any], ...]
 
-    def cse(self, expressions: Any) -> tuple[list[tuple[Any, Any]], Any]:
+    def cse(self, expressions: Expression) -> tuple[list[tuple[Any, Any]], Any]:
         """`replacements` and the expressions, in the form of the argument `cse` of `sympy.lambdify`:
 
         lambdify(equations.arguments, [equations.M, equations.f], cse=equations.cse)
@@ -147,7 +147,6 @@ def exact(value: float | bool, dtype: str) -> Expression:
 
 @functools.cache
 def _operations() -> dict[str, Any]:
-    """SymPy's functions for the operations of graphs, for real and finite numbers."""
     sp = import_sympy()
     # SymPy raises if it compares a result of a division by zero.
 

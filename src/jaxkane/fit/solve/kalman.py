@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from ..._integrate.events import Status
 from ..._integrate.inputs import for_fixed_steps, inputs_at
 from ..._integrate.integrate import ends_between, is_valid, one_step
-from ..._integrate.status import Status
 from ..._kane.right_hand_side import values_of
 from ..._system.system import System, unpacked
 from ...estimate._filter import begun, brought_back, sensed

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PyTree
 from numpy.typing import ArrayLike
 
 from ..._common.lookup import real_number
-from ..._integrate.status import Status, reason
+from ..._integrate.events import Status, reason
 from ..._scalarjit.compat import on_device
 from ..._scalarjit.components import Numbers
 from ..._scalarjit.digest import digest
