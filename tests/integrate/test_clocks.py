@@ -45,33 +45,6 @@ def test_elapsed_time_is_exact_at_samples(dtype, t0, rate, hold):
     assert float(ride.t_end) == pytest.approx(t0 + 4.0, rel=rtol)
 
 
-def place_of_the_last(t0, dtype, hold, options):
-    """The place after one second, and its derivatives by a delay of the force and by its size."""
-    n = 11
-    values = np.sin(np.arange(n) * 0.9)
-    grid = np.arange(n) / 10
-
-    def place(x):
-        delay = x[0] if options.get("step") is None or not hold else 0.0
-        # A delay is a number of the trace: samples have relative times in float32, absolute ones in float64.
-        samples = jk.Samples(t0 + grid + delay, x[1] * values, zero_order_hold=hold)
-        ride = jk.simulate(Particle(), state(dtype), t0 + np.array([0.0, 0.5, 1.0]), {"push": samples}, **options)
-        return ride["x"][-1]
-
-    return jax.jit(jax.value_and_grad(place))(jnp.array([0.0, 1.0], dtype))
-
-
-@pytest.mark.weekly
-@pytest.mark.parametrize("options", [{}, {"step": 0.05}], ids=["adaptive", "fixed"])
-@pytest.mark.parametrize("hold", [True, False])
-def test_derivatives_do_not_depend_on_the_start_time(options, hold):
-    rtol = 5e-6  # a POSIX time has a resolution of 2.4e-7 s
-    (x, slope), *others = (place_of_the_last(t0, jnp.float64, hold, options) for t0 in (0.0, 1e6, 1.7e9))
-    for x1, slope1 in others:
-        assert float(x1) == pytest.approx(float(x), rel=rtol)
-        np.testing.assert_allclose(slope1, slope, rtol=rtol, atol=1e-12)
-
-
 @pytest.mark.weekly
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("step", [None, 0.01])

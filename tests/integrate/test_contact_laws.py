@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mechanisms import BouncingBall
 
 import jaxkane as jk
 from jaxkane.catalog import Belt
@@ -40,29 +39,6 @@ def end_of(ride):
 
 
 # -- A ball in air (figures of a closed form).
-DROP = jnp.array([1.0, 0.1, 0.8])  # height, drag, restitution
-drop = simulate_with_slopes(
-    lambda p: BouncingBall(drag=p[1], restitution=p[2]), lambda p: jk.State(p[:1], jnp.zeros_like(p[:1]))
-)
-BOUNCES = [0.4590853109923369, 1.1280946846381106, 1.6405736265752897, 2.0400984767321484, 2.3546963595549943]
-BOUNCES += [2.603903008180971, 2.802033708031122, 2.9599159114088045]
-
-
-@pytest.mark.weekly
-def test_a_bouncing_ball_with_drag():
-    atol, slope_rtol = 1e-10, 1e-6  # the second derivative of |v| v is discontinuous at the top
-    slopes, ride = drop(DROP, jnp.linspace(0.0, 3.0, 21))
-    assert int(ride.status) == 0
-    assert int(ride.jumps.count) == 8
-    np.testing.assert_allclose(ride.jumps.t[:8], BOUNCES, atol=atol)
-    np.testing.assert_allclose(end_of(ride), [0.016894590512326443, 0.22459525490753116], atol=atol)
-    np.testing.assert_allclose(ride.jumps.energy[:8], 0.18 * ride.jumps.before.u[:8, 0] ** 2, rtol=1e-11)
-    np.testing.assert_allclose(ride.jumps.impulses[:8, 0], -1.8 * ride.jumps.before.u[:8, 0], rtol=1e-11)
-    expected = [[-0.26057481040204583, 0.5942348144692445, -1.7473679927968893]]
-    expected += [[11.973675953465243, -28.61188128267571, 92.11386201759065]]
-    np.testing.assert_allclose(slopes["end"], expected, rtol=slope_rtol)
-
-
 # -- A rod with a round end, in a plane over a table. A ball has no length, a particle has no radius either.
 class RoundRod(jk.System):
     """The table may oscillate along y and move along x. A horizontal force acts on the mass centre."""

@@ -25,68 +25,12 @@ def drop(height=1.0, restitution=0.8, drag=0.1, ts=TS, **options):
 
 
 @pytest.mark.weekly
-def test_each_member_of_a_batch_bounces_at_its_own_times():
-    """A member equals its own simulation: one bounces until it rests, one a hundred times, one never."""
-    heights, restitutions = jnp.array([0.2, 0.05, 60.0]), jnp.array([0.5, 0.985, 0.5])
-    batch = jax.jit(jax.vmap(lambda h, e: drop(h, e, 0.0, max_jumps=128)))(heights, restitutions)
-    assert batch.reason == ["completed"] * 3
-    assert int(batch.jumps.count[2]) == 0
-    # t_n = sqrt(2 h / g) (1 + 2 (e + e^2 + ... e^n))
-    e = 0.985 ** np.arange(1, 200)
-    times = np.sqrt(0.1 / 9.81) * (1 + 2 * np.concatenate([[0.0], np.cumsum(e)]))
-    assert int(batch.jumps.count[1]) == np.searchsorted(times, 3.0)
-    for i in range(3):
-        one = drop(heights[i], restitutions[i], 0.0, max_jumps=128)
-        np.testing.assert_allclose(batch.q[i], one.q, rtol=1e-12, atol=1e-14)
-        np.testing.assert_array_equal(batch.stats["steps"][i], one.stats["steps"])
-        np.testing.assert_allclose(batch.jumps.t[i], one.jumps.t, rtol=1e-13)
-        np.testing.assert_array_equal(batch.contacts["floor"][i], one.contacts["floor"])
-
-
-@pytest.mark.weekly
 def test_exceeding_max_jumps_ends_the_simulation():
     ride = drop(0.05, 0.985, 0.0, max_jumps=16)
     assert ride.reason == "max jumps"
     assert int(ride.jumps.count) == 16
     assert "max_jumps" in repr(ride)
     assert (ride.contacts["floor"][-1]) == -1
-
-
-@pytest.mark.weekly
-def test_derivatives_in_reverse_mode():
-    """The same as in forward mode, without NaN from contact states that do not occur, also when the ball rests."""
-    slopes = jax.jit(jax.grad(lambda p: drop(p[0], p[2], p[1]).end.q[0]))(jnp.array([1.0, 0.1, 0.8]))
-    np.testing.assert_allclose(slopes, [-0.26057481040204583, 0.5942348144692445, -1.7473679927968893], rtol=1e-7)
-    rests = jax.jit(jax.grad(lambda p: jnp.sum(drop(p[0], p[2], p[1]).q[-1])))(jnp.array([0.2, 0.0, 0.5]))
-    np.testing.assert_allclose(rests, 0.0, atol=1e-12)
-
-
-@pytest.mark.weekly
-def test_gradients_of_a_sweep():
-    """Of the mean height of a batch by its common restitution, and of each member by its own height."""
-
-    def mean(restitution, heights):
-        system = BouncingBall(drag=jnp.array(0.0), restitution=restitution)
-        batch = jk.sweep.sweep(
-            system, jk.State(heights[:, None], jnp.zeros((3, 1))), jnp.linspace(0.0, 1.0, 6), **TIGHT
-        )
-        return jnp.mean(batch.q[:, -1, 0])
-
-    heights = jnp.array([0.5, 1.0, 9.0])
-    by_e, by_h = jax.grad(mean, (0, 1))(jnp.array(0.8), heights)
-
-    def expected(e, h):
-        """The height after 1 s with no, one or two bounces."""
-        fall = jnp.sqrt(2 * h / 9.81)
-        v, t = e * 9.81 * fall, 1 - fall
-        first = v * t - 9.81 * t**2 / 2
-        late = t - 2 * v / 9.81
-        second = e * v * late - 9.81 * late**2 / 2
-        return jnp.where(h > 5, h - 9.81 / 2, jnp.where(late > 0, second, first))
-
-    by_formula = jax.grad(lambda e, h: jnp.mean(jax.vmap(expected, (None, 0))(e, h)), (0, 1))(0.8, heights)
-    np.testing.assert_allclose(by_e, by_formula[0], rtol=1e-9)
-    np.testing.assert_allclose(by_h, by_formula[1], rtol=1e-9)
 
 
 @pytest.mark.weekly
@@ -120,16 +64,6 @@ def test_float32():
     assert rests.ok
     np.testing.assert_allclose(rests.jumps.t[int(rests.jumps.count) - 1], 3 * np.sqrt(0.4 / 9.81), atol=1e-3)
     np.testing.assert_allclose(rests.q[-8:], 0.0, atol=1e-6)
-
-
-@pytest.mark.weekly
-def test_a_simulation_resumes_with_the_contact_states():
-    """From the state at the end of another one. The contacts of a ball at rest remain closed."""
-    first = drop(0.2, 0.5, 0.0)
-    again = jk.simulate(BouncingBall(drag=0.0, restitution=0.5), first.state(-1), TS, **TIGHT)
-    assert int(again.jumps.count) == 0
-    np.testing.assert_array_equal(again.contacts["floor"], 1)
-    np.testing.assert_array_equal(again.q, 0.0)
 
 
 class AnyContacts(jk.System):

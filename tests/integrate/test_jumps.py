@@ -89,32 +89,6 @@ def test_a_bouncing_ball_with_drag():
 
 
 @pytest.mark.weekly
-@pytest.mark.parametrize("adjoint", ["forward", pytest.param("reverse", marks=pytest.mark.weekly)])
-def test_derivatives_through_jumps(adjoint):
-    """Of the state at the end and of the time of the last bounce, against the closed form.
-
-    The second derivative of |v| v jumps at the top, where no step ends: this limits the accuracy.
-    """
-    rtol = 1e-7
-    slopes = jax.jacfwd if adjoint == "forward" else jax.jacrev
-
-    def found(p):
-        ride = drop(p, adjoint=adjoint)
-        return jnp.stack([ride.end.q[0], ride.end.u[0], ride["h"][11], ride.jumps.t[2]])
-
-    def expected(p):
-        h, g, c, e = p
-        time, v = jnp.arccosh(jnp.exp(c * h)) / jnp.sqrt(g * c), e * jnp.sqrt(g / c * (1 - jnp.exp(-2 * c * h)))
-        for _ in range(2):
-            top = jnp.log(1 + v * v * c / g) / (2 * c)
-            time += (jnp.arctan(v * jnp.sqrt(c / g)) + jnp.arccosh(jnp.exp(c * top))) / jnp.sqrt(g * c)
-            v = e * jnp.sqrt(g / c * (1 - jnp.exp(-2 * c * top)))
-        return jnp.stack([*closed_form(p, 2.0), closed_form(p, 1.1)[0], time])
-
-    np.testing.assert_allclose(jax.jit(slopes(found))(P), jax.jacfwd(expected)(P), rtol=rtol)
-
-
-@pytest.mark.weekly
 def test_second_derivatives_through_a_jump():
     """Without drag, by height, gravity and restitution: the derivative of |v| v has a corner at the top."""
     rtol, ts, p = 1e-8, jnp.linspace(0.0, 1.0, 6), jnp.array([1.0, 9.81, 0.8])
@@ -147,12 +121,6 @@ def test_results_agree_for_other_solvers_and_options(options):
 
 
 @pytest.mark.weekly
-def test_an_implicit_solver():
-    ride = drop(P, solver=diffrax.Kvaerno5(), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose([ride.end.q[0], ride.end.u[0]], closed_form(P, 2.0), atol=1e-6)
-
-
-@pytest.mark.weekly
 def test_each_member_of_a_batch_jumps_at_its_own_times():
     """A member equals its own simulation, beside one without jumps and one with as many as are allowed."""
     heights = jnp.array([0.01, 1.0, 30.0])
@@ -168,30 +136,6 @@ def test_each_member_of_a_batch_jumps_at_its_own_times():
         np.testing.assert_allclose(batch.q[i], one.q, rtol=1e-12, atol=1e-13)
         np.testing.assert_array_equal(batch.stats["steps"][i], one.stats["steps"])
         np.testing.assert_allclose(batch.jumps.t[i], one.jumps.t, rtol=1e-12)
-
-
-@pytest.mark.parametrize("t0", [0.0, 1.7e9])
-@pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_results_do_not_depend_on_start_time_and_time_scale(t0, scale):
-    """With g / scale^2 the motion is the same at times that are scaled."""
-    p = P.at[1].divide(scale**2)
-    with_times = np.asarray(TS) * scale + t0 if t0 == 0 or scale == 1e6 else None
-    if with_times is None:
-        pytest.skip("float64 cannot resolve microseconds there")
-    ride = drop(p, with_times, atol=1e-14)
-    assert int(ride.jumps.count) == 3
-    np.testing.assert_allclose((np.asarray(ride.jumps.t[:3]) - t0) / scale, TIMES, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_float32():
-    p = P.astype(jnp.float32)
-    system = jax.tree.map(lambda x: x.astype(jnp.float32), Ball(p[3], p[2], p[1]))
-    start = jk.State(p[:1], jnp.zeros(1, jnp.float32))
-    ride = jk.simulate(system, start, jnp.asarray(TS, jnp.float32))
-    assert ride.q.dtype == jnp.float32
-    np.testing.assert_allclose(ride.jumps.t[:3], TIMES, atol=2e-4)
-    np.testing.assert_allclose(ride.end.q[0], closed_form(P, 2.0)[0], atol=1e-3)
 
 
 class Free(jk.System):
@@ -351,14 +295,6 @@ def test_a_repeated_jump_has_a_status():
 
 
 @pytest.mark.slow
-def test_accumulating_jumps_have_a_status():
-    ride = drop(P.at[3].set(0.3), max_jumps=20)
-    assert ride.reason == "max jumps"
-    assert int(ride.jumps.count) == 20
-    assert "max_jumps" in repr(ride)
-
-
-@pytest.mark.slow
 def test_a_jump_at_a_discontinuity_of_an_input():
     """The push changes its sign where the ball lands."""
     samples = jk.Samples(jnp.array([0.0, TIMES[0]]), jnp.array([0.0, 2.0]), zero_order_hold=True)
@@ -426,16 +362,6 @@ def test_functions_that_cannot_represent_jumps_raise_or_warn(tmp_path):
         jk.estimate.Filter(Ball(), {"h": 0.01})
     with pytest.warns(UserWarning, match="do not contain them"):
         jk.export.c(Ball(), tmp_path / "ball.c", ["rates"])
-
-
-@pytest.mark.weekly
-def test_a_sweep_over_parameters_with_different_numbers_of_jumps():
-    heights = jnp.array([[0.5], [1.0], [9.0]])
-    batch = jk.sweep.sweep(Ball(drag=0.0), jk.State(heights, jnp.zeros((3, 1))), jnp.linspace(0.0, 1.0, 5), chunk=2)
-    np.testing.assert_array_equal(batch.jumps.count, [2, 1, 0])
-    first = np.sqrt(2 * heights[:2, 0] / 9.81)
-    np.testing.assert_allclose(batch.jumps.t[:2, 0], first, rtol=1e-7)
-    np.testing.assert_allclose(batch.jumps.t[0, 1], first[0] * 2.6, rtol=1e-7)
 
 
 @pytest.mark.weekly
@@ -568,21 +494,3 @@ def test_times_of_jumps_in_float32_with_posix_times():
     system = jax.tree.map(lambda x: x.astype(jnp.float32), Ball(0.8, 0.1))
     ride = jk.simulate(system, start, 1.7e9 + np.asarray(TS, np.float64))
     np.testing.assert_allclose(ride.jumps.t[:3] - 1.7e9, TIMES, atol=2e-4)
-
-
-@pytest.mark.weekly
-@pytest.mark.filterwarnings("error::UserWarning")
-def test_an_impact_of_a_system_with_many_speeds_does_not_warn():
-    class Blocks(jk.System):
-        coordinates, speeds = (tuple(f"{x}{i}" for i in range(13)) for x in "xv")
-
-        def motion(self, t, q, u):
-            N, O = jk.inertial()
-            points = [O.moving(q[i] * N.x, u[i] * N.x) for i in range(13)]
-            return jk.Motion([jk.Body(1.0, 0.0, P, name=f"block {i}") for i, P in enumerate(points)])
-
-        def events(self, t, q, u):
-            return {"wall": jk.falling(q["x0"], then=jk.Impact(u["v0"], restitution=0.5))}
-
-    ride = jk.simulate(Blocks(), jk.State(np.ones(13), -np.ones(13)), np.array([0.0, 2.0]))
-    np.testing.assert_allclose(ride.u[-1], [0.5, *[-1.0] * 12], rtol=1e-12)

@@ -1,6 +1,5 @@
 """States of the first order and outputs: beside exact solutions, through every part of the library, and refused."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -99,28 +98,6 @@ def test_accelerations_state_rates_and_outputs_at_one_time(cart, ride):
 
 
 @pytest.mark.weekly
-def test_derivatives_in_both_modes_and_in_batches(cart):
-    def last(cart, force):
-        ride = jk.simulate(cart, jk.State({"place": 0.2}, {}, {"force": force}), ts, {"command": 5.0})
-        return ride["acceleration"][-1] + ride["filtered"][-3]
-
-    value_and_grad = jax.jit(jax.value_and_grad(last, (0, 1)))
-    slope, by_force = value_and_grad(cart, 3.0)[1]
-    h = 1e-5
-    for name in ("lag", "filter_time", "gain"):
-        up, down = (value_and_grad(Cart(**{name: getattr(cart, name) + d}), 3.0)[0] for d in (h, -h))
-        assert float(getattr(slope, name)) == pytest.approx(float(up - down) / (2 * h), rel=1e-5)
-    up, down = (value_and_grad(cart, 3.0 + d)[0] for d in (h, -h))
-    assert float(by_force) == pytest.approx(float(up - down) / (2 * h), rel=1e-5)
-    forward = jax.jacfwd(last, 1)(cart, 3.0)
-    assert float(forward) == pytest.approx(float(by_force), rel=1e-9)
-    batch = jk.State(jnp.full((3, 1), 0.2), jnp.zeros((3, 1)), jnp.array([[3.0, 0.0], [1.0, 0.0], [0.0, 0.5]]))
-    rides = jax.vmap(lambda state: jk.simulate(cart, state, ts, {"command": 5.0}))(batch)
-    assert rides["force"].shape == (3, 21)
-    assert float(rides["acceleration"][0, -1]) != float(rides["acceleration"][1, -1])
-
-
-@pytest.mark.weekly
 def test_a_sweep_over_parameters_and_initial_states(cart):
     rides = sweep(cart, START, ts, {"command": 5.0}, table={"lag": [0.1, 0.2], "force": [3.0, 1.0]})
     assert rides["acceleration"].shape == (2, 21)
@@ -184,42 +161,6 @@ def test_a_lag_and_the_initial_value_of_a_state_are_identified(cart):
         fit(cart, Trial(ts, measured, sigma=noise, initial={"froce": 1.0}), "lag")
     with pytest.raises(ValueError, match="has no channel acceleratoin"):
         fit(cart, Trial(ts, {"acceleratoin": measured["place"]}, sigma=1.0), "lag")
-
-
-class Falling(jk.System):
-    """Dropped, with a state whose mean is that of the height: an event while states run."""
-
-    coordinates = ("height",)
-    speeds = ("climb",)
-    states = ("mean",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        P = O.moving(q["height"] * N.z, u["climb"] * N.z, frame=N)
-        return jk.Motion([jk.Body(1.0, 0.0, P)])
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -GRAVITY * motion.N.z)
-
-    def state_rates(self, t, q, u, x, motion, now):
-        return q["height"]
-
-    def events(self, t, q, u):
-        return {"ground": q["height"]}
-
-
-@pytest.mark.weekly
-def test_an_event_ends_the_integration_of_states():
-    def end(height):
-        ride = jk.simulate(Falling(), jk.State([height], [0.0], [0.0]), ts)
-        return ride.t_end, ride.end.x[0], ride.x[-1, 0]
-
-    (t_end, mean, after), (_, slope, _) = jax.jvp(end, (2.0,), (1.0,))
-    exact = np.sqrt(2 * 2.0 / GRAVITY)
-    assert float(t_end) == pytest.approx(exact, abs=1e-9)
-    assert float(mean) == pytest.approx(2.0 * exact * 2 / 3, abs=1e-8)  # of h - g t^2 / 2 up to h = g t^2 / 2
-    assert float(slope) == pytest.approx(exact, rel=1e-5)  # d/dh (2/3 h sqrt(2 h / g)) = sqrt(2 h / g)
-    assert np.isnan(after)
 
 
 @pytest.mark.weekly

@@ -33,22 +33,6 @@ def place(t, delay):
     return sum(jump * s**2 / 2 for jump, s in zip(jumps, since, strict=True))
 
 
-def end(delay, adjoint="auto"):
-    push = jk.Samples(ts + delay, values, zero_order_hold=True)
-    return jk.simulate(Cart(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], {"push": push}, adjoint=adjoint)["place"]
-
-
-@pytest.mark.weekly
-def test_the_solution_and_its_derivative_by_a_delay_are_exact():
-    found, slope = jax.jit(lambda d: jax.jvp(lambda d: end(d, "forward"), (d,), (1.0,)))(0.03)
-    exact = [place(t, 0.03) for t in (0.0, 0.5, 1.0)]
-    np.testing.assert_allclose(found, exact, atol=1e-12)
-    h = 1e-6
-    np.testing.assert_allclose(slope, [(place(t, 0.03 + h) - place(t, 0.03 - h)) / (2 * h) for t in (0, 0.5, 1)], 1e-8)
-    reverse = jax.jit(jax.grad(lambda d: end(d)[-1]))(0.03)
-    assert float(reverse) == pytest.approx(float(slope[-1]), rel=1e-9)
-
-
 def test_fixed_steps_that_end_at_the_samples_are_exact():
     push = jk.Samples(ts, values, zero_order_hold=True)
     ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())
