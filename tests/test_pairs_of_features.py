@@ -554,7 +554,7 @@ WITH_USES: dict[str, dict[str, Any]] = {
     },
     "functions": {
         "simulate": "integrate/test_simulate.py::test_inputs_of_every_kind",
-        "derivatives": "integrate/test_zero_order_hold.py::test_a_delay_within_an_input_function_is_differentiable",
+        "derivatives": "integrate/test_zero_order_hold.py::test_a_delay_in_a_function_or_a_system_is_differentiable",
         "sweep": "sweep/test_sweep_files.py::test_values_read_by_inputs_and_reduce_are_part_of_the_digest",
         "fit": Refused(lambda: trial_with(late), r"inputs\['push'\] must be samples .*Put feedback"),
         "collocation": "collocation/test_invariance.py::test_inputs_and_systems_that_depend_on_time",
@@ -576,7 +576,7 @@ WITH_USES: dict[str, dict[str, Any]] = {
     },
     "delays": {
         "simulate": "test_a_delay_in_a_function_equals_a_delay_of_the_samples",
-        "derivatives": "integrate/test_zero_order_hold.py::test_a_delay_within_an_input_function_is_differentiable",
+        "derivatives": "integrate/test_zero_order_hold.py::test_a_delay_in_a_function_or_a_system_is_differentiable",
         "sweep": "sweep/test_sweep.py::test_a_member_has_the_discontinuities_of_its_input",
         "fit": "fit/test_transcriptions.py::test_the_delay_of_a_zero_order_hold_input_is_estimated",
         "collocation": NotApplicable("an input is a function of time, as above"),
@@ -619,7 +619,9 @@ CLOCK_OF_MULTIPLIERS = "test_multipliers_do_not_depend_on_the_start_of_the_clock
 SAME_MOTION = "test_multipliers_and_redundant_residuals_do_not_change_the_motion"
 DELAY = "test_a_delay_in_a_function_equals_a_delay_of_the_samples"
 SINGLE_PRECISION = "test_float32_gives_the_motion_of_float64"
-COARSE_CLOCK = "integrate/test_clocks.py::test_times_that_float32_cannot_resolve_are_rejected_if_inputs_depend_on_time"
+COARSE_CLOCK = (
+    "integrate/test_clocks.py::test_times_that_float32_cannot_resolve_are_rejected_if_something_depends_on_time"
+)
 
 # The laws simulate systems with states and with samples as inputs. The delays are delays in functions.
 OF_TWO: dict[str, dict[str, Any]] = {

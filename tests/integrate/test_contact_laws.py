@@ -141,18 +141,15 @@ def test_a_ball_with_spin_drag_and_friction():
 
 
 BACKSPIN = {
-    "sphere": (0.4, 1.019367991845056, 3.0193679918450567, -5.484199796126404),
     "disk": (0.5, 1.1892626571525653, 2.7208064333446593, -14.41612866689319),
     "hoop": (1.0, 1.783893985728848, 2.1218144750254844, -41.218144750254844),
 }
 BY_MU_V_W = {
-    "sphere": (-5.09683995922528, 1.7198194262414446, -0.028018057375855547),
     "disk": (-6.9373655000566306, 1.729754219050855, -0.02702457809491449),
     "hoop": (-15.60907237512742, 1.891946992864424, -0.010805300713557602),
 }
 
 
-@pytest.mark.weekly_cases("sphere")
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", BACKSPIN)
 def test_a_ball_with_backspin_slides_and_then_rolls(kind):
@@ -623,14 +620,11 @@ def test_members_of_a_sweep_whose_dry_friction_becomes_impossible():
 
 @pytest.mark.weekly
 def test_static_friction_that_equals_the_kinetic_one():
-    """The oscillator of Siconos: it rests after eight turns."""
+    """The oscillator of Siconos: it rests after eight turns, half a period apart."""
     atol, slope_atol = 1e-10, 1e-8
     slopes, ride = belt(jnp.array([1.0, 0.0, 1.0, 1.0, 12.0, 6.0]), jnp.linspace(0, 30, 21))
-    times = [0.43240777557053783, 3.574000429160331, 6.715593082750124, 9.857185736339918, 12.998778389929711]
-    times += [16.140371043519504, 19.281963697109298, 22.42355635069909]
-    np.testing.assert_allclose(jumps_of(ride), times, atol=atol)
-    np.testing.assert_allclose(
-        ride.jumps.after.q[:3, 0], [13.317821063276353, -11.317821063276353, 9.317821063276353], atol=atol
-    )
+    np.testing.assert_allclose(jumps_of(ride), 0.43240777557053783 + np.pi * np.arange(8), atol=atol)
+    turns = 13.317821063276353 - 2.0 * np.arange(3)
+    np.testing.assert_allclose(ride.jumps.after.q[:3, 0], turns * [1.0, -1.0, 1.0], atol=atol)
     np.testing.assert_allclose(end_of(ride), [0.6821789367236468, 0.0], atol=atol)
     np.testing.assert_allclose(slopes["end"][0, 5], -0.4190581774617469, atol=slope_atol)

@@ -37,11 +37,12 @@ def test_exceeding_max_jumps_ends_the_simulation():
 @pytest.mark.parametrize(
     ("options", "atol"),
     [
+        ({}, 1e-10),
         ({"step": 0.005, "rtol": None, "atol": None}, 1e-6),
         ({"solver": diffrax.Kvaerno5(), "rtol": 1e-9, "atol": 1e-9}, 1e-6),
         ({"solver": diffrax.Dopri8()}, 1e-9),
     ],
-    ids=["fixed steps", "implicit", "Dopri8"],
+    ids=["Tsit5", "fixed steps", "implicit", "Dopri8"],
 )
 def test_results_agree_for_other_solvers_and_options(options, atol):
     ride = drop(**options)

@@ -144,7 +144,7 @@ def test_singular_equations_raise_at_one_time():
 
 
 class Coupled(jk.System):
-    """Two carts on one line, coupled where their ends meet; `twice` is another point at that place."""
+    """Two carts on one line, coupled where their ends meet. `twice` is another point at that place."""
 
     coordinates, speeds, dependent_speeds = ("x", "y"), ("x_dot",), ("y_dot",)
 

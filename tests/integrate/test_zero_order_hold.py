@@ -120,14 +120,6 @@ def end_with(system, push):
     return ride["place"][-1]
 
 
-@pytest.mark.slow
-def test_a_delay_within_an_input_function_is_differentiable():
-    rtol, h = 1e-8, 1e-6
-    slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
-    found = by_delay(lambda d: end_with(Cart(), push_of("asked earlier", d, True)))
-    np.testing.assert_allclose(found, (place(1.0, 0.03), slope), rtol=rtol)
-
-
 @pytest.mark.weekly
 @pytest.mark.parametrize("form", ["branch", "controller"])
 def test_samples_called_by_a_function_equal_samples_passed_directly(form):
@@ -145,15 +137,6 @@ class Blown(Cart):
         return jk.Force(self.wind(t) * motion.N.x, motion["cart"])
 
 
-@pytest.mark.weekly
-@pytest.mark.filterwarnings("ignore:Blown")
-def test_samples_stored_in_a_system_have_derivatives_by_their_times():
-    rtol, h = 1e-8, 1e-6
-    slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
-    found = by_delay(lambda d: end_with(Blown(jk.Samples(ts + d, values, zero_order_hold=True)), None))
-    np.testing.assert_allclose(found, (place(1.0, 0.03), slope), rtol=rtol)
-
-
 class Late(Cart):
     delay: jk.Scalar = jk.parameter(0.0)  # [s]
 
@@ -161,12 +144,22 @@ class Late(Cart):
         return jk.Force(samples_held(t - self.delay) * motion.N.x, motion["cart"])
 
 
-@pytest.mark.weekly
-@pytest.mark.filterwarnings("ignore:Late")
-def test_discontinuities_of_samples_captured_by_a_system_are_found():
+DELAYED = {
+    "input": lambda d: (Cart(), push_of("asked earlier", d, True)),
+    "stored": lambda d: (Blown(jk.Samples(ts + d, values, zero_order_hold=True)), None),
+    "captured": lambda d: (Late(d), None),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.weekly_cases("stored", "captured")
+@pytest.mark.filterwarnings("ignore:Blown", "ignore:Late")
+@pytest.mark.parametrize("kind", DELAYED)
+def test_a_delay_in_a_function_or_a_system_is_differentiable(kind):
     rtol, h = 1e-8, 1e-6
     slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
-    np.testing.assert_allclose(by_delay(lambda d: end_with(Late(d), None)), (place(1.0, 0.03), slope), rtol=rtol)
+    found = by_delay(lambda d: end_with(*DELAYED[kind](d)))
+    np.testing.assert_allclose(found, (place(1.0, 0.03), slope), rtol=rtol)
 
 
 @pytest.mark.parametrize(

@@ -51,43 +51,21 @@ THREE = [0.25019093320933394, 0.794427601939151, 0.551371380490387]
 THREE_BEFORE = [-1.0991712400376326, -0.7993348603550983, 1.4942137815850476]
 FIVE = [-0.9894693908688506, 0.6424568367655326, 0.5941388575040925, -0.06413009431255845, -0.39393514636137295]
 FIVE_BEFORE = [-0.8862975515969067, -0.9805216493835016, -0.2196947764694137, 0.018193035831813198, 0.21398940829796986]
-SEVEN = [0.9910005668687853, 0.5853238384275061, 0.24435845888232532, 0.9779202953637698]
-SEVEN += [-0.5693826035288021, -0.6795759322843109, 0.22507920854606156]
-SEVEN_BEFORE = [-1.8242319681544665, -1.8572788849056154, 0.05955528108548114, -0.1351758986988436]
-SEVEN_BEFORE += [1.668671092771409, 0.5169050179640418, 0.05647058639805547]
 THREE_AFTER = [-0.7628341445235738, 0.8971463950346212, 2.523253529194818]
 THREE_AFTER_BOTH = [0.05001258516848717, 0.48084859410187786, -3.7180542874703555]
-FIVE_AFTER = [-0.9557074281794495, -1.334257728599285, -0.7459636148503581, 1.8197091532420917, -2.256063058918521]
-FIVE_AFTER_XYZ = [
-    -1.3660969652185262,
-    -0.9296782824544791,
-    2.040213282260614,
-    3.1937900338427863,
-    0.0027525998585989364,
-]
-FIVE_AFTER_BOTH = [-0.11456926433005477, -1.140670282907006, -1.867846763756749, -0.2801753155468532]
-FIVE_AFTER_BOTH += [-0.6360612801314708]
-SEVEN_AFTER = [-1.7827289017742474, -2.8790300532229764, -0.24163788782176088, 1.2789382725394245]
-SEVEN_AFTER += [5.9838897170512935, 14.841073565622176, 13.549084689798324]
-SEVEN_AFTER_XYZ = [-1.3563514393445122, -2.6637676516466544, -0.9613895286644907, 0.6879535561186859]
-SEVEN_AFTER_XYZ += [5.071222142470407, 10.659303507005815, 4.549110952643275]
-SEVEN_AFTER_BOTH = [1.0856195139841676, 0.3009631159757902, -3.5923196307916183, -1.7864524976042615]
-SEVEN_AFTER_BOTH += [2.5661152788949373, 16.566114471663127, 9.843795202223731]
+FIVE_AFTER_XYZ = [-1.3660969652185262, -0.9296782824544791, 2.040213282260614, 3.1937900338427863]
+FIVE_AFTER_XYZ += [0.0027525998585989364]
 Z, XYZ, BOTH = (tip_z, 0.5), (tip, 0.0), (tip_and_middle_z, 0.3)
 PINOCCHIO = {
     "3 z": (THREE, THREE_BEFORE, *Z, THREE_AFTER, [2.4585216212613616]),
     "3 both": (THREE, THREE_BEFORE, *BOTH, THREE_AFTER_BOTH, [-3.5064707305054093, 18.64332802349147]),
-    "5 z": (FIVE, FIVE_BEFORE, *Z, FIVE_AFTER, [-3.2862521141017305]),
     "5 xyz": (FIVE, FIVE_BEFORE, *XYZ, FIVE_AFTER_XYZ, [-1.0750988666405135, 5.149824677630524, 0.7080449645907833]),
-    "5 both": (FIVE, FIVE_BEFORE, *BOTH, FIVE_AFTER_BOTH, [-2.7727064354180477, -5.436631883634892]),
-    "7 z": (SEVEN, SEVEN_BEFORE, *Z, SEVEN_AFTER, [21.623188281537338]),
-    "7 xyz": (SEVEN, SEVEN_BEFORE, *XYZ, SEVEN_AFTER_XYZ, [0.9059103479133794, 7.313235852643972, 18.257879576082015]),
-    "7 both": (SEVEN, SEVEN_BEFORE, *BOTH, SEVEN_AFTER_BOTH, [18.659152566194383, 36.64871975241565]),
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [pytest.param(x, marks=[pytest.mark.weekly] * (x[0] > "3")) for x in PINOCCHIO])
+@pytest.mark.weekly_cases("5 *")
+@pytest.mark.parametrize("case", PINOCCHIO)
 def test_impulses_agree_with_pinocchio(case):
     q, before, residuals, e, u, p = PINOCCHIO[case]
     after = jk.impact(chain(len(q)), 0.0, q, before, residuals, e)
@@ -314,7 +292,7 @@ def test_restitution_is_relative_to_a_moving_surface():
 
 
 class Carried(jk.System):
-    """A pendulum on a pivot with a prescribed velocity; its mass has a prescribed part of its velocity."""
+    """A pendulum on a pivot with a prescribed velocity."""
 
     coordinates, speeds = ("angle",), ("rate",)
 
@@ -329,7 +307,6 @@ class Carried(jk.System):
 def test_a_prescribed_pivot_keeps_its_velocity():
     system, q, u, t = Carried(), [0.4], [1.3], 0.8
     after = jk.impact(system, t, q, u, lambda t, q, u, m: m["bob"].center.velocity.dot(m.N.x), 0.25)
-    # v = t + 1.5 cos(angle) rate
     v = t + 1.5 * np.cos(0.4) * 1.3
     np.testing.assert_allclose(after.u, [(-0.25 * v - t) / (1.5 * np.cos(0.4))], rtol=RTOL)
     energies = [jk.kinetic_energy(system, t, q, x) for x in (u, after.u)]
@@ -390,15 +367,6 @@ def test_derivatives_agree_with_central_differences():
             e = jnp.zeros_like(x).at[place].set(h)
             low, high = (f(*point[:i], x + sign * e, *point[i + 1 :]) for sign in (-1.0, 1.0))
             np.testing.assert_allclose(a[(..., *place)], (high - low) / (2 * h), rtol=0, atol=1e-8 * np.abs(a).max())
-
-
-@pytest.mark.slow
-def test_a_batch_equals_its_members():
-    us = STRIKE_U[None] + jnp.array([[0.0, 0.0], [0.3, -0.1], [-0.2, 0.4]])
-    e = jnp.array([0.0, 0.5, 1.0])
-    each = [strike(u, x, 5.0, STRIKE_Q) for u, x in zip(us, e, strict=True)]
-    batch = jax.jit(jax.vmap(lambda u, x: strike(u, x, 5.0, STRIKE_Q)))(us, e)
-    np.testing.assert_allclose(batch, np.stack(each), rtol=0, atol=1e-13)
 
 
 def test_an_elastic_impact_loses_no_energy():
