@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import Sled
 
 import jaxkane as jk
 from jaxkane.catalog import Belt
@@ -247,16 +248,6 @@ def test_a_contact_opens_if_the_table_falls_faster_than_gravity():
     np.testing.assert_allclose(slopes["gravity"]["t"][0], by_g, rtol=1e-8)
 
 
-def test_a_spinning_ball_lifts_off_a_shaking_table():
-    """It lands with friction and sticks. The friction is zero, so its limit vanishes with the normal force."""
-    ball = {"friction": 0.9, "radius": 0.1, "inertia": 0.004, "h": 1.1, "vx": 1.0, "w": -10.0, "vy": 0.5}
-    ride, _ = ride_of(np.linspace(0, 0.7, 21), push=(0.0, 8.0, 8.0, 8.0), shake=0.04, **ball)
-    assert int(ride.status) == 0
-    lifts = (2 * np.pi * 2 + np.arcsin(10.0 / (0.04 * SHAKE**2))) / SHAKE
-    np.testing.assert_allclose(jumps_of(ride)[1:], lifts, atol=1e-10)
-    assert ride.contacts["table"][-1] == OPEN
-
-
 def test_a_load_stays_on_a_shaking_table():
     """It neither sinks nor slips: A w^2 = 8 < g. The end of the rod is the contact."""
     atol = 1e-10
@@ -478,14 +469,6 @@ def test_random_simulations_satisfy_the_contact_laws(kind):
 
 ROUNDED = {
     "a ball": {"restitution": 0.7, "h": 0.1, "vy": -1.0, "radius": 0.1, "inertia": 0.004},
-    "a rod": {
-        "restitution": 0.7,
-        "friction": 0.05,
-        "inertia": 0.25,
-        "angle": -0.49304063472288884,
-        "w": 3.0,
-        "vy": 0.5,
-    },
     "a fast rod": {"restitution": 0.7, "friction": 0.3, "inertia": 0.25, "angle": 0.6488771128508386, "w": -10.0},
     "an inelastic rod": {"friction": 0.3, "inertia": 0.25, "angle": 0.008209005982792839, "vx": -2.0, "w": -10.0},
 }
@@ -590,19 +573,13 @@ def test_a_block_on_a_belt_sticks_and_slips():
     np.testing.assert_array_equal(slopes["end"][1, 4:], 0.0)
 
 
-class Brake(jk.System):
-    """A block of 1 kg, whose dry friction decreases with the time."""
+class Brake(Sled):
+    """Its dry friction decreases with the time."""
 
-    kinetic: jk.Scalar = jk.parameter(2.0, unit="N")
     decrease: jk.Scalar = jk.parameter(0.0, unit="N/s")
-    coordinates, speeds = ("x",), ("v",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="block")])
 
     def contacts(self, t, q, u, motion):
-        return {"brake": jk.DryFriction(u["v"], self.kinetic - self.decrease * t, static=2.5)}
+        return {"brake": jk.DryFriction(u["v"], 2.0 - self.decrease * t, static=2.5)}
 
 
 @pytest.mark.weekly

@@ -210,7 +210,6 @@ class TwoBlocks(jk.System):
         return {f"brake {i}": jk.DryFriction(u[i], 3.0, static=5.0) for i in range(2)}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("v", "push", "ends", "friction"),
     [
@@ -364,20 +363,6 @@ def test_a_particle_on_a_slope_changes_the_direction_of_its_slip():
     assert float(ride["vx"][-1]) > 0.99 * 1.0
     np.testing.assert_array_equal(ride.contacts["plane"], SLIDES)
     np.testing.assert_allclose(ride["plane.normal"], 9.81 * np.cos(np.arctan(0.5)), rtol=rtol)
-
-
-@pytest.mark.weekly
-def test_a_particle_bounces_and_stops_in_space():
-    """Impulses of friction mu L_N along the slip, then friction mu m g until it stops; all along one line."""
-    atol = 1e-9
-    ride = jk.simulate(
-        Particle(0.1, 0.5), jk.State({"z": 1.0}, {"vx": 1.2, "vy": 1.6}), jnp.linspace(0, 3, 21), **TIGHT
-    )
-    # The figures of a particle with vx = 2 in a plane
-    np.testing.assert_allclose(jumps_of(ride)[-1], 1.3545709229571927 + 0.6841650607329194, atol=atol)
-    np.testing.assert_allclose(end_of(ride)[:3], [0.6 * 2.138735983690112, 0.8 * 2.138735983690112, 0.0], atol=atol)
-    np.testing.assert_array_equal(ride.end.u, 0.0)
-    np.testing.assert_array_equal(ride.contacts["plane"], np.repeat([OPEN, SLIDES, STICKS], [10, 4, 7]))
 
 
 class Driven(Particle):

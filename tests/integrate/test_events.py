@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mechanisms import Bead
+from mechanisms import Bead, Sled
 from scipy.special import ellipk
 from slopes import differences, slopes
 
@@ -295,16 +295,11 @@ def test_an_event_of_a_stabilized_simulation():
     np.testing.assert_allclose(ride.end.q, [np.sqrt(0.91), 0.3], atol=1e-6)
 
 
-class Cubic(jk.System):
-    """A particle with the speed 1 whose event is a cubic polynomial of its place."""
+class Cubic(Sled):
+    """Its event is a cubic polynomial of its place. Its speed is 1."""
 
-    p: jax.Array = jk.parameter(shape=(4,))
-    event: Callable = eqx.field(static=True)
-    coordinates, speeds = ("x",), ("v",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x))])
+    p: jax.Array = jk.parameter((0.0, 0.0, 0.0, 1.0))
+    event: Callable = eqx.field(static=True, default=jk.rising)
 
     def events(self, t, q, u):
         a, b, c, d = (self.p[i] for i in range(4))
@@ -322,7 +317,9 @@ def test_the_first_crossing_of_cubics_within_one_step(event, way):
     p[::7, 3] = 0.0
     p[:40:2] = [np.poly([x, x + 0.08, y]) for x, y in rng.uniform([0.1, 1.1], [0.9, 3.0], (20, 2))]
     p[1:3] = np.poly([0.2, 0.5, 0.8]), -np.poly([0.2, 0.5, 0.8])
-    ends = jax.jit(jax.vmap(lambda p: jk.simulate(Cubic(p, event), jk.State([0.0], [1.0]), [0.0, 1.0], step=1.0).t_end))
+    ends = jax.jit(
+        jax.vmap(lambda p: jk.simulate(Cubic(p=p, event=event), jk.State([0.0], [1.0]), [0.0, 1.0], step=1.0).t_end)
+    )
     for coefficients, t_end in zip(p, np.asarray(ends(p)), strict=True):
         roots = np.roots(coefficients)
         roots = np.sort(roots[np.abs(roots.imag) < 1e-9].real)
@@ -409,19 +406,13 @@ def test_events_that_are_not_named_scalars_raise(events, message):
 
 def test_invalid_samples_raise():
     times = np.array([0.0, 1.0, 2.0])
-    for ts, values, error in (
-        (times[::-1], times, ValueError),
-        (times, times[:2], ValueError),
-        (times[:1], times[:1], ValueError),
-        (times, np.array([0.0, np.nan, 1.0]), ValueError),
-        (np.array([0.0, np.nan, 1.0]), times, ValueError),
-        (np.ma.masked_array(times, [0, 1, 0]), times, ValueError),
-        (times, times + 1j, TypeError),
-        (times, ["a", "b", "c"], TypeError),
-    ):
-        with pytest.raises(error, match="Samples"):
+    masked = np.ma.masked_array(times, [0, 1, 0])
+    for ts, values in ((times[::-1], times), (times, times[:2]), (times[:1], times[:1]), (masked, times)):
+        with pytest.raises(ValueError, match="Samples"):
             jk.Samples(ts, values)
-    for value, error in ((np.nan, ValueError), ("a", TypeError), (1j, TypeError), (np.ones(11, complex), TypeError)):
+    with pytest.raises(TypeError, match="Samples"):
+        jk.Samples(times, times + 1j)
+    for value, error in ((np.nan, ValueError), ("a", TypeError), (np.ones(11, complex), TypeError)):
         with pytest.raises(error, match="drive"):
             jk.simulate(Particle(), jk.State(jnp.ones(1), jnp.ones(1)), TS, {"drive": value})
 

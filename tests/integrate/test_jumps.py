@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import Sled
 
 import jaxkane as jk
 from jaxkane.catalog import CompassGait, RimlessWheel
@@ -142,22 +143,10 @@ def test_each_member_of_a_batch_jumps_at_its_own_times():
         np.testing.assert_allclose(batch.jumps.t[i], one.jumps.t, rtol=1e-12)
 
 
-class Free(jk.System):
-    """A particle without forces. `mode` counts or marks jumps."""
-
-    coordinates, speeds, states = ("x",), ("v",), ("mode",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x))])
-
-    def state_rates(self, t, q, u, x, motion, now):
-        return {}
-
-
 def moving(events, v=1.0, x=0.0, ts=TS, **options):
-    """A particle whose events are given by a function (t, q, u, x)."""
-    kind = type("Moving", (Free,), {"events": lambda self, t, q, u, x: events(t, q, u, x)})
+    """A particle without forces, with the events of a function (t, q, u, x). The state `mode` counts or marks jumps."""
+    members = {"states": ("mode",), "state_rates": lambda *_: {}, "events": lambda _, t, q, u, x: events(t, q, u, x)}
+    kind = type("Moving", (Sled,), members)
     return jk.simulate(kind(), jk.State(jnp.array([x]), jnp.array([v])), ts, **options)
 
 
@@ -372,16 +361,6 @@ def test_a_jump_that_violates_a_configuration_constraint_ends_the_simulation():
     bicycle = Kicked.benchmark()
     start = jk.assemble(bicycle, {}, {"roll_rate": -0.2, "rear_wheel_rate": -4.6 / bicycle.rR})
     assert jk.simulate(bicycle, start, jnp.linspace(0.0, 1.0, 3)).reason == "impossible jump"
-
-
-@pytest.mark.slow
-def test_the_last_sample_shortly_after_a_jump():
-    for late in (0.0, 1e-15, 1e-13, 1e-12, 1e-10):
-        ride = drop(P, jnp.array([0.0, TIMES[0] + late]))
-        assert ride.ok
-        assert int(ride.jumps.count) == 1
-        assert float(ride["v"][-1]) > 0
-        assert float(ride["bounces"][-1]) == 1.0
 
 
 @pytest.mark.slow

@@ -204,33 +204,25 @@ def test_a_simulation_can_be_resumed_from_its_end():
 @pytest.mark.weekly
 def test_invalid_times_and_samples_give_status_invalid_under_jit():
     """Where no check sees the numbers."""
-    kinds = (False, True)
 
     @jax.jit
     @jax.vmap
     def statuses(ts, knots, values):
-        rides = [jk.simulate(PENDULUM, START, ts)]
-        rides += [jk.simulate(PENDULUM, START, TS, {"shoulder_torque": jk.Samples(knots, values, k)}) for k in kinds]
-        return [ride.status for ride in rides]
+        torques = [None, *({"torque": jk.Samples(knots, values, zero_order_hold=x)} for x in (False, True))]
+        return [jk.simulate(Pendulum(), jk.State([0.4], [0.0]), ts, x).status for x in torques]
 
-    def with_entry(x, place, value):
-        x = np.array(x)
-        x[place] = value
-        return x
-
-    knots, values = np.linspace(-0.5, 1.5, 9), np.ones(9)
-    wrong = [(0, -np.inf), (0, np.nan), (-1, np.inf), (-1, np.nan), (4, np.nan), (4, 9.0)]
-    of_times = statuses(
-        np.stack([with_entry(TS, *entry) for entry in wrong]),
-        np.stack([with_entry(knots, *entry) for entry in wrong]),
-        np.stack([values] * len(wrong)),
-    )
-    np.testing.assert_array_equal(of_times, jk.Status.INVALID)
-    places = [with_entry(values, i, x) for i in (0, 4, -1) for x in (np.nan, np.inf)]
-    good = [np.stack([np.asarray(x)] * (len(places) + 1)) for x in (TS, knots)]
-    _, *of_values = statuses(*good, np.stack([*places, values]))
-    np.testing.assert_array_equal(np.array(of_values)[:, :-1], jk.Status.INVALID)
-    np.testing.assert_array_equal(np.array(of_values)[:, -1], jk.Status.COMPLETED)
+    ts, knots, values = np.array(TS), np.linspace(-0.5, 1.5, 9), np.ones(9)
+    cases, of_times, of_samples = [(ts, knots, values)], [jk.Status.COMPLETED], [jk.Status.COMPLETED]
+    for i, x in ((0, -np.inf), (0, np.nan), (-1, np.inf), (-1, np.nan), (4, np.nan), (4, 9.0)):
+        for k in range(3):
+            case = [ts.copy(), knots.copy(), values.copy()]
+            case[k][i] = x
+            cases.append(case)
+            of_times.append(jk.Status.INVALID if k == 0 else jk.Status.COMPLETED)
+            valid = k == 2 and x == 9.0  # any number is a valid value
+            of_samples.append(jk.Status.COMPLETED if valid else jk.Status.INVALID)
+    found = statuses(*(np.stack(x) for x in zip(*cases, strict=True)))
+    np.testing.assert_array_equal(found, [of_times, of_samples, of_samples])
 
 
 def test_progress_is_printed_on_request_only(capfd):

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import Sled
 
 import jaxkane as jk
 
@@ -34,18 +35,10 @@ def pendulum():
     return jk.catalog.DoublePendulum(mass=1.0, length=0.7), jk.State(jnp.array([1.0, -0.5]), jnp.zeros(2))
 
 
-class Oscillator(jk.System):
+class Oscillator(Sled):
     mass: jk.Scalar = jk.parameter(1.0)
     stiffness: jk.Scalar = jk.parameter(4.0)
     level: jk.Scalar = jk.parameter(-2.0)
-    coordinates, speeds, inputs = ("x",), ("v",), ("push",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="mass")])
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.Force((inputs["push"] - self.stiffness * q["x"]) * motion.N.x, motion["mass"])
 
     def events(self, t, q, u):
         return {"level": jk.falling(q["x"] - self.level)}
@@ -60,7 +53,7 @@ def test_a_fixed_step_to_a_non_finite_state_ends_the_simulation(adjoint):
     """As one with tolerances: with a reason, and derivatives that are NaN where there is no motion."""
 
     def ride(stiffness, mass=1.0):
-        push = {"push": lambda t, _: jnp.where(t > 0.55, jnp.nan, 0.0)}
+        push = {"force": lambda t, _: jnp.where(t > 0.55, jnp.nan, 0.0)}
         system = Oscillator(mass=mass, stiffness=stiffness)
         return jk.simulate(system, AT_REST, [0.0, 0.5, 1.0], push, step=0.01, adjoint=adjoint)
 
@@ -155,7 +148,7 @@ def test_a_massless_batch_member_does_not_affect_the_gradients_of_others():
     @jax.jit
     @jax.grad
     def slope(stiffness, masses):
-        of = lambda m: jk.simulate(Oscillator(m, stiffness), AT_REST, [0.0, 0.5], adjoint="reverse")  # noqa: E731
+        of = lambda m: jk.simulate(Oscillator(mass=m, stiffness=stiffness), AT_REST, [0.0, 0.5], adjoint="reverse")  # noqa: E731
         return jax.vmap(of)(masses)["x"][0, -1]
 
     expected = slope(4.0, jnp.array([1.0, 2.0]))
@@ -194,7 +187,7 @@ def test_a_step_ends_at_a_discontinuity_or_halfway_to_it():
     Steps grow by the factor 10 from 1 ms up to 0.3 s. From 0.111 s, two halves lead to 0.5 s, because a short remainder
     would make the next proposal fall below the shortest step.
     """
-    force, loose = {"push": lambda t, state: t}, {"rtol": 1e6, "atol": 1e6}
+    force, loose = {"force": lambda t, state: t}, {"rtol": 1e6, "atol": 1e6}
     options = {"solver": diffrax.Heun(), "max_step": 0.3, "discontinuities": [0.5], **loose}
     ride = jk.simulate(Oscillator(stiffness=0.0), jk.State([0.0], [0.0]), [0.0, 1.0], force, **options)
     steps = np.array([0.001, 0.01, 0.1, 0.1945, 0.1945, 0.3, 0.2])

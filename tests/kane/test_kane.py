@@ -149,39 +149,3 @@ def test_float32_stays_float32():
     assert u_dot.dtype == jnp.float32
     np.testing.assert_allclose(u_dot, jk.accelerations(WhippleBicycle.benchmark(), 0.0, q, u), rtol=1e-4, atol=1e-4)
     assert jax.grad(lambda u: jk.accelerations(bike, 0.0, q, u).sum())(u).dtype == jnp.float32
-
-
-@pytest.mark.weekly
-def test_a_long_chain():
-    """Ten speeds: M and f by closed form, derivatives in both modes."""
-
-    class Chain(jk.System):
-        coordinates = tuple(f"theta{i}" for i in range(10))
-        speeds = tuple(f"omega{i}" for i in range(10))
-        length: jk.Scalar = jk.parameter(1.0)
-
-        def motion(self, t, q, u):
-            N, P = jk.inertial()
-            bodies = []
-            for i in range(10):
-                L = N.rotate(3, q[i], u[i], f"L{i}")
-                P = P.fixed(-self.length * L.y)
-                bodies.append(jk.Body(1.0, 0.0, P, name=f"bob{i}"))
-            return jk.Motion(bodies)
-
-        def loads(self, t, q, u, motion, inputs):
-            return jk.weight(motion, -9.81 * motion.N.y)
-
-    chain = Chain()
-    q, u = jnp.linspace(0.1, 1.0, 10), jnp.linspace(1.0, -1.0, 10)
-    M, f = jk.equations_of_motion(chain, 0.0, q, u)
-    # Closed form: M_rs = (n - max(r, s)) l^2 cos(q_r - q_s); the same with sin and u_s^2, and gravity.
-    n, r = 10, np.arange(10)
-    left = (n - np.maximum(r[:, None], r[None, :])).astype(float)
-    difference = np.asarray(q)[:, None] - np.asarray(q)[None, :]
-    np.testing.assert_allclose(M, left * np.cos(difference), atol=1e-13)
-    expected = -(left * np.sin(difference)) @ np.asarray(u) ** 2 - 9.81 * (n - r) * np.sin(q)
-    np.testing.assert_allclose(f, expected, atol=1e-12)
-    total = lambda q: jk.accelerations(chain, 0.0, q, u).sum()  # noqa: E731
-    gradient, forward = jax.jit(lambda q: (jax.grad(total)(q), jax.jacfwd(total)(q)))(q)
-    np.testing.assert_allclose(gradient, forward, rtol=1e-9)

@@ -104,25 +104,6 @@ def test_joint_forces_of_a_pendulum_satisfy_newtons_law():
     np.testing.assert_allclose(forces["O"], m * (a1 + a2 - 2 * g), rtol=RTOL, atol=RTOL)
 
 
-@pytest.mark.slow
-def test_joint_forces_of_the_spatial_pendulum_satisfy_newtons_law():
-    system, q, u = moving("SpatialDoublePendulum")
-    forces = constraint_forces(system, 0.0, q, u)
-    weights = np.array([[0.0, 9.81 * m, 0.0] for m in (1.2, 0.8)])
-    both, second = momentum_rate(system, q, u), momentum_rate(system, q, u, bodies=slice(1, 2))
-    np.testing.assert_allclose(forces["O"], both + weights.sum(0), rtol=RTOL, atol=1e-12)
-    np.testing.assert_allclose(forces["A"], second + weights[1], rtol=RTOL, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_the_force_of_a_rail_is_normal_to_the_rail():
-    # Exercise 5.2: along the rail nothing but the loads, across it the weights and the bar's momentum
-    system, q, u = moving("SliderWithPinnedBar")
-    force = constraint_forces(system, 0.0, q, u, {"force": 3.0})["A"]
-    p_dot = momentum_rate(system, q, u, {"force": 3.0})
-    np.testing.assert_allclose(force, [0.0, p_dot[1] + 3.0 * 9.81, 0.0], rtol=RTOL, atol=1e-12)
-
-
 def test_guide_forces_of_piston_and_slider_agree_with_newton_euler():
     # Exercise 5.1, by Newton and Euler on the bar: the wall of A pushes along x, the guide of B along y.
     system, q, u = moving("BarWithPiston")
