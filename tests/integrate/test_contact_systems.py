@@ -4,21 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_contact_laws import OPEN, SLIDES, STICKS, TIGHT, end_of, jumps_of
 
 import jaxkane as jk
 from jaxkane.catalog import RockingBlock
-
-TIGHT = {"rtol": 1e-12, "atol": 1e-12}
-OPEN, SLIDES, STICKS = 0, 1, 2
-
-
-def end_of(ride):
-    return np.concatenate([ride.end.q, ride.end.u])
-
-
-def jumps_of(ride):
-    """The times of the jumps that exist."""
-    return np.asarray(ride.jumps.t)[: int(ride.jumps.count)]
 
 
 # -- A block with two corners.

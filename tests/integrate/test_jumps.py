@@ -303,15 +303,6 @@ def test_the_energy_balance_includes_losses_in_jumps():
     assert jk.audit(RimlessWheel(), wheel).energy_balance < 1e-9
 
 
-def test_functions_that_cannot_represent_jumps_raise_or_warn(tmp_path):
-    with pytest.raises(
-        ValueError, match=r"events or contacts of Ball change its state: floor\. A Kalman filter cannot"
-    ):
-        jk.estimate.Filter(Ball(), {"h": 0.01})
-    with pytest.warns(UserWarning, match="do not contain them"):
-        jk.export.c(Ball(), tmp_path / "ball.c", ["rates"])
-
-
 @pytest.mark.weekly
 def test_invalid_jumps_raise():
     def then(new):
