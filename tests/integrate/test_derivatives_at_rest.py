@@ -134,15 +134,6 @@ def test_a_value_is_the_same_with_and_without_its_derivative():
 
 
 @pytest.mark.slow
-def test_an_adjoint_of_diffrax_differentiates_the_steps_of_the_motion():
-    p = jnp.array([0.3, 0.0, 0.0, 0.0, 0.0])
-    plain = jk.simulate(Oscillator(), jk.State(p[:2], jnp.zeros(2)), [0.0, 10.0], adjoint=diffrax.ForwardMode())
-    assert plain.adjoint == "ForwardMode"
-    found = jax.jacfwd(lambda p: end(p, adjoint=diffrax.ForwardMode()))(p)
-    assert abs(found[1, 1] - np.cos(200.0)) > 0.1  # the steps do not resolve the fast part, which rests
-
-
-@pytest.mark.slow
 def test_a_stiff_part_that_has_decayed_does_not_shorten_the_steps():
     """u1' = -1e4 u1, as a first-order state beside a slow one."""
 

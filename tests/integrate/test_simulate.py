@@ -107,8 +107,6 @@ def test_a_fall_and_singular_speeds_end_a_bicycle_simulation():
     ("adjoint", "mode"),
     [
         ("auto", "forward"),
-        ("auto", "reverse"),
-        ("both", "forward"),
         ("both", "reverse"),
         (diffrax.DirectAdjoint(), "forward"),
         (diffrax.DirectAdjoint(), "reverse"),
@@ -124,8 +122,7 @@ def test_every_adjoint_against_differences(adjoint, mode):
         torque = {"torque": x[2] * TS[:3]}
         options = {"adjoint": adjoint, "step": 0.05, "max_steps": 4}
         ride = jk.simulate(Pendulum(length=x[0]), jk.State(x[1:2], jnp.zeros(1)), TS[:3], torque, **options)
-        if adjoint != "both":
-            assert ride.adjoint == ("fixed steps" if adjoint == "auto" else type(adjoint).__name__)
+        assert ride.adjoint == ("fixed steps" if isinstance(adjoint, str) else type(adjoint).__name__)
         return ride["angle"][-1] + ride["rate"][1]
 
     both, x = slopes(read, mode), jnp.array([1.1, 0.4, 3.0])

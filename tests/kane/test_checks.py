@@ -388,11 +388,10 @@ def test_assemble_is_twice_differentiable_and_can_be_vmapped():
     bike = WhippleBicycle.benchmark()
     pitch = lambda x: jk.assemble(bike, jnp.zeros(8).at[jnp.array([0, 2])].set(x)).q[4]  # noqa: E731
     x, h = jnp.array([0.3, -0.5]), 1e-5
-    forward, reverse = jax.jacfwd(pitch)(x), jax.grad(pitch)(x)
-    e = h * jnp.eye(2)
+    forward, e = jax.jacfwd(pitch)(x), h * jnp.eye(2)
     numeric = jnp.stack([(pitch(x + d) - pitch(x - d)) / (2 * h) for d in e])
     np.testing.assert_allclose(forward, numeric, atol=1e-9)
-    np.testing.assert_allclose(reverse, forward, atol=1e-13)
+    np.testing.assert_allclose(jax.grad(pitch)(x), forward, atol=1e-13)
     hessian = jax.jacfwd(jax.jacfwd(pitch))(x)
     slopes = jax.jit(jax.jacfwd(pitch))
     numeric = jnp.stack([(slopes(x + d) - slopes(x - d)) / (2 * h) for d in e])
