@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
@@ -144,16 +143,6 @@ def test_work_between_too_few_samples_has_a_large_reported_error(times):
 
 
 @pytest.mark.slow
-def test_an_inaccurate_simulation_with_a_damper_fails_the_audit():
-    ride = jk.simulate(
-        OSCILLATOR, jk.State([0.1], [0.0]), np.linspace(0.0, 1.0, 97), rtol=1e-2, atol=1e-2, max_step=1.0
-    )
-    audit = jk.audit(OSCILLATOR, ride)
-    assert audit.energy_balance > 1e-3
-    assert not audit.ok
-
-
-@pytest.mark.slow
 def test_verdicts_do_not_depend_on_the_units():
     """Lengths of 1e-6 to 1e6 m and times of 1e-12 s; a loop that is open by one per cent is found in all units."""
     tables = []
@@ -192,31 +181,3 @@ def test_reflected_inertias_do_not_contribute_to_the_momentum():
     np.testing.assert_allclose(audit.angular_momentum, audit.angular_momentum[:1].repeat(41, 0), atol=1e-8)
     assert np.ptp(audit.kinetic_energy) > 0.01
     assert audit.energy_balance < 1e-7  # their kinetic energy is counted
-
-
-class DrivenRod(jk.System):
-    """A driven rod in a plane; where `anew`, its torque acts on a frame that `loads` makes itself."""
-
-    anew: bool = eqx.field(static=True, default=False)
-    coordinates = ("angle",)
-    speeds = ("rate",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        rod = N.rotate(3, q["angle"], u["rate"])
-        return jk.Motion([jk.Body(1.0, (0.1, 0.0, 0.1), O.fixed(0.5 * rod.x), rod)], frames={"rod": rod})
-
-    def loads(self, t, q, u, motion, inputs):
-        rod = motion.N.rotate(3, q["angle"], u["rate"]) if self.anew else motion["rod"]
-        return (jk.Torque(0.2 * motion.N.z, rod),)
-
-
-@pytest.mark.slow
-def test_loads_on_frames_created_in_loads_do_work():
-    """0.2 N m on a rod of 0.1 kg m^2 about its end, 1 kg at 0.5 m: 0.2 / 0.35 rad/s^2."""
-    start, ts = jk.State(jnp.zeros(1), jnp.array([2.0])), jnp.linspace(0.0, 0.1, 6)
-    for anew in (False, True):
-        np.testing.assert_allclose(jk.accelerations(DrivenRod(anew=anew), 0.0, [0.0], [2.0]), 0.2 / 0.35, rtol=1e-14)
-    audit = jk.audit(DrivenRod(anew=True), jk.simulate(DrivenRod(anew=True), start, ts))
-    assert audit.ok
-    np.testing.assert_allclose(audit.work, 0.2 * (2.0 * ts + 0.5 * 0.2 / 0.35 * ts**2), rtol=1e-7)

@@ -135,11 +135,8 @@ def test_third_derivatives_of_the_end_time_are_nan():
 class Clocked(Particle):
     """An event that oscillates in a motion without forces, so that error control alone would pass over it."""
 
-    def loads(self, t, q, u, motion, inputs):
-        return []
-
     def events(self, t, q, u):
-        return {"tick": jk.falling(jnp.cos(np.pi / 2 * (q["x"] + 0.0)))}
+        return {"tick": jk.falling(jnp.cos(np.pi / 2 * q["x"]))}
 
 
 @pytest.mark.slow

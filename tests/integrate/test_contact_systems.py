@@ -183,68 +183,49 @@ def test_events_change_the_state_of_closed_contacts():
     np.testing.assert_allclose(jumps_of(rest), [stops, 1.0, lands], atol=atol)
 
 
-class TwoBlocks(jk.System):
-    """Two independent blocks of 1 kg with dry friction: 3 N while they slide, 5 N at rest."""
+class TwoPoints(jk.System):
+    """Two independent points of 1 kg on a floor, with forces along it. Friction: 3 N while they slide, 5 N at rest."""
 
-    coordinates, speeds, inputs = ("x1", "x2"), ("v1", "v2"), ("push1", "push2")
+    coordinates, speeds, inputs = ("x1", "y1", "x2", "y2"), ("vx1", "vy1", "vx2", "vy2"), ("push1", "push2")
 
     def motion(self, t, q, u):
         N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[i] * N.x, u[i] * N.x), name=f"block {i}") for i in range(2)])
+        points = {f"point {i}": O.moving(N.vector(*q[k : k + 2], 0.0), N.vector(*u[k : k + 2], 0.0)) for i, k in PLACES}
+        return jk.Motion(
+            [jk.Body(1.0, 0.0, point, name=f"body {name}") for name, point in points.items()], points=points
+        )
 
     def loads(self, t, q, u, motion, inputs):
-        return [jk.Force(inputs[f"push{i + 1}"] * motion.N.x, body) for i, body in enumerate(motion.bodies)]
+        push = [jk.Force(inputs[f"push{i}"] * motion.N.x, motion[f"point {i}"]) for i, _ in PLACES]
+        return jk.weight(motion, -10.0 * motion.N.y), push
 
     def contacts(self, t, q, u, motion):
-        return {f"brake {i}": jk.DryFriction(u[i], 3.0, static=5.0) for i in range(2)}
+        law = {"friction": 0.3, "static": 0.5}
+        return {f"point {i}": jk.Contact(motion[f"point {i}"], motion.N.y, **law) for i, _ in PLACES}
+
+
+PLACES = ((1, 0), (2, 2))
 
 
 @pytest.mark.parametrize(
-    ("v", "push", "ends", "friction"),
+    ("u", "push", "ends", "friction"),
     [
-        ((0.6, 3.0), (0.0, 0.0), (0.0, 1.5), (0.0, -3.0)),  # at 0.2 s the first block stops, and the other slides on
-        ((0.0, 0.0), (4.0, 6.0), (0.0, 1.5), (-4.0, -3.0)),  # static friction holds one block, and not the other one
-        ((0.0, 3.0), (2.0, 2.0), (0.0, 2.5), (-2.0, -3.0)),  # the smaller force does not stop the sliding block
+        ((0.6, 0.0, 3.0, 0.0), (0.0, 0.0), (0.0, 1.5), (0.0, -3.0)),  # at 0.2 s one stops, and the other slides on
+        ((0.0, 0.0, 0.0, 0.0), (4.0, 6.0), (0.0, 1.5), (-4.0, -3.0)),  # static friction holds only one
+        ((0.0, 0.0, 3.0, 0.0), (2.0, 2.0), (0.0, 2.5), (-2.0, -3.0)),  # the smaller force does not stop the slip
+        ((0.2, -1.0, 2.0, -1.0), (0.0, 0.0), (0.0, 0.2), (0.0, -3.0)),  # an impact stops one: impulses 0.2 and 0.3
     ],
-    ids=["stops", "static", "slides"],
+    ids=["stops", "static", "slides", "impact"],
 )
-def test_independent_blocks_stick_and_slide_independently(v, push, ends, friction):
+def test_independent_points_stick_and_slide_independently(u, push, ends, friction):
     atol = 1e-10
     inputs = dict(zip(("push1", "push2"), push, strict=True))
-    ride = jk.simulate(TwoBlocks(), jk.State(jnp.zeros(2), jnp.array(v)), jnp.linspace(0, 0.5, 21), inputs, **TIGHT)
-    np.testing.assert_allclose(ride.end.u, ends, atol=atol)
-    np.testing.assert_allclose([ride["brake 0.friction"][-1], ride["brake 1.friction"][-1]], friction, atol=atol)
-    assert [int(ride.contacts[f"brake {i}"][-1]) for i in range(2)] == [STICKS, SLIDES]
-
-
-class TwoPoints(jk.System):
-    """Two independent points of 1 kg over a floor."""
-
-    coordinates, speeds = ("x1", "y1", "x2", "y2"), ("x1_dot", "y1_dot", "x2_dot", "y2_dot")
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        points = [O.moving(q[i] * N.x + q[i + 1] * N.y, u[i] * N.x + u[i + 1] * N.y) for i in (0, 2)]
-        bodies = [jk.Body(1.0, 0.0, point, name=f"body {i}") for i, point in enumerate(points)]
-        return jk.Motion(bodies, points={f"point {i}": point for i, point in enumerate(points)})
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -10.0 * motion.N.y)
-
-    def contacts(self, t, q, u, motion):
-        return {name: jk.Contact(motion[name], motion.N.y, friction=0.5) for name in ("point 0", "point 1")}
-
-
-@pytest.mark.weekly
-def test_one_point_stops_in_an_impact_and_the_other_slides_on():
-    """Both have the normal impulse 1. The first one needs the impulse 0.2 of friction to stop, the other one 2."""
-    atol = 1e-10
-    start = jk.State({}, {"x1_dot": 0.2, "y1_dot": -1.0, "x2_dot": 2.0, "y2_dot": -1.0})
-    ride = jk.simulate(TwoPoints(), start, jnp.linspace(0, 0.2, 21), **TIGHT)
-    np.testing.assert_allclose(ride.jumps.after.u[0], [0.0, 0.0, 1.5, 0.0], atol=atol)
-    np.testing.assert_allclose(ride.jumps.impulses[0], [1.0, -0.2, 1.0, -0.5], atol=atol)
-    np.testing.assert_allclose(ride.end.u, [0.0, 0.0, 0.5, 0.0], atol=atol)
-    assert [int(ride.contacts[f"point {i}"][-1]) for i in range(2)] == [STICKS, SLIDES]
+    ride = jk.simulate(TwoPoints(), jk.State(jnp.zeros(4), jnp.array(u)), jnp.linspace(0, 0.5, 21), inputs, **TIGHT)
+    np.testing.assert_allclose(ride.end.u, [ends[0], 0.0, ends[1], 0.0], atol=atol)
+    np.testing.assert_allclose([ride["point 1.friction"][-1], ride["point 2.friction"][-1]], friction, atol=atol)
+    assert [int(ride.contacts[f"point {i}"][-1]) for i in (1, 2)] == [STICKS, SLIDES]
+    if u[1]:
+        np.testing.assert_allclose(ride.jumps.impulses[0], [1.0, -0.2, 1.0, -0.3], atol=atol)
 
 
 # -- Balls in a row (exact fractions).

@@ -148,7 +148,7 @@ def test_a_massless_batch_member_does_not_affect_the_gradients_of_others():
     @jax.jit
     @jax.grad
     def slope(stiffness, masses):
-        of = lambda m: jk.simulate(Oscillator(mass=m, stiffness=stiffness), AT_REST, [0.0, 0.5], adjoint="reverse")  # noqa: E731
+        of = lambda m: jk.simulate(Sled(m, 0.0, stiffness), AT_REST, [0.0, 0.5], adjoint="reverse")  # noqa: E731
         return jax.vmap(of)(masses)["x"][0, -1]
 
     expected = slope(4.0, jnp.array([1.0, 2.0]))

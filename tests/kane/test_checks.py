@@ -1,6 +1,5 @@
 """Wrong descriptions and bad numbers: each is caught with an error that names what is wrong."""
 
-import dataclasses
 import warnings
 
 import equinox as eqx
@@ -255,21 +254,6 @@ def test_impossible_inertias_are_checked_by_the_same_rule_everywhere(asked):
         asked(Spinner(1.0, 1.0, 2.2))
     with pytest.raises(ValueError, match="none may be negative"):
         asked(AnyInertia(1.0, -0.1, 1.0))
-
-
-@pytest.mark.weekly
-def test_impossible_bodies_in_a_batch_have_status_invalid():
-    # possible, rounded, measured, refused, negative
-    I33 = np.array([2.0, 2.003, 2.1, 2.2, -0.1])
-    right = [0, 0, 0, 4, 4]
-    body = Spinner(1.0, 1.0, 1.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        rides = jk.sweep.sweep(body, RESTING, TS, table=jk.sweep.grid(I33=I33))
-        by_vmap = jax.jit(jax.vmap(lambda I: jk.simulate(dataclasses.replace(body, I33=I), RESTING, TS).status))(I33)
-    np.testing.assert_array_equal(rides.status, right)
-    assert np.isnan(rides.q[3:]).all()
-    np.testing.assert_array_equal(by_vmap, right)
 
 
 def test_an_inertia_needs_a_frame():

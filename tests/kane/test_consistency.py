@@ -282,6 +282,14 @@ def test_loads_may_act_on_points_created_in_loads(way):
     np.testing.assert_allclose(slope, [-3.0], rtol=1e-12)
 
 
+@pytest.mark.slow
+def test_loads_on_points_created_in_loads_do_work():
+    ride = jk.simulate(Pushed("again"), jk.State([0.4], [0.5]), np.linspace(0.0, 0.1, 6), {"torque": 0.3})
+    audit = jk.audit(Pushed("again"), ride)
+    assert audit.ok
+    assert audit.work[-1] > 0.1
+
+
 def test_loads_on_points_of_a_motion_without_speeds_are_refused():
     with pytest.raises(ValueError, match=r"Pushed: the (frame 'B' turns|point .* moves) with .*self.motion\(t, q"):
         evaluate(Pushed("still"), jk.State(np.array([0.4]), np.array([0.5])))

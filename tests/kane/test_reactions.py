@@ -170,32 +170,6 @@ def test_constraint_moments_of_a_frame():
     np.testing.assert_allclose(forces["B"], [0.0, -10.0, 0.0], rtol=RTOL, atol=RTOL)
 
 
-class Sleigh(jk.System):
-    """Chaplygin's sleigh: a knife edge at P, from which the body is built; a scalar residual."""
-
-    coordinates = ("x", "y", "angle")
-    speeds = ("vx", "rate")
-    dependent_speeds = ("vy",)
-
-    def q_dot(self, t, q, u):
-        return u["vx"], u["vy"], u["rate"]
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        B = N.rotate(3, q["angle"], u["rate"], "B")
-        P = O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["vx"], u["vy"], 0.0))
-        body = jk.Body(2.0, (0.2, 0.2, 0.3), P.fixed(0.4 * B.x), B)
-        return jk.Motion([body], [P.velocity.dot(B.y)])
-
-
-@pytest.mark.slow
-def test_the_multiplier_of_a_scalar_residual_is_a_force_along_it():
-    system, q, u = Sleigh(), jnp.array([0.1, 0.2, 0.5]), jnp.array([1.0, 0.7])
-    (force,) = constraint_multipliers(system, 0.0, q, u)
-    across = np.array([-np.sin(0.5), np.cos(0.5), 0.0])
-    np.testing.assert_allclose(force * across, momentum_rate(system, q, u), rtol=RTOL, atol=RTOL)
-
-
 class Lift(jk.System):
     """A particle that slides on a platform, which rises with the velocity t^2."""
 

@@ -176,13 +176,7 @@ class Doubled(jk.System):
 
 @pytest.mark.parametrize("L", [1e-9, 1.0, 1e9])
 def test_a_doubled_velocity_is_refused_in_any_unit(L):
-    class Fresh(Doubled):
-        """Descriptions are checked once for each class."""
-
-    assert np.isfinite(jk.accelerations(Fresh(L), 0.0, [0.3], [0.5]))
-
-    class Wrong(Doubled):
-        pass
-
+    right, wrong = (type("Fresh", (Doubled,), {})(L, factor) for factor in (1.0, 2.0))  # checked once for each class
+    assert np.isfinite(jk.accelerations(right, 0.0, [0.3], [0.5]))
     with pytest.raises(ValueError, match="moves with"):
-        jk.accelerations(Wrong(L, 2.0), 0.0, [0.3], [0.5])
+        jk.accelerations(wrong, 0.0, [0.3], [0.5])
