@@ -380,7 +380,7 @@ class Billiard(jk.System):
         w = N.vector(*u["wx":"wz"])
         C = O.moving(N.vector(*q["x":"z"]), N.vector(*u["vx":"vz"]))
         I = 0.4 * self.radius**2
-        bottom = jk.Point.at(C.velocity + w.cross(-self.radius * N.z), C.position - self.radius * N.z)
+        bottom = jk.Point.at(C.velocity + w.cross(-self.radius * N.z))
         return jk.Motion([jk.Body(1.0, (I, I, I), C, N, w, name="ball")], points={"bottom": bottom})
 
     def loads(self, t, q, u, motion, inputs):
@@ -388,7 +388,7 @@ class Billiard(jk.System):
 
     def contacts(self, t, q, u, motion):
         law = {"friction": self.friction, "restitution": self.restitution}
-        return {"table": jk.Contact(motion["bottom"], motion.N.z, **law)}
+        return {"table": jk.Contact(motion["bottom"], motion.N.z, gap=q["z"] - self.radius, **law)}
 
 
 @pytest.mark.weekly
