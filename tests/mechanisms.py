@@ -1,7 +1,6 @@
 """Systems that tests of several rooms use."""
 
 import dataclasses
-import itertools
 
 import equinox as eqx
 import jax
@@ -248,40 +247,6 @@ class BouncingBall(jk.catalog.BouncingBall):
         return {"floor": jk.Contact(gap=q["height"], restitution=self.restitution)}
 
 
-class KerbWheel(jk.System):
-    """A disc over a road with a kerb: it flies, lands, rolls, slides."""
-
-    radius: Scalar = parameter(0.35)
-    height: Scalar = parameter(0.08)  # of the kerb, which ends at x = 0
-    friction: Scalar = parameter(0.8)
-    coordinates = ("yaw", "lean", "spin", "x", "y", "z")
-    speeds = ("yaw_rate", "lean_rate", "spin_rate", "x_dot", "y_dot", "z_dot")
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        Y = N.rotate(3, q["yaw"], u["yaw_rate"])
-        L = Y.rotate(1, q["lean"], u["lean_rate"], "L")
-        W = L.rotate(2, q["spin"], u["spin_rate"], "W")
-        center = O.moving(N.vector(*q["x":"z"]), N.vector(*u["x_dot":"z_dot"]))
-        disc = jk.Body(1.5, (0.09, 0.18, 0.09), center, L, W.angular_velocity, name="disc")
-        rim = center.fixed(-self.radius * L.z, W)
-        return jk.Motion([disc], points={"rim": rim, "center": center}, frames={"W": W})
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -9.81 * motion.N.z)
-
-    def contacts(self, t, q, u, motion):
-        N, rim, center = motion.N, motion["rim"], motion["center"]
-        out = q["x":"z"][0], q["x":"z"][2] - self.height  # from the edge to the centre, in the plane x z
-        distance = jnp.sqrt(out[0] ** 2 + out[1] ** 2)
-        away = (out[0] / distance) * N.x + (out[1] / distance) * N.z
-        edge = center.fixed(-self.radius * away, motion["W"])
-        return {
-            "road": jk.Contact(rim, N.z, friction=self.friction),
-            "kerb": jk.Contact(edge, away, gap=distance - self.radius, friction=self.friction),  # upright wheel
-        }
-
-
 class SliderCrank(jk.System):
     """A crank, a rod and a slider on y = 0, closed by configuration constraints."""
 
@@ -301,34 +266,6 @@ class SliderCrank(jk.System):
         crank = jk.Body(0.6, (0.0, 0.0, 0.6 * 0.15**2 / 12), O.fixed(0.075 * A.x), A, name="crank")
         rod = jk.Body(0.9, (0.0, 0.0, 0.9 * 0.4**2 / 12), pin.fixed(0.2 * B.x), B, name="rod")
         return jk.Motion([crank, rod, jk.Body(0.5, 0.0, slider, name="slider")], points={"pin": pin})
-
-
-class SliderInGuides(jk.System):
-    """A slider crank whose slider has four corners between two guides (Flores and Glocker)."""
-
-    coordinates, speeds = ("crank", "rod", "slider"), ("crank_rate", "rod_rate", "slider_rate")
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        A, B, S = (N.rotate(3, x, rate) for x, rate in zip(q, u, strict=True))
-        pin = O.fixed(0.153 * A.x)
-        P = pin.fixed(0.306 * B.x)
-        crank = jk.Body(0.038, (0.0, 0.0, 7.4e-5), O.fixed(0.0765 * A.x), A, name="crank")
-        rod = jk.Body(0.038, (0.0, 0.0, 5.9e-4), pin.fixed(0.153 * B.x), B, name="rod")
-        places = itertools.product((0.025, -0.025), (-0.05, 0.05))
-        corners = {f"corner {i}": P.fixed(x * S.x + y * S.y) for i, (y, x) in enumerate(places)}
-        return jk.Motion([crank, rod, jk.Body(0.076, (0.0, 0.0, 2.7e-6), P, S, name="slider")], points=corners)
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -9.81 * motion.N.y)
-
-    def contacts(self, t, q, u, motion):
-        law, N = {"restitution": 0.4, "friction": 0.01}, motion.N
-        sides = {f"corner {i}": (-1.0 if i < 2 else 1.0) * N.y for i in range(4)}
-        return {
-            name: jk.Contact(motion[name], side, gap=0.026 + motion[name].position.dot(side), **law)
-            for name, side in sides.items()
-        }
 
 
 class Sled(jk.System):

@@ -183,14 +183,14 @@ MUTATIONS = (
     Mutation("contacts: the friction of two corners is not proportional to their limits", "_kane/contact/laws.py",
              "shares = jnp.clip(limits / jnp.where(largest > 0, largest, 1.0), 1e-8, 1.0)",
              "shares = jnp.ones_like(limits)",
-             "kane/test_unilateral.py integrate/test_contact_systems.py integrate/test_contact_laws.py"),
+             "integrate/test_contact_systems.py integrate/test_contact_laws.py"),
     Mutation("contacts: all sliding contacts stop when one does", "_kane/contact/states_after_jump.py",
              "stops |= jnp.any(stops) & is_slow & (memory.states == SLIDES) & ~bearing",
              "stops |= jnp.any(stops) & (memory.states == SLIDES) & ~bearing",
              "integrate/test_contact_systems.py integrate/test_contact_laws.py integrate/test_contact_options.py"),
     Mutation("contacts: sticking is limited by the kinetic friction", "_kane/contact/laws.py",
              "(force - self.slip.static * L[:, 0])", "(force - self.friction * L[:, 0])",
-             "kane/test_unilateral.py integrate/test_contact_laws.py integrate/test_contact_systems.py"),
+             "integrate/test_contact_laws.py integrate/test_contact_systems.py"),
 )
 # fmt: on
 

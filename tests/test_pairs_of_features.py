@@ -495,8 +495,8 @@ WITH_USES: dict[str, dict[str, Any]] = {
     },
     "jumps": {
         "simulate": "integrate/test_jumps.py::test_a_bouncing_ball_with_drag",
-        "derivatives": "integrate/test_jumps.py::test_derivatives_through_jumps",
-        "sweep": "integrate/test_jumps.py::test_a_sweep_over_parameters_with_different_numbers_of_jumps",
+        "derivatives": "integrate/test_laws_of_simulations.py::test_forward_derivatives_equal_central_differences",
+        "sweep": "integrate/test_laws_of_simulations.py::test_a_batch_equals_its_members_and_its_saved_files",
         "fit": Refused(lambda: with_noise(Jumping(), {"x": 0.1, "v": 0.0, "force": 0.0}), OMIT_NOISE),
         "collocation": "collocation/test_known_solutions.py::test_gaits_of_walkers",
         "orbit": "stability/test_periodic.py::test_rimless_wheel",
@@ -506,7 +506,7 @@ WITH_USES: dict[str, dict[str, Any]] = {
     },
     "states": {
         "simulate": "integrate/test_states.py::test_states_of_a_linear_system_agree_with_the_exact_solution",
-        "derivatives": "integrate/test_states.py::test_derivatives_in_both_modes_and_in_batches",
+        "derivatives": "integrate/test_laws_of_simulations.py::test_forward_derivatives_equal_central_differences",
         "sweep": "integrate/test_states.py::test_a_sweep_over_parameters_and_initial_states",
         "fit": "integrate/test_states.py::test_a_lag_and_the_initial_value_of_a_state_are_identified",
         "collocation": "collocation/test_invariance.py::test_first_order_states_and_outputs",
@@ -516,8 +516,8 @@ WITH_USES: dict[str, dict[str, Any]] = {
         "C": "integrate/test_states.py::test_exported_functions_take_states_after_the_inputs",
     },
     "dependent speeds": {
-        "simulate": "integrate/test_simulate.py::test_energy_and_front_contact_over_five_seconds",
-        "derivatives": "integrate/test_simulate.py::test_gradients_of_the_bicycle",
+        "simulate": "integrate/test_audit.py::test_energy_balance_of_ten_seconds",
+        "derivatives": "integrate/test_laws_of_simulations.py::test_forward_derivatives_equal_central_differences",
         "sweep": "sweep/test_sweep_tables.py::test_dependent_coordinates_are_recomputed_for_each_member",
         "fit": "fit/test_noise.py::test_likelihood_with_dependent_coordinates",
         "collocation": "collocation/test_invariance.py::test_dependent_coordinates_and_speeds",
@@ -554,7 +554,7 @@ WITH_USES: dict[str, dict[str, Any]] = {
     },
     "functions": {
         "simulate": "integrate/test_simulate.py::test_inputs_of_every_kind",
-        "derivatives": "integrate/test_zero_order_hold.py::test_a_delay_within_an_input_function_is_differentiable",
+        "derivatives": "integrate/test_zero_order_hold.py::test_a_delay_in_a_function_or_a_system_is_differentiable",
         "sweep": "sweep/test_sweep_files.py::test_values_read_by_inputs_and_reduce_are_part_of_the_digest",
         "fit": Refused(lambda: trial_with(late), r"inputs\['push'\] must be samples .*Put feedback"),
         "collocation": "collocation/test_invariance.py::test_inputs_and_systems_that_depend_on_time",
@@ -576,7 +576,7 @@ WITH_USES: dict[str, dict[str, Any]] = {
     },
     "delays": {
         "simulate": "test_a_delay_in_a_function_equals_a_delay_of_the_samples",
-        "derivatives": "integrate/test_zero_order_hold.py::test_the_solution_and_its_derivative_by_a_delay_are_exact",
+        "derivatives": "integrate/test_zero_order_hold.py::test_a_delay_in_a_function_or_a_system_is_differentiable",
         "sweep": "sweep/test_sweep.py::test_a_member_has_the_discontinuities_of_its_input",
         "fit": "fit/test_transcriptions.py::test_the_delay_of_a_zero_order_hold_input_is_estimated",
         "collocation": NotApplicable("an input is a function of time, as above"),
@@ -586,7 +586,7 @@ WITH_USES: dict[str, dict[str, Any]] = {
         "C": NO_INPUT,
     },
     "float32": {
-        "simulate": "integrate/test_simulate.py::test_float32_results",
+        "simulate": "integrate/test_laws_of_simulations.py::test_float32_gives_the_results_of_float64",
         "derivatives": "integrate/test_laws_of_simulations.py::test_float32_gives_the_results_of_float64",
         "sweep": "test_a_sweep_in_float32_with_time_stamps_of_today_equals_its_members",
         "fit": "test_a_fit_in_float32_with_time_stamps_of_today_recovers_the_parameter_of_its_simulation",
@@ -600,7 +600,7 @@ WITH_USES: dict[str, dict[str, Any]] = {
     },
     "clocks": {
         "simulate": "integrate/test_clocks.py::test_elapsed_time_is_exact_at_samples",
-        "derivatives": "integrate/test_clocks.py::test_derivatives_do_not_depend_on_the_start_time",
+        "derivatives": "integrate/test_laws_of_simulations.py::test_results_do_not_depend_on_the_start_of_the_clock",
         "sweep": "test_a_sweep_in_float32_with_time_stamps_of_today_equals_its_members",
         "fit": "fit/test_collocation.py::test_missing_samples_and_a_clock_offset_do_not_bias_estimates",
         "collocation": Refused(
@@ -619,7 +619,9 @@ CLOCK_OF_MULTIPLIERS = "test_multipliers_do_not_depend_on_the_start_of_the_clock
 SAME_MOTION = "test_multipliers_and_redundant_residuals_do_not_change_the_motion"
 DELAY = "test_a_delay_in_a_function_equals_a_delay_of_the_samples"
 SINGLE_PRECISION = "test_float32_gives_the_motion_of_float64"
-COARSE_CLOCK = "integrate/test_clocks.py::test_times_that_float32_cannot_resolve_are_rejected_if_inputs_depend_on_time"
+COARSE_CLOCK = (
+    "integrate/test_clocks.py::test_times_that_float32_cannot_resolve_are_rejected_if_something_depends_on_time"
+)
 
 # The laws simulate systems with states and with samples as inputs. The delays are delays in functions.
 OF_TWO: dict[str, dict[str, Any]] = {
@@ -643,8 +645,8 @@ OF_TWO: dict[str, dict[str, Any]] = {
         "functions": DELAY,
         "samples": "integrate/test_jumps.py::test_a_jump_at_a_discontinuity_of_an_input",
         "delays": DELAY,
-        "float32": "integrate/test_jumps.py::test_float32",
-        "clocks": "integrate/test_jumps.py::test_results_do_not_depend_on_start_time_and_time_scale",
+        "float32": "integrate/test_jumps.py::test_times_of_jumps_in_float32_with_posix_times",
+        "clocks": "integrate/test_laws_of_simulations.py::test_results_do_not_depend_on_the_start_of_the_clock",
     },
     "states": {
         "dependent speeds": SAME_MOTION,

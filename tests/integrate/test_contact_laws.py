@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mechanisms import BouncingBall
+from mechanisms import Sled
 
 import jaxkane as jk
 from jaxkane.catalog import Belt
@@ -40,29 +40,6 @@ def end_of(ride):
 
 
 # -- A ball in air (figures of a closed form).
-DROP = jnp.array([1.0, 0.1, 0.8])  # height, drag, restitution
-drop = simulate_with_slopes(
-    lambda p: BouncingBall(drag=p[1], restitution=p[2]), lambda p: jk.State(p[:1], jnp.zeros_like(p[:1]))
-)
-BOUNCES = [0.4590853109923369, 1.1280946846381106, 1.6405736265752897, 2.0400984767321484, 2.3546963595549943]
-BOUNCES += [2.603903008180971, 2.802033708031122, 2.9599159114088045]
-
-
-@pytest.mark.weekly
-def test_a_bouncing_ball_with_drag():
-    atol, slope_rtol = 1e-10, 1e-6  # the second derivative of |v| v is discontinuous at the top
-    slopes, ride = drop(DROP, jnp.linspace(0.0, 3.0, 21))
-    assert int(ride.status) == 0
-    assert int(ride.jumps.count) == 8
-    np.testing.assert_allclose(ride.jumps.t[:8], BOUNCES, atol=atol)
-    np.testing.assert_allclose(end_of(ride), [0.016894590512326443, 0.22459525490753116], atol=atol)
-    np.testing.assert_allclose(ride.jumps.energy[:8], 0.18 * ride.jumps.before.u[:8, 0] ** 2, rtol=1e-11)
-    np.testing.assert_allclose(ride.jumps.impulses[:8, 0], -1.8 * ride.jumps.before.u[:8, 0], rtol=1e-11)
-    expected = [[-0.26057481040204583, 0.5942348144692445, -1.7473679927968893]]
-    expected += [[11.973675953465243, -28.61188128267571, 92.11386201759065]]
-    np.testing.assert_allclose(slopes["end"], expected, rtol=slope_rtol)
-
-
 # -- A rod with a round end, in a plane over a table. A ball has no length, a particle has no radius either.
 class RoundRod(jk.System):
     """The table may oscillate along y and move along x. A horizontal force acts on the mass centre."""
@@ -165,18 +142,15 @@ def test_a_ball_with_spin_drag_and_friction():
 
 
 BACKSPIN = {
-    "sphere": (0.4, 1.019367991845056, 3.0193679918450567, -5.484199796126404),
     "disk": (0.5, 1.1892626571525653, 2.7208064333446593, -14.41612866689319),
     "hoop": (1.0, 1.783893985728848, 2.1218144750254844, -41.218144750254844),
 }
 BY_MU_V_W = {
-    "sphere": (-5.09683995922528, 1.7198194262414446, -0.028018057375855547),
     "disk": (-6.9373655000566306, 1.729754219050855, -0.02702457809491449),
     "hoop": (-15.60907237512742, 1.891946992864424, -0.010805300713557602),
 }
 
 
-@pytest.mark.weekly_cases("sphere")
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", BACKSPIN)
 def test_a_ball_with_backspin_slides_and_then_rolls(kind):
@@ -272,16 +246,6 @@ def test_a_contact_opens_if_the_table_falls_faster_than_gravity():
     np.testing.assert_allclose(ride["table.normal"], expected, atol=1e-9)
     by_g = 1 / (0.05 * SHAKE**3 * np.cos(SHAKE * t))
     np.testing.assert_allclose(slopes["gravity"]["t"][0], by_g, rtol=1e-8)
-
-
-def test_a_spinning_ball_lifts_off_a_shaking_table():
-    """It lands with friction and sticks. The friction is zero, so its limit vanishes with the normal force."""
-    ball = {"friction": 0.9, "radius": 0.1, "inertia": 0.004, "h": 1.1, "vx": 1.0, "w": -10.0, "vy": 0.5}
-    ride, _ = ride_of(np.linspace(0, 0.7, 21), push=(0.0, 8.0, 8.0, 8.0), shake=0.04, **ball)
-    assert int(ride.status) == 0
-    lifts = (2 * np.pi * 2 + np.arcsin(10.0 / (0.04 * SHAKE**2))) / SHAKE
-    np.testing.assert_allclose(jumps_of(ride)[1:], lifts, atol=1e-10)
-    assert ride.contacts["table"][-1] == OPEN
 
 
 def test_a_load_stays_on_a_shaking_table():
@@ -505,14 +469,6 @@ def test_random_simulations_satisfy_the_contact_laws(kind):
 
 ROUNDED = {
     "a ball": {"restitution": 0.7, "h": 0.1, "vy": -1.0, "radius": 0.1, "inertia": 0.004},
-    "a rod": {
-        "restitution": 0.7,
-        "friction": 0.05,
-        "inertia": 0.25,
-        "angle": -0.49304063472288884,
-        "w": 3.0,
-        "vy": 0.5,
-    },
     "a fast rod": {"restitution": 0.7, "friction": 0.3, "inertia": 0.25, "angle": 0.6488771128508386, "w": -10.0},
     "an inelastic rod": {"friction": 0.3, "inertia": 0.25, "angle": 0.008209005982792839, "vx": -2.0, "w": -10.0},
 }
@@ -617,19 +573,13 @@ def test_a_block_on_a_belt_sticks_and_slips():
     np.testing.assert_array_equal(slopes["end"][1, 4:], 0.0)
 
 
-class Brake(jk.System):
-    """A block of 1 kg, whose dry friction decreases with the time."""
+class Brake(Sled):
+    """Its dry friction decreases with the time."""
 
-    kinetic: jk.Scalar = jk.parameter(2.0, unit="N")
     decrease: jk.Scalar = jk.parameter(0.0, unit="N/s")
-    coordinates, speeds = ("x",), ("v",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="block")])
 
     def contacts(self, t, q, u, motion):
-        return {"brake": jk.DryFriction(u["v"], self.kinetic - self.decrease * t, static=2.5)}
+        return {"brake": jk.DryFriction(u["v"], 2.0 - self.decrease * t, static=2.5)}
 
 
 @pytest.mark.weekly
@@ -647,14 +597,11 @@ def test_members_of_a_sweep_whose_dry_friction_becomes_impossible():
 
 @pytest.mark.weekly
 def test_static_friction_that_equals_the_kinetic_one():
-    """The oscillator of Siconos: it rests after eight turns."""
+    """The oscillator of Siconos: it rests after eight turns, half a period apart."""
     atol, slope_atol = 1e-10, 1e-8
     slopes, ride = belt(jnp.array([1.0, 0.0, 1.0, 1.0, 12.0, 6.0]), jnp.linspace(0, 30, 21))
-    times = [0.43240777557053783, 3.574000429160331, 6.715593082750124, 9.857185736339918, 12.998778389929711]
-    times += [16.140371043519504, 19.281963697109298, 22.42355635069909]
-    np.testing.assert_allclose(jumps_of(ride), times, atol=atol)
-    np.testing.assert_allclose(
-        ride.jumps.after.q[:3, 0], [13.317821063276353, -11.317821063276353, 9.317821063276353], atol=atol
-    )
+    np.testing.assert_allclose(jumps_of(ride), 0.43240777557053783 + np.pi * np.arange(8), atol=atol)
+    turns = 13.317821063276353 - 2.0 * np.arange(3)
+    np.testing.assert_allclose(ride.jumps.after.q[:3, 0], turns * [1.0, -1.0, 1.0], atol=atol)
     np.testing.assert_allclose(end_of(ride), [0.6821789367236468, 0.0], atol=atol)
     np.testing.assert_allclose(slopes["end"][0, 5], -0.4190581774617469, atol=slope_atol)

@@ -25,25 +25,6 @@ def drop(height=1.0, restitution=0.8, drag=0.1, ts=TS, **options):
 
 
 @pytest.mark.weekly
-def test_each_member_of_a_batch_bounces_at_its_own_times():
-    """A member equals its own simulation: one bounces until it rests, one a hundred times, one never."""
-    heights, restitutions = jnp.array([0.2, 0.05, 60.0]), jnp.array([0.5, 0.985, 0.5])
-    batch = jax.jit(jax.vmap(lambda h, e: drop(h, e, 0.0, max_jumps=128)))(heights, restitutions)
-    assert batch.reason == ["completed"] * 3
-    assert int(batch.jumps.count[2]) == 0
-    # t_n = sqrt(2 h / g) (1 + 2 (e + e^2 + ... e^n))
-    e = 0.985 ** np.arange(1, 200)
-    times = np.sqrt(0.1 / 9.81) * (1 + 2 * np.concatenate([[0.0], np.cumsum(e)]))
-    assert int(batch.jumps.count[1]) == np.searchsorted(times, 3.0)
-    for i in range(3):
-        one = drop(heights[i], restitutions[i], 0.0, max_jumps=128)
-        np.testing.assert_allclose(batch.q[i], one.q, rtol=1e-12, atol=1e-14)
-        np.testing.assert_array_equal(batch.stats["steps"][i], one.stats["steps"])
-        np.testing.assert_allclose(batch.jumps.t[i], one.jumps.t, rtol=1e-13)
-        np.testing.assert_array_equal(batch.contacts["floor"][i], one.contacts["floor"])
-
-
-@pytest.mark.weekly
 def test_exceeding_max_jumps_ends_the_simulation():
     ride = drop(0.05, 0.985, 0.0, max_jumps=16)
     assert ride.reason == "max jumps"
@@ -53,51 +34,15 @@ def test_exceeding_max_jumps_ends_the_simulation():
 
 
 @pytest.mark.weekly
-def test_derivatives_in_reverse_mode():
-    """The same as in forward mode, without NaN from contact states that do not occur, also when the ball rests."""
-    slopes = jax.jit(jax.grad(lambda p: drop(p[0], p[2], p[1]).end.q[0]))(jnp.array([1.0, 0.1, 0.8]))
-    np.testing.assert_allclose(slopes, [-0.26057481040204583, 0.5942348144692445, -1.7473679927968893], rtol=1e-7)
-    rests = jax.jit(jax.grad(lambda p: jnp.sum(drop(p[0], p[2], p[1]).q[-1])))(jnp.array([0.2, 0.0, 0.5]))
-    np.testing.assert_allclose(rests, 0.0, atol=1e-12)
-
-
-@pytest.mark.weekly
-def test_gradients_of_a_sweep():
-    """Of the mean height of a batch by its common restitution, and of each member by its own height."""
-
-    def mean(restitution, heights):
-        system = BouncingBall(drag=jnp.array(0.0), restitution=restitution)
-        batch = jk.sweep.sweep(
-            system, jk.State(heights[:, None], jnp.zeros((3, 1))), jnp.linspace(0.0, 1.0, 6), **TIGHT
-        )
-        return jnp.mean(batch.q[:, -1, 0])
-
-    heights = jnp.array([0.5, 1.0, 9.0])
-    by_e, by_h = jax.grad(mean, (0, 1))(jnp.array(0.8), heights)
-
-    def expected(e, h):
-        """The height after 1 s with no, one or two bounces."""
-        fall = jnp.sqrt(2 * h / 9.81)
-        v, t = e * 9.81 * fall, 1 - fall
-        first = v * t - 9.81 * t**2 / 2
-        late = t - 2 * v / 9.81
-        second = e * v * late - 9.81 * late**2 / 2
-        return jnp.where(h > 5, h - 9.81 / 2, jnp.where(late > 0, second, first))
-
-    by_formula = jax.grad(lambda e, h: jnp.mean(jax.vmap(expected, (None, 0))(e, h)), (0, 1))(0.8, heights)
-    np.testing.assert_allclose(by_e, by_formula[0], rtol=1e-9)
-    np.testing.assert_allclose(by_h, by_formula[1], rtol=1e-9)
-
-
-@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("options", "atol"),
     [
+        ({}, 1e-10),
         ({"step": 0.005, "rtol": None, "atol": None}, 1e-6),
         ({"solver": diffrax.Kvaerno5(), "rtol": 1e-9, "atol": 1e-9}, 1e-6),
         ({"solver": diffrax.Dopri8()}, 1e-9),
     ],
-    ids=["fixed steps", "implicit", "Dopri8"],
+    ids=["Tsit5", "fixed steps", "implicit", "Dopri8"],
 )
 def test_results_agree_for_other_solvers_and_options(options, atol):
     ride = drop(**options)
@@ -108,28 +53,6 @@ def test_results_agree_for_other_solvers_and_options(options, atol):
     assert rests.ok
     np.testing.assert_allclose(rests.jumps.t[int(rests.jumps.count) - 1], 3 * np.sqrt(0.4 / 9.81), atol=10 * atol)
     np.testing.assert_allclose([rests.end.q, rests.end.u], 0.0, atol=1e-12)
-
-
-@pytest.mark.weekly
-def test_float32():
-    ride = drop(jnp.float32(1.0), ts=jnp.asarray(TS, jnp.float32), rtol=1e-6, atol=1e-6)
-    assert ride.q.dtype == jnp.float32
-    assert ride.contacts["floor"].dtype == jnp.int32
-    np.testing.assert_allclose(ride.jumps.t[:5], BOUNCES[:5], atol=5e-4)
-    rests = drop(jnp.float32(0.2), 0.5, 0.0, ts=jnp.asarray(TS, jnp.float32), rtol=1e-6, atol=1e-6)
-    assert rests.ok
-    np.testing.assert_allclose(rests.jumps.t[int(rests.jumps.count) - 1], 3 * np.sqrt(0.4 / 9.81), atol=1e-3)
-    np.testing.assert_allclose(rests.q[-8:], 0.0, atol=1e-6)
-
-
-@pytest.mark.weekly
-def test_a_simulation_resumes_with_the_contact_states():
-    """From the state at the end of another one. The contacts of a ball at rest remain closed."""
-    first = drop(0.2, 0.5, 0.0)
-    again = jk.simulate(BouncingBall(drag=0.0, restitution=0.5), first.state(-1), TS, **TIGHT)
-    assert int(again.jumps.count) == 0
-    np.testing.assert_array_equal(again.contacts["floor"], 1)
-    np.testing.assert_array_equal(again.q, 0.0)
 
 
 class AnyContacts(jk.System):
@@ -151,57 +74,39 @@ def simulate_with(contacts, y=1.0, **speeds):
 
 
 BAD = {
-    "not a dict": (lambda m, q, u: [jk.Contact(m["rim"], m.N.y)], TypeError, "dict of contacts by name"),
-    "not a contact": (lambda m, q, u: {"floor": q["y"]}, TypeError, "must be a jaxkane.Contact"),
-    "no name": (lambda m, q, u: {1: jk.Contact(gap=q["y"])}, TypeError, "must be a string"),
-    "a point alone": (lambda m, q, u: {"a": jk.Contact(m["rim"])}, ValueError, "a point and a normal, or a gap"),
-    "nothing": (lambda m, q, u: {"a": jk.Contact()}, ValueError, "a point and a normal, or a gap"),
-    "a surface alone": (lambda m, q, u: {"a": jk.Contact(gap=q["y"], surface=m["C"])}, ValueError, "surface"),
-    "no vector": (lambda m, q, u: {"a": jk.Contact(m["rim"], 1.0)}, TypeError, "`normal` must be a Vector"),
-    "no point": (lambda m, q, u: {"a": jk.Contact(m.N, m.N.y)}, TypeError, "`point` must be a Point"),
-    "a boolean gap": (lambda m, q, u: {"a": jk.Contact(gap=q["y"] > 0)}, TypeError, "gap"),
-    "restitution above one": (lambda m, q, u: {"a": jk.Contact(gap=q["y"], restitution=1.5)}, ValueError, "1.5"),
-    "negative restitution": (lambda m, q, u: {"a": jk.Contact(gap=q["y"], restitution=-0.1)}, ValueError, "-0.1"),
-    "negative friction": (lambda m, q, u: {"a": jk.Contact(m["rim"], m.N.y, friction=-0.1)}, ValueError, "negative"),
-    "friction of a gap": (lambda m, q, u: {"a": jk.Contact(gap=q["y"], friction=0.1)}, ValueError, "DryFriction"),
-    "little static friction": (
-        lambda m, q, u: {"a": jk.Contact(m["rim"], m.N.y, friction=0.5, static=0.4)},
-        ValueError,
-        "smaller than the kinetic friction",
-    ),
-    "negative dry friction": (lambda m, q, u: {"a": jk.DryFriction(u["vx"], -1.0)}, ValueError, "negative"),
-    "no slip": (lambda m, q, u: {"a": jk.DryFriction(m.N.x, 1.0)}, TypeError, "`slip` must be one number"),
-    "five contacts": (
-        lambda m, q, u: {str(i): jk.Contact(gap=q["y"] + i) for i in range(5)},
-        ValueError,
-        "At most 4 are possible.*MuJoCo",
-    ),
-    "gap against velocity": (
-        lambda m, q, u: {"a": jk.Contact(m["rim"], m.N.y, gap=2.0 * q["y"])},
-        ValueError,
-        "gap",
-    ),
+    "not a dict": (lambda m, q, u: [jk.Contact(m["rim"], m.N.y)], "dict of contacts by name"),
+    "not a contact": (lambda m, q, u: q["y"], "must be a jaxkane.Contact"),
+    "no name": (lambda m, q, u: {1: jk.Contact(gap=q["y"])}, "must be a string"),
+    "a point alone": (lambda m, q, u: jk.Contact(m["rim"]), "a point and a normal, or a gap"),
+    "a surface alone": (lambda m, q, u: jk.Contact(gap=q["y"], surface=m["C"]), "surface"),
+    "a boolean gap": (lambda m, q, u: jk.Contact(gap=q["y"] > 0), "gap"),
+    "restitution": (lambda m, q, u: jk.Contact(gap=q["y"], restitution=1.5), "1.5"),
+    "friction of a gap": (lambda m, q, u: jk.Contact(gap=q["y"], friction=0.1), "DryFriction"),
+    "static friction": (lambda m, q, u: jk.Contact(m["rim"], m.N.y, friction=0.5, static=0.4), "smaller than the kin"),
+    "negative dry friction": (lambda m, q, u: jk.DryFriction(u["vx"], -1.0), "negative"),
+    "five contacts": (lambda m, q, u: {str(i): jk.Contact(gap=q["y"] + i) for i in range(5)}, "At most 4 .*MuJoCo"),
+    "gap against velocity": (lambda m, q, u: jk.Contact(m["rim"], m.N.y, gap=2.0 * q["y"]), "gap"),
     "a point beside the contact": (
-        lambda m, q, u: {"a": jk.Contact(m["C"].fixed(0.1 * m.N.x, m["disc"].frame), m.N.y, gap=q["y"] - 0.1)},
-        ValueError,
+        lambda m, q, u: jk.Contact(m["C"].fixed(0.1 * m.N.x, m["disc"].frame), m.N.y, gap=q["y"] - 0.1),
         "gap",
     ),
-    "a gap of speeds": (lambda m, q, u: {"a": jk.Contact(gap=q["y"] + u["vy"])}, ValueError, "do not depend on the sp"),
-    "a normal of speeds": (
-        lambda m, q, u: {"a": jk.Contact(m["rim"], m.N.y + u["vx"] * m.N.x, gap=1.0)},
-        ValueError,
-        "'a'",
-    ),
-    "a square slip": (lambda m, q, u: {"a": jk.DryFriction(u["vx"] ** 2, 1.0)}, ValueError, "affine in the speeds"),
-    "penetration": (lambda m, q, u: {"a": jk.Contact(gap=q["y"] - 2.0)}, ValueError, "gap"),
+    "a gap of speeds": (lambda m, q, u: jk.Contact(gap=q["y"] + u["vy"]), "do not depend on the sp"),
+    "a normal of speeds": (lambda m, q, u: jk.Contact(m["rim"], m.N.y + u["vx"] * m.N.x, gap=1.0), "'a'"),
+    "a square slip": (lambda m, q, u: jk.DryFriction(u["vx"] ** 2, 1.0), "affine in the speeds"),
+    "penetration": (lambda m, q, u: jk.Contact(gap=q["y"] - 2.0), "gap"),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_misuse_is_explained(case):
-    contacts, kind, message = BAD[case]
-    with pytest.raises(kind, match=message):
-        simulate_with(contacts)
+    contacts, message = BAD[case]
+
+    def by_name(motion, q, u):
+        found = contacts(motion, q, u)
+        return found if isinstance(found, dict | list) else {"a": found}
+
+    with pytest.raises((TypeError, ValueError), match=message):
+        simulate_with(by_name)
 
 
 class Particle(jk.System):
@@ -272,10 +177,7 @@ def test_an_event_and_a_contact_need_different_names():
         jk.simulate(Both(), jk.State({"height": 1.0}, {}), TS)
 
 
-def test_functions_without_contact_support_raise(tmp_path):
+def test_a_controller_of_diffrax_does_not_support_contacts():
+    controller = diffrax.PIDController(rtol=1e-6, atol=1e-6)
     with pytest.raises(ValueError, match="contact"):
-        jk.estimate.Filter(BouncingBall(), {"height": 0.01})
-    with pytest.raises(ValueError, match="contact"):
-        jk.simulate(
-            BouncingBall(), jk.State({"height": 1.0}, {}), TS, controller=diffrax.PIDController(rtol=1e-6, atol=1e-6)
-        )
+        jk.simulate(BouncingBall(), jk.State({"height": 1.0}, {}), TS, controller=controller)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_zero_order_hold import Cart
+from test_clocks import Particle
 
 import jaxkane as jk
 
@@ -19,7 +19,7 @@ def place(t):
 
 def ride(ts, values, **options):
     push = {"push": jk.Samples(ts, values)}
-    return jk.simulate(Cart(), jk.State([0.0], [0.0]), np.linspace(0.0, 1.0, 3), push, **options)
+    return jk.simulate(Particle(), jk.State([0.0], [0.0]), np.linspace(0.0, 1.0, 3), push, **options)
 
 
 @pytest.mark.weekly
@@ -28,13 +28,13 @@ def test_a_smooth_signal_and_a_peak_with_dense_samples(n):
     """The samples of a smooth signal; and the same with a peak of one sample: a push of `height` dt [N s]."""
     atol, ts = 1e-8, np.linspace(0.0, 1.0, n)
     smooth = ride(ts, wave(ts))
-    np.testing.assert_allclose(smooth["place"], place(smooth.t), atol=atol)
+    np.testing.assert_allclose(smooth["x"], place(smooth.t), atol=atol)
     assert smooth.stats["steps"] < 100
     height, i = 1000.0, n // 3 + 1
     peak = ride(ts, wave(ts) + height * (np.arange(n) == i))
     gained = height * (ts[1] - ts[0]) * np.maximum(smooth.t - ts[i], 0.0)
     assert gained[-1] > 1e4 * atol * (100_000 / n)
-    np.testing.assert_allclose(peak["place"], place(smooth.t) + gained, atol=atol)
+    np.testing.assert_allclose(peak["x"], place(smooth.t) + gained, atol=atol)
 
 
 @pytest.mark.slow
@@ -51,7 +51,7 @@ def test_steps_end_at_the_samples_of_non_smooth_signals(signal):
     fine = np.union1d(ts[ts <= 1.0], [1.0])
     a, h = np.interp(fine, ts, values), np.diff(fine)
     v = np.append(0.0, np.cumsum(h * (a[1:] + a[:-1]) / 2))
-    np.testing.assert_allclose(found["place"][-1], np.sum(h * v[:-1] + h**2 * (2 * a[:-1] + a[1:]) / 6), atol=1e-8)
+    np.testing.assert_allclose(found["x"][-1], np.sum(h * v[:-1] + h**2 * (2 * a[:-1] + a[1:]) / 6), atol=1e-8)
     assert (int(found.stats["steps"]) > 0.9 * n) == (signal != "uneven")
 
 
@@ -63,7 +63,7 @@ def test_derivatives_by_delay_and_scale_of_samples_agree_with_the_closed_form():
 
     def end(x):
         motion = ride(ts + x[0], (1 + x[1]) * wave(ts), adjoint="forward")
-        return motion["place"][-1], motion.stats["steps"]
+        return motion["x"][-1], motion.stats["steps"]
 
     slopes, steps = jax.jit(jax.jacfwd(end, has_aux=True))(jnp.zeros(2))
     # By d at d = 0, of the integral of (1 - t) wave(t - d).
@@ -76,7 +76,7 @@ def test_derivatives_by_delay_and_scale_of_samples_agree_with_the_closed_form():
 def test_each_jump_of_a_zero_order_hold_ends_a_step():
     ts = np.linspace(0.0, 1.0, 10_000)
     push = {"push": jk.Samples(ts, np.sin(ts), zero_order_hold=True)}
-    assert jk.simulate(Cart(), jk.State([0.0], [0.0]), np.linspace(0.0, 1.0, 3), push).stats["steps"] >= 9_999
+    assert jk.simulate(Particle(), jk.State([0.0], [0.0]), np.linspace(0.0, 1.0, 3), push).stats["steps"] >= 9_999
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
+from mechanisms import Sled
 
 import jaxkane as jk
 
@@ -133,35 +134,18 @@ def test_a_value_is_the_same_with_and_without_its_derivative():
 
 
 @pytest.mark.slow
-def test_an_adjoint_of_diffrax_differentiates_the_steps_of_the_motion():
-    p = jnp.array([0.3, 0.0, 0.0, 0.0, 0.0])
-    plain = jk.simulate(Oscillator(), jk.State(p[:2], jnp.zeros(2)), [0.0, 10.0], adjoint=diffrax.ForwardMode())
-    assert plain.adjoint == "ForwardMode"
-    found = jax.jacfwd(lambda p: end(p, adjoint=diffrax.ForwardMode()))(p)
-    assert abs(found[1, 1] - np.cos(200.0)) > 0.1  # the steps do not resolve the fast part, which rests
-
-
-@pytest.mark.slow
 def test_a_stiff_part_that_has_decayed_does_not_shorten_the_steps():
     """u1' = -1e4 u1, as a first-order state beside a slow one."""
 
-    class Stiff(jk.System):
-        rate: jk.Scalar = jk.parameter(1e4)
-        coordinates, speeds, states = ("x",), ("v",), ("z",)
-
-        def motion(self, t, q, u):
-            N, O = jk.inertial()
-            return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="block")])
-
-        def loads(self, t, q, u, motion, inputs):
-            return jk.Force(-q["x"] * motion.N.x, motion["block"])
+    class Stiff(Sled):
+        states = ("z",)
 
         def state_rates(self, t, q, u, x, motion, now):
-            return {"z": -self.rate * (x[0] - q["x"])}
+            return {"z": -1e4 * (x[0] - q["x"])}
 
     def last(x):
         state = jk.State(jnp.stack([x]), jnp.zeros(1), jnp.zeros(1))
-        return jk.simulate(Stiff(), state, [0.0, 10.0], solver=diffrax.Kvaerno5())["z"][-1]
+        return jk.simulate(Stiff(stiffness=1.0), state, [0.0, 10.0], solver=diffrax.Kvaerno5())["z"][-1]
 
     np.testing.assert_allclose(jax.jit(jax.jacfwd(last))(1.0), np.cos(10.0), atol=1e-3)
 

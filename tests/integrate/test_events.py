@@ -10,9 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from mechanisms import Bead
+from mechanisms import Bead, Sled
 from scipy.special import ellipk
 from slopes import differences, slopes
 
@@ -57,34 +55,6 @@ def exact(h, v, g):
     """t_end, height and velocity there."""
     root = jnp.sqrt(v**2 + 2 * g * h)
     return jnp.stack([(v + root) / g, 0.0 * h, -root])
-
-
-@pytest.mark.weekly
-@pytest.mark.parametrize("options", [{}, {"step": 0.07}], ids=["adaptive", "fixed"])
-def test_a_dropped_particle(options):
-    atol = 1e-9
-    ride = dropped(1.0, **options)
-    t_end = np.sqrt(2.0 / 9.81)
-    assert ride.reason == "ground"
-    np.testing.assert_allclose(ride.t_end, t_end, atol=atol)
-    np.testing.assert_allclose([ride.end.q[0], ride.end.u[0]], [0.0, -9.81 * t_end], atol=atol)
-    reached = np.asarray(TS) <= t_end
-    np.testing.assert_allclose(ride["h"][reached], (1.0 - 4.905 * TS**2)[reached], atol=atol)
-    assert np.isnan(ride.q[~reached]).all()
-    assert np.isnan(ride["drive"][~reached]).all()
-
-
-@pytest.mark.weekly
-def test_second_derivatives_of_the_end_time():
-    """By the velocity at the start, against the formula."""
-    h, g = jnp.array(1.0), jnp.array(9.81)
-
-    def end(v):
-        ride = dropped(h, v, adjoint="forward")
-        return jnp.stack([ride.t_end, ride.end.q[0], ride.end.u[0]])
-
-    second = jax.jit(jax.jacfwd(jax.jacfwd(end)))(0.3)
-    np.testing.assert_allclose(second, jax.jacfwd(jax.jacfwd(lambda v: exact(h, v, g)))(0.3), atol=1e-9)
 
 
 class Pendulum(jk.System):
@@ -156,18 +126,6 @@ def test_an_event_that_is_zero_at_the_start():
         assert float(at_once.t_end) == 0.0
         assert np.isfinite(at_once.q[0]).all()
         assert np.isnan(at_once.q[1:]).all()
-
-
-@pytest.mark.weekly
-@pytest.mark.parametrize(
-    ("ends", "options"), [("ground", {}), ("either", {"step": 0.5})], ids=["falling-adaptive", "either-fixed"]
-)
-def test_two_crossings_within_a_step(ends, options):
-    """Both ends of the first step are above: h = 0.08 - t + 5.19 t^2 / 2 is zero at 0.0987 and 0.29 s."""
-    start = jk.State(jnp.array([0.08]), jnp.array([-1.0]))
-    ride = jk.simulate(Particle(ends=ends), start, TS, {"drive": 15.0}, **options)
-    assert ride.reason == "ground"
-    np.testing.assert_allclose(ride.t_end, (1 - np.sqrt(1 - 2 * 5.19 * 0.08)) / 5.19, atol=1e-9)
 
 
 @pytest.mark.weekly
@@ -248,17 +206,6 @@ def test_outputs_after_an_early_end_are_nan():
 
 
 @pytest.mark.weekly
-def test_singular_dependent_speeds_end_the_simulation():
-    """The bead's horizontal speed vanishes at a quarter of a turn: the motion ends before."""
-    ride = jk.simulate(Bead(ends=False), jk.State(TOP, jnp.ones(1)), TS)
-    assert ride.status == jk.Status.SINGULAR_SPEEDS
-    assert np.pi / 2 - 0.01 < float(ride.t_end) <= np.pi / 2
-    reached = np.asarray(TS) < np.pi / 2
-    np.testing.assert_allclose(ride["vy"][reached], -np.sin(TS)[reached], atol=1e-5)
-    assert np.isnan(ride["vy"][~reached]).all()
-
-
-@pytest.mark.weekly
 def test_other_end_times_have_nan_derivatives():
     """`max_steps` is no smooth end: its time has a derivative that is NaN, and so has what was not reached."""
 
@@ -293,33 +240,14 @@ def test_an_event_that_is_not_finite_at_the_start_raises():
 
 
 @pytest.mark.weekly
-def test_an_event_in_single_precision():
-    particle, ts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (Particle(), TS))
-    start = jk.State(jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32))
-    ride = jk.simulate(particle, start, ts)
-    assert ride.reason == "ground"
-    assert ride.t_end.dtype == ride.end.q.dtype == jnp.float32
-    np.testing.assert_allclose(ride.t_end, np.sqrt(2 / 9.81), rtol=1e-5)
-    np.testing.assert_allclose(ride.end.q, 0.0, atol=1e-5)
-
-
-@pytest.mark.weekly
-def test_an_event_with_an_implicit_solver():
-    """The bead passes y = 0.3 where cos(t) does; Kvaerno's method solves for the stages of every step."""
-    ride = jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), TS, solver=diffrax.Kvaerno5())
-    assert ride.reason == "low"
-    np.testing.assert_allclose(ride.t_end, np.arccos(0.3), atol=1e-6)
-
-
-@pytest.mark.weekly
 @pytest.mark.parametrize(
     "options",
     [
         {},
         {"step": 0.13},
-        pytest.param({"solver": diffrax.Heun()}, marks=pytest.mark.weekly),
-        pytest.param({"solver": diffrax.HalfSolver(diffrax.Bosh3())}, marks=pytest.mark.weekly),
-        pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.weekly),
+        {"solver": diffrax.Heun()},
+        {"solver": diffrax.HalfSolver(diffrax.Bosh3())},
+        {"solver": diffrax.Kvaerno5()},
     ],
     ids=["Tsit5", "fixed", "Heun", "HalfSolver", "Kvaerno5"],
 )
@@ -365,16 +293,11 @@ def test_an_event_of_a_stabilized_simulation():
     np.testing.assert_allclose(ride.end.q, [np.sqrt(0.91), 0.3], atol=1e-6)
 
 
-class Cubic(jk.System):
-    """A particle with the speed 1 whose event is a cubic polynomial of its place."""
+class Cubic(Sled):
+    """Its event is a cubic polynomial of its place. Its speed is 1."""
 
-    p: jax.Array = jk.parameter(shape=(4,))
-    event: Callable = eqx.field(static=True)
-    coordinates, speeds = ("x",), ("v",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x))])
+    p: jax.Array = jk.parameter((0.0, 0.0, 0.0, 1.0))
+    event: Callable = eqx.field(static=True, default=jk.rising)
 
     def events(self, t, q, u):
         a, b, c, d = (self.p[i] for i in range(4))
@@ -392,7 +315,9 @@ def test_the_first_crossing_of_cubics_within_one_step(event, way):
     p[::7, 3] = 0.0
     p[:40:2] = [np.poly([x, x + 0.08, y]) for x, y in rng.uniform([0.1, 1.1], [0.9, 3.0], (20, 2))]
     p[1:3] = np.poly([0.2, 0.5, 0.8]), -np.poly([0.2, 0.5, 0.8])
-    ends = jax.jit(jax.vmap(lambda p: jk.simulate(Cubic(p, event), jk.State([0.0], [1.0]), [0.0, 1.0], step=1.0).t_end))
+    ends = jax.jit(
+        jax.vmap(lambda p: jk.simulate(Cubic(p=p, event=event), jk.State([0.0], [1.0]), [0.0, 1.0], step=1.0).t_end)
+    )
     for coefficients, t_end in zip(p, np.asarray(ends(p)), strict=True):
         roots = np.roots(coefficients)
         roots = np.sort(roots[np.abs(roots.imag) < 1e-9].real)
@@ -414,87 +339,41 @@ def test_derivatives_by_sample_times_agree_with_differences(mode):
     def height(x, adjoint):
         """x: the delay of a signal; of all times of the ride."""
         one, other = jk.Samples(kinks + x[0], 5 * values), jk.Samples(others, -3 * values)
-        drive = Both(one, other)
-        ride = jk.simulate(
-            Particle(), jk.State(jnp.array([9.0]), jnp.zeros(1)), ts + x[1], {"drive": drive}, rtol=1e-11, atol=1e-11,
-            adjoint=adjoint,
-        )  # fmt: skip
+        options = {"rtol": 1e-11, "atol": 1e-11, "adjoint": adjoint}
+        drive = {"drive": lambda t, state: one(t) + other(t)}
+        ride = jk.simulate(Particle(), jk.State(jnp.array([9.0]), jnp.zeros(1)), ts + x[1], drive, **options)
         return ride["h"][-1] + ride["v"][2]
 
     both, x = slopes(height, mode), jnp.zeros(2)
     np.testing.assert_allclose(both(x)[0], differences(both, x, 1e-5), rtol=1e-6)
 
 
-class Both(eqx.Module):
-    """The sum of two signals."""
-
-    one: jk.Samples
-    other: jk.Samples
-
-    def __call__(self, t, state):
-        return self.one(t) + self.other(t)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"step": jnp.nan}, "`step` must be positive"),
         ({"step": -0.1}, "`step` must be positive"),
         ({"rtol": 0.0}, "`rtol` must be positive"),
-        ({"atol": float("nan")}, "`atol` must be positive"),
         ({"stabilize": -1.0}, "`stabilize` must be a finite, nonnegative rate"),
         ({"max_steps": 0}, "`max_steps` must be a positive whole number"),
         ({"max_steps": 2.5}, "`max_steps` must be a positive whole number"),
         ({"step": 0.1, "rtol": 1e-6}, "Pass either `step`"),
         ({"step": 0.1, "atol": 1e-6}, "Pass either `step`"),
-    ],
-)
-def test_contradictory_options_raise(options, message):
-    with pytest.raises(ValueError, match=message):
-        dropped(1.0, **options)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+        ({"adjoint": "backwards"}, "`adjoint` must be one of"),
         ({"solver": diffrax.Tsit5}, r"`solver` must be an instance, not a class: solver=diffrax.Tsit5\(\)"),
-        ({"solver": "Tsit5"}, r"`solver` must be a solver of diffrax, e.g. diffrax.Tsit5\(\); got 'Tsit5'"),
-        (
-            {"adjoint": diffrax.DirectAdjoint},
-            r"`adjoint` must be an instance, not a class: adjoint=diffrax.DirectAdjoint\(\)",
-        ),
-        (
-            {"adjoint": True},
-            "`adjoint` must be one of auto, reverse, forward, both, or an adjoint of diffrax; got True",
-        ),
-        (
-            {"adjoint": None},
-            "`adjoint` must be one of auto, reverse, forward, both, or an adjoint of diffrax; got None",
-        ),
-        ({"project": "no"}, "`project` must be True or False; got 'no'"),
-        ({"progress": 1}, "`progress` must be True or False; got 1"),
+        ({"adjoint": diffrax.DirectAdjoint}, r"`adjoint` must be an instance, not a class: .*DirectAdjoint\(\)"),
     ],
 )
-def test_options_of_the_wrong_type_raise(options, message):
-    with pytest.raises(TypeError, match=message):
+def test_invalid_and_contradictory_options_raise(options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
         dropped(1.0, **options)
-
-
-def branching(t, state):
-    return 1.0 if t > 0.5 else 0.0
-
-
-def by_numpy(t, state):
-    return np.polyval([1.0, 0.0], t)
 
 
 @pytest.mark.parametrize(
     ("inputs", "label"),
     [
-        ({"drive": branching}, "The input 'drive'"),
-        ({"drive": by_numpy}, "The input 'drive'"),
-        ({"drive": lambda t, s: float(s["h"])}, "The input 'drive'"),
-        (lambda t, s: {"drive": branching(t, s)}, "The function of the inputs"),
+        ({"drive": lambda t, s: 1.0 if t > 0.5 else 0.0}, "The input 'drive'"),
+        ({"drive": lambda t, s: np.polyval([1.0, 0.0], t)}, "The input 'drive'"),
+        (lambda t, s: {"drive": float(s["h"])}, "The function of the inputs"),
     ],
 )
 def test_inputs_that_need_concrete_values_raise(inputs, label):
@@ -504,22 +383,14 @@ def test_inputs_that_need_concrete_values_raise(inputs, label):
         jk.simulate(Particle(), jk.State(jnp.ones(1), jnp.ones(1)), TS, inputs)
 
 
-class Deciding(Particle):
-    def events(self, t, q, u):
-        return {"low": q["h"] if q["h"] > 0.1 else 1.0}
-
-
-def test_an_event_that_needs_a_concrete_value_raises():
-    with pytest.raises(TypeError, match=r"Deciding.events uses a traced value .* jnp.where\(a > b, x, y\) for `if`"):
-        dropped(1.0, system=Deciding())
-
-
 @pytest.mark.parametrize(
     ("events", "message"),
     [
         (lambda q: {"low": q["h"] < 0.5}, "The event 'low' is a boolean"),
         (lambda q: {"low": jk.falling(q["h"] < 0.5)}, "The event 'low' is a boolean"),
         (lambda q: [q["h"]], "events must return a dict of quantities by name"),
+        (lambda q: {"low": q["h"] if q["h"] > 0.1 else 1.0}, r"Watching.events uses a traced value .* jnp.where"),
+        (lambda q: {"max_steps": q[0] - 0.5}, "the event name 'max_steps' is reserved"),
     ],
 )
 def test_events_that_are_not_named_scalars_raise(events, message):
@@ -527,46 +398,21 @@ def test_events_that_are_not_named_scalars_raise(events, message):
         def events(self, t, q, u):
             return events(q)
 
-    with pytest.raises(TypeError, match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         dropped(1.0, system=Watching())
-
-
-def test_an_event_named_like_a_status_raises():
-    class Confusing(Particle):
-        def events(self, t, q, u):
-            return {"max_steps": q[0] - 0.5}
-
-    with pytest.raises(ValueError, match="the event name 'max_steps' is reserved"):
-        dropped(1.0, system=Confusing())
 
 
 def test_invalid_samples_raise():
     times = np.array([0.0, 1.0, 2.0])
-    for ts, values, error in (
-        (times[::-1], times, ValueError),
-        (times, times[:2], ValueError),
-        (times[:1], times[:1], ValueError),
-        (times, np.array([0.0, np.nan, 1.0]), ValueError),
-        (np.array([0.0, np.nan, 1.0]), times, ValueError),
-        (np.ma.masked_array(times, [0, 1, 0]), times, ValueError),
-        (times, times + 1j, TypeError),
-        (times, ["a", "b", "c"], TypeError),
-    ):
-        with pytest.raises(error, match="Samples"):
+    masked = np.ma.masked_array(times, [0, 1, 0])
+    for ts, values in ((times[::-1], times), (times, times[:2]), (times[:1], times[:1]), (masked, times)):
+        with pytest.raises(ValueError, match="Samples"):
             jk.Samples(ts, values)
-    for value, error in ((np.nan, ValueError), ("a", TypeError), (1j, TypeError), (np.ones(11, complex), TypeError)):
+    with pytest.raises(TypeError, match="Samples"):
+        jk.Samples(times, times + 1j)
+    for value, error in ((np.nan, ValueError), ("a", TypeError), (np.ones(11, complex), TypeError)):
         with pytest.raises(error, match="drive"):
             jk.simulate(Particle(), jk.State(jnp.ones(1), jnp.ones(1)), TS, {"drive": value})
-
-
-@pytest.mark.slow
-def test_invalid_times_under_jit_give_status_invalid():
-    start = jk.State(jnp.ones(1), jnp.ones(1))
-    hidden = jax.jit(lambda ts: jk.simulate(Particle(), start, ts))
-    for ts in (TS.at[3].set(jnp.nan), TS[::-1]):
-        ride = hidden(ts)
-        assert ride.reason == "invalid"
-        assert np.isnan(ride.q).all()
 
 
 def _of_a_batch(x, adjoint):
@@ -584,13 +430,11 @@ def _formulas(h, v, g):
 
 _OF_A_BATCH = {mode: slopes(_of_a_batch, mode) for mode in ("forward", "reverse")}
 _BY_FORMULA = jax.jit(jax.vmap(slopes(lambda x, _: _formulas(*x), "forward"), in_axes=1))
-_number = lambda low, high: st.floats(low, high, allow_nan=False)  # noqa: E731
 
 
 @pytest.mark.weekly
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
-@settings(max_examples=8, deadline=None, derandomize=True)
-@given(_number(0.5, 1.5), _number(-1.0, 2.0), _number(5.0, 15.0))
+@pytest.mark.parametrize(("h", "v", "g"), [(0.5, -0.5, 12.0), (1.2, 0.0, 9.81), (1.5, 2.0, 5.0)])
 def test_batch_members_end_at_their_own_times_with_correct_derivatives(mode, h, v, g):
     """Two end early, one completes, and the start of one is no number. Derivatives by what is theirs and by what all
     share (g, in the first column) are those of the formula, and NaN where what is missing is read."""

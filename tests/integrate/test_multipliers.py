@@ -16,7 +16,6 @@ class Links(jk.System):
     """Four links of length 1 between two fixed points. The last two determine the others except where they are in
     line."""
 
-    gravity: jk.Scalar = jk.parameter(9.81)
     coordinates, dependent_coordinates = ("q0", "q1", "q2", "q3"), ("q2", "q3")
     speeds, dependent_speeds = ("u0", "u1"), ("u2", "u3")
 
@@ -33,7 +32,7 @@ class Links(jk.System):
         return [sum(jnp.cos(x) for x in q) - 2.8, sum(jnp.sin(x) for x in q)]
 
     def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -self.gravity * motion.N.y)
+        return jk.weight(motion, -9.81 * motion.N.y)
 
     def outputs(self, t, q, u, motion, now):
         return {"fall": now.acceleration(motion["end"]).dot(motion.N.y)}
@@ -45,7 +44,7 @@ def at_rest():
     return np.asarray(jk.assemble(Links(), [0.9, 0.3, -0.3, -0.9], None).q)
 
 
-def by_scipy(duration, gravity=9.81):
+def by_scipy(duration):
     """Angles and rates at the end, with multipliers (index reduction by two differentiations)."""
     i = np.arange(4)
     w = 3 - np.maximum.outer(i, i) + 0.5 * (i[:, None] != i) + (1 / 12 + 1 / 4) * (i[:, None] == i)
@@ -56,13 +55,13 @@ def by_scipy(duration, gravity=9.81):
         M, h = w * np.cos(q[:, None] - q), w * np.sin(q[:, None] - q) @ v**2
         C, drift = np.stack([-s, c]), np.array([-(c * v) @ v, -(s * v) @ v])
         K = np.block([[M, -C.T], [C, np.zeros((2, 2))]])
-        return np.r_[v, np.linalg.solve(K, np.r_[-h - gravity * (3.5 - i) * c, -drift])[:4]]
+        return np.r_[v, np.linalg.solve(K, np.r_[-h - 9.81 * (3.5 - i) * c, -drift])[:4]]
 
     return solve_ivp(rates, (0, duration), [*at_rest(), 0, 0, 0, 0], method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
 
 
-def swing(gravity, ts, **options):
-    system = jk.with_multipliers(Links(gravity))
+def swing(ts, **options):
+    system = jk.with_multipliers(Links())
     state = jk.State(jnp.asarray(at_rest()), jnp.zeros(4))
     return jk.simulate(system, state, ts, rtol=1e-12, atol=1e-12, max_steps=100_000, **options)
 
@@ -71,7 +70,7 @@ def swing(gravity, ts, **options):
 def test_with_multipliers_passes_singular_dependent_speeds():
     ts = jnp.linspace(0.0, 2.0, 21)
     assert jk.simulate(Links(), jk.assemble(Links(), at_rest(), None), ts).reason == "singular speeds"
-    ride = swing(9.81, ts)
+    ride = swing(ts)
     assert ride.ok
     np.testing.assert_allclose([*ride.q[-1], *ride.u[-1]], by_scipy(2.0), atol=1e-8)
     audit = jk.audit(jk.with_multipliers(Links()), ride)
@@ -79,17 +78,12 @@ def test_with_multipliers_passes_singular_dependent_speeds():
     assert np.abs(audit.configuration_residuals).max() < 1e-9
     # the end point is fixed
     np.testing.assert_allclose(ride["fall"], 0.0, atol=1e-9)
-    slope = jax.jvp(lambda g: swing(g, ts).q[-1], (9.81,), (1.0,))[1]
-    h = 1e-4
-    differences = (by_scipy(2.0, 9.81 + h) - by_scipy(2.0, 9.81 - h))[:4] / (2 * h)
-    np.testing.assert_allclose(slope, differences, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.weekly
 def test_energy_and_constraints_hold_for_thirty_seconds():
-    ride = swing(9.81, jnp.linspace(0.0, 30.0, 601), stabilize=10.0)
-    audit = jk.audit(jk.with_multipliers(Links()), ride)
-    assert ride.ok
+    audit = jk.audit(jk.with_multipliers(Links()), swing(jnp.linspace(0.0, 30.0, 601), stabilize=10.0))
+    assert audit.reason == "completed"
     assert audit.energy_balance < 1e-8
     assert np.abs(audit.configuration_residuals).max() < 1e-8
 
@@ -98,48 +92,20 @@ class Parallelogram(jk.System):
     """Three rockers that hang from points of the ground and carry one bar: four constraints, of which three are
     independent."""
 
-    excess: jk.Scalar = jk.parameter(0.0, unit="m")
     coordinates, speeds = ("a", "b", "c", "bar"), ("a_dot", "b_dot", "c_dot", "bar_dot")
 
     def motion(self, t, q, u):
         N, O = jk.inertial()
-        rockers = {name: N.rotate(3, q[name], u[f"{name}_dot"]) for name in "abc"}
-        hinges = [O.fixed(x * N.x) for x in (0.0, 1.0, 2.0)]
-        bodies = [
-            jk.Body(1.0, (0.0, 0.0, 1 / 12), hinge.fixed(-0.5 * A.y), A, name=name)
-            for hinge, (name, A) in zip(hinges, rockers.items(), strict=True)
-        ]
-        B = N.rotate(3, q["bar"], u["bar_dot"])
-        bar = jk.Body(2.0, (0.0, 0.0, 2 / 3), O.fixed(-1.0 * rockers["a"].y).fixed(1.0 * B.x), B, name="bar")
-        return jk.Motion([*bodies, bar])
+        return jk.Motion([jk.Body(1.0, (0.0, 0.0, 1 / 12), O, N.rotate(3, q[i], u[i])) for i in range(4)])
 
     def configuration_constraints(self, t, q):
-        first = jnp.sin(q["a"]), -jnp.cos(q["a"])
         residuals = []
         for name, x in (("b", 1.0), ("c", 2.0)):
-            along = x + self.excess * (x - 1.0)
             residuals += [
-                first[0] + along * jnp.cos(q["bar"]) - x - jnp.sin(q[name]),
-                first[1] + along * jnp.sin(q["bar"]) + jnp.cos(q[name]),
+                jnp.sin(q["a"]) + x * jnp.cos(q["bar"]) - x - jnp.sin(q[name]),
+                x * jnp.sin(q["bar"]) + jnp.cos(q[name]) - jnp.cos(q["a"]),
             ]
         return residuals
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -9.81 * motion.N.y)
-
-
-@pytest.mark.weekly
-@pytest.mark.parametrize("excess", [0.0, 1e-8])
-def test_a_redundant_third_rocker_does_not_change_the_motion(excess):
-    system = jk.with_multipliers(Parallelogram(excess))
-    state = jk.assemble(system, [0.5, 0.4, 0.45, 0.02], None, free=("b", "c", "bar"))
-    np.testing.assert_allclose(state.q, [0.5, 0.5, 0.5, 0.0], atol=1e-7)
-    ride = jk.simulate(system, state, jnp.linspace(0.0, 2.0, 11), rtol=1e-10, atol=1e-10)
-    # one pendulum: 3 (1/12 + 1/4) + 2 = 3 kg m^2, and 3 / 2 + 2 = 3.5 kg m
-    pendulum = solve_ivp(
-        lambda t, y: [y[1], -9.81 * 3.5 / 3 * np.sin(y[0])], (0, 2), [0.5, 0.0], rtol=1e-11, atol=1e-11
-    )
-    np.testing.assert_allclose(ride["a"][-1], pendulum.y[0, -1], atol=1e-6 if excess else 1e-8)
 
 
 class Struck(Links):

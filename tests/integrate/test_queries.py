@@ -1,8 +1,6 @@
 """Places, velocities, orientations and rates of speeds by name, along trajectories, batches and early ends."""
 
 import dataclasses
-import importlib
-import inspect
 
 import jax
 import jax.numpy as jnp
@@ -146,7 +144,7 @@ def test_singular_equations_raise_at_one_time():
 
 
 class Coupled(jk.System):
-    """Two carts on one line, coupled where their ends meet; `twice` is another point at that place."""
+    """Two carts on one line, coupled where their ends meet. `twice` is another point at that place."""
 
     coordinates, speeds, dependent_speeds = ("x", "y"), ("x_dot",), ("y_dot",)
 
@@ -208,21 +206,3 @@ def test_every_public_function_refuses_the_motion_of_another_system(ride, name):
     f, other = OF_A_TRAJECTORY[name], type("Other", (Disc,), OTHERS["inputs"])()
     with pytest.raises(ValueError, match="belongs to another system"):
         f(other, ride)
-
-
-def test_every_public_function_of_a_trajectory_is_tested():
-    rooms = [jk, *(importlib.import_module(f"jaxkane.{room}") for room in jk._PACKAGES if room != "catalog")]
-    functions = {
-        f"{room.__name__}.{name}": f
-        for room in rooms
-        for name in {*vars(room), *getattr(room, "__all__", ())}  # a name of jaxkane is imported when it is used
-        if inspect.isfunction(f := getattr(room, name)) and not name.startswith("_")
-    }
-    functions["jaxkane.animate"] = jk.animate
-    taking = {
-        name
-        for name, f in functions.items()
-        if "system" in inspect.signature(f).parameters
-        and (" along(" in inspect.getsource(f) or {"trajectory", "motions"} & {*inspect.signature(f).parameters})
-    }
-    assert taking == {*OF_A_TRAJECTORY}

@@ -1,12 +1,10 @@
 """Motion over time: accuracy, inputs, statuses, gradients, and what is refused."""
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from slopes import differences, slopes
 
@@ -17,39 +15,6 @@ BIKE = WhippleBicycle.benchmark()
 PENDULUM = DoublePendulum(mass=1.0, length=1.0)
 TS = jnp.linspace(0.0, 1.0, 11)
 START = jk.State(jnp.array([1.0, -0.5]), jnp.array([0.0, 0.3]))
-
-
-def mechanical_energy(bike, q, u):
-    """Kinetic and potential; N3 points down."""
-
-    def one(q, u):
-        motion = bike.motion(0.0, q, jnp.zeros(6))
-        height = sum(body.mass * body.center.position.dot(motion.N.z) for body in motion.bodies)
-        return jk.kinetic_energy(bike, 0.0, q, u) - bike.g * height, motion["Q"].position.dot(motion.N.z)
-
-    return jax.jit(jax.vmap(one))(q, u)
-
-
-@pytest.mark.weekly
-def test_energy_and_front_contact_over_five_seconds():
-    """v = 4.6 m/s, roll rate 0.5 rad/s (Meijaard et al., Figure 4), rtol 1e-10."""
-    state = jk.assemble(BIKE, {}, {"roll_rate": 0.5, "rear_wheel_rate": -4.6 / 0.3})
-    ride = jk.simulate(BIKE, state, jnp.linspace(0.0, 5.0, 101), rtol=1e-10, atol=1e-10)
-    assert ride.ok
-    energy, front_contact = mechanical_energy(BIKE, ride.q, ride.u)
-    kinetic = float(jk.kinetic_energy(BIKE, 0.0, state.q, state.u))
-    assert float(jnp.abs(energy - energy[0]).max()) / kinetic < 1e-9
-    assert float(jnp.abs(front_contact).max()) < 1e-9
-    assert abs(float(ride["roll"][-1])) < 0.05  # stable at this speed
-    np.testing.assert_allclose(ride["yaw_rate"], ride.u_dep[:, 0])
-
-
-@pytest.mark.weekly
-def test_fixed_and_adaptive_steps_agree():
-    fine = jk.simulate(PENDULUM, START, TS, solver=diffrax.Dopri8(), rtol=1e-11, atol=1e-11)
-    steps = jk.simulate(PENDULUM, START, TS, step=1e-3)
-    np.testing.assert_allclose(steps.q, fine.q, atol=1e-9)
-    assert steps.stats["steps"] == 1000
 
 
 @pytest.mark.weekly
@@ -70,31 +35,6 @@ def test_inputs_of_every_kind():
         np.testing.assert_allclose(ride.q, ramp.q, atol=1e-7, err_msg=kind)
         np.testing.assert_allclose(ride["elbow_torque"], 3.0 * TS, rtol=1e-12, err_msg=kind)
         np.testing.assert_array_equal(ride["shoulder_torque"], 0.0)
-
-
-class Rider(eqx.Module):
-    """Steers into the fall, and reads a dependent speed beside."""
-
-    gain: jk.Scalar
-
-    def __call__(self, t, state):
-        steer = 15.0 * state["roll_rate"] + 20.0 * state["roll"] - state["steer_rate"]
-        return {"steer_torque": self.gain * steer, "roll_torque": -0.001 * state["yaw_rate"]}
-
-
-@pytest.mark.weekly
-def test_a_steering_controller_stabilizes_the_bicycle():
-    """A rider who steers into the fall keeps the bicycle up at 2.5 m/s, where it falls by itself."""
-    state = jk.assemble(BIKE, {"roll": 0.02}, {"rear_wheel_rate": -2.5 / 0.3})
-    ts = jnp.linspace(0.0, 5.0, 51)
-    alone, ridden = (jk.simulate(BIKE, state, ts, Rider(gain), adjoint="forward") for gain in (0.0, 1.0))
-    assert alone.status == jk.Status.SINGULAR_SPEEDS  # its front wheel turns across
-    assert ridden.ok
-    assert float(jnp.abs(ridden["roll"]).max()) < 0.03
-    steer = 15.0 * ridden["roll_rate"] + 20.0 * ridden["roll"] - ridden["steer_rate"]
-    np.testing.assert_allclose(ridden["steer_torque"], steer, atol=1e-12)
-    np.testing.assert_allclose(ridden["roll_torque"], -0.001 * ridden["yaw_rate"], atol=1e-16)  # a dependent speed
-    assert float(jnp.abs(ridden["roll_torque"]).max()) > 0
 
 
 class Wheel(jk.System):
@@ -131,100 +71,35 @@ def test_a_controller_reads_the_state_by_name():
 
 
 @pytest.mark.weekly
-def test_statuses():
-    few = jk.simulate(PENDULUM, START, TS, max_steps=5)
-    assert few.status == jk.Status.MAX_STEPS
-    assert np.isfinite(few.q[0]).all()
-    assert np.isnan(few.q[-1]).all()
-    ends = Until(jnp.array(0.5))
-    ride = jk.simulate(PENDULUM, START, TS, {"elbow_torque": ends})
+def test_a_torque_that_becomes_nan_and_a_state_that_is_nan_under_jit_have_a_status():
+    torque = {"torque": lambda t, state: jnp.where(t < 0.5, 1.0, jnp.nan)}
+    run = jax.jit(lambda q: jk.simulate(Pendulum(), jk.State(q, jnp.zeros(1)), TS, torque))
+    ride = run(jnp.array([0.4]))
     assert ride.status == jk.Status.STEP_TOO_SMALL
-    assert 0.49 < float(ride.t_end) <= 0.5
-    reached = np.asarray(TS) <= float(ride.t_end)
-    assert np.isfinite(ride.q[reached]).all()
-    assert np.isnan(ride.q[~reached]).all()
     assert not ride.ok
-    of_start = jax.jit(lambda q: jk.simulate(PENDULUM, jk.State(q, jnp.zeros(2)), TS, {"elbow_torque": ends}))
-    bad = of_start(jnp.array([jnp.nan, 0.0]))  # under a trace: alone, a state that is not finite is an error
+    assert 0.49 < float(ride.t_end) <= 0.5
+    np.testing.assert_array_equal(np.isfinite(ride["angle"]), TS <= ride.t_end)
+    bad = run(jnp.array([jnp.nan]))
     assert bad.reason == "invalid"
     assert np.isnan(bad.q).all()
 
 
-class Until(eqx.Module):
-    """A torque that is no number any more after a time."""
-
-    when: jk.Scalar
-
-    def __call__(self, t, state):
-        return jnp.where(t < self.when, 1.0, jnp.nan)
-
-
-@pytest.fixture(scope="module")
-def bicycle_for_a_second():
-    """One program for all short rides: (roll, roll rate, steer, steer rate, rear wheel rate) -> ride."""
-
-    @jax.jit
-    def ride(q, u):
-        return jk.simulate(BIKE, jk.State(q, u), TS, adjoint="forward")
-
-    def of(roll=0.0, roll_rate=0.0, steer=0.0, steer_rate=0.0, wheel=-10.0):
-        rates = {"roll_rate": roll_rate, "steer_rate": steer_rate, "rear_wheel_rate": wheel}
-        state = jk.assemble(BIKE, {"roll": roll, "steer": steer}, rates)
-        return ride(state.q, state.u)
-
-    return of
-
-
 @pytest.mark.slow
-def test_a_fall_and_singular_speeds_end_a_bicycle_simulation(bicycle_for_a_second):
+def test_a_fall_and_singular_speeds_end_a_bicycle_simulation():
     """A roll beyond 78 degrees is a fall. Steered to 1.6 rad it is just beside 91.77 degrees, where for the upright
     bicycle the dependent speeds are singular."""
-    fell = bicycle_for_a_second(roll=1.2, roll_rate=2.0)
+
+    def ride(angles, rates):
+        return jk.simulate(BIKE, jk.assemble(BIKE, angles, rates), TS)
+
+    fell = ride({"roll": 1.2}, {"roll_rate": 2.0, "rear_wheel_rate": -10.0})
     assert fell.reason == "fell over"
     np.testing.assert_allclose(fell.end.q[BIKE.coordinates.index("roll")], np.arccos(0.2), atol=1e-9)
     assert np.isnan(fell.q[1:]).all()
-    across = bicycle_for_a_second(steer=1.6, steer_rate=0.5, wheel=-1.0)
+    across = ride({"steer": 1.6}, {"steer_rate": 0.5, "rear_wheel_rate": -1.0})
     assert across.status == jk.Status.SINGULAR_SPEEDS
     np.testing.assert_allclose(across.end.q[BIKE.coordinates.index("steer")], np.deg2rad(91.77), atol=1e-4)
     assert np.isnan(across.q[1:]).all()
-    slow = bicycle_for_a_second(roll=0.3, wheel=-1.0 / 0.3)  # it turns in further and further
-    assert slow.status == jk.Status.SINGULAR_SPEEDS
-    reached = np.asarray(TS) <= float(slow.t_end)
-    assert 1 < reached.sum() < 11
-    assert np.isfinite(slow.q[reached]).all()
-    assert np.isnan(slow.q[~reached]).all()
-
-
-def loss(system, state, torque, adjoint):
-    ride = jk.simulate(
-        system, state, TS, {"elbow_torque": torque}, adjoint=adjoint, rtol=1e-10, atol=1e-10, max_steps=256
-    )
-    return jnp.sum(ride["theta1"] ** 2 + ride["theta2_dot"])
-
-
-@pytest.mark.weekly
-@pytest.mark.parametrize(
-    ("torque", "forward", "reverse"),
-    [(jnp.array(0.7), "auto", "both"), (jnp.sin(jnp.linspace(0.0, 3.0, 11)), "forward", "auto")],
-    ids=["number", "samples"],
-)
-def test_gradients_of_a_simulation_against_central_differences(torque, forward, reverse):
-    """Parameters, initial state and inputs; forward, reverse, and an adjoint for both."""
-    rtol = 1e-6
-    arguments = (PENDULUM, START, torque)
-    direction = jax.tree.map(lambda x: jnp.cos(jnp.arange(x.size, dtype=x.dtype).reshape(x.shape)), arguments)
-    both = jax.jit(jax.value_and_grad(lambda *args: loss(*args, reverse), argnums=(0, 1, 2)))  # one program for both
-
-    def along(h):
-        return float(both(*jax.tree.map(lambda x, d: x + h * d, arguments, direction))[0])
-
-    h = 1e-5
-    numeric = (along(h) - along(-h)) / (2 * h)
-    tangent = jax.jvp(lambda *args: loss(*args, forward), arguments, direction)[1]
-    np.testing.assert_allclose(tangent, numeric, rtol=rtol)
-    gradient = both(*arguments)[1]
-    products = jax.tree.map(lambda g, d: jnp.sum(g * d), gradient, direction)
-    np.testing.assert_allclose(sum(jax.tree.leaves(products)), numeric, rtol=rtol)
 
 
 @pytest.mark.weekly
@@ -232,7 +107,7 @@ def test_gradients_of_a_simulation_against_central_differences(torque, forward, 
     ("adjoint", "mode"),
     [
         ("auto", "forward"),
-        ("auto", "reverse"),
+        ("both", "reverse"),
         (diffrax.DirectAdjoint(), "forward"),
         (diffrax.DirectAdjoint(), "reverse"),
         (diffrax.RecursiveCheckpointAdjoint(), "reverse"),
@@ -247,7 +122,7 @@ def test_every_adjoint_against_differences(adjoint, mode):
         torque = {"torque": x[2] * TS[:3]}
         options = {"adjoint": adjoint, "step": 0.05, "max_steps": 4}
         ride = jk.simulate(Pendulum(length=x[0]), jk.State(x[1:2], jnp.zeros(1)), TS[:3], torque, **options)
-        assert ride.adjoint == ("fixed steps" if adjoint == "auto" else type(adjoint).__name__)
+        assert ride.adjoint == ("fixed steps" if isinstance(adjoint, str) else type(adjoint).__name__)
         return ride["angle"][-1] + ride["rate"][1]
 
     both, x = slopes(read, mode), jnp.array([1.1, 0.4, 3.0])
@@ -293,52 +168,10 @@ def test_second_derivatives_with_reverse_mode_raise_with_advice(mode):
         jax.eval_shape(derivative, 0.2)
 
 
-def test_a_state_that_is_not_finite_is_refused_by_name():
-    with pytest.raises(ValueError, match=r"Pendulum: state.q: angle = nan is not finite"):
-        jk.simulate(Pendulum(), jk.State([np.nan], [0.0]), TS)
-
-
 @pytest.mark.slow
 def test_a_state_of_mixed_types_is_promoted():
     state = jk.State(jnp.array([0.4], jnp.float32), jnp.array([0.1]))
     assert jk.simulate(Pendulum(), state, TS[:3], step=0.05, max_steps=4).q.dtype == jnp.float64
-
-
-@pytest.mark.weekly
-def test_second_derivatives_forward_over_forward():
-    f = lambda m: loss(DoublePendulum(mass=m, length=1.0), START, 0.7, "forward")  # noqa: E731
-    both = slopes(lambda m, _: jax.jacfwd(f)(m), "forward")  # the second derivative, and the first
-    numeric = (both(1.0 + 1e-4)[1] - both(1.0 - 1e-4)[1]) / 2e-4
-    np.testing.assert_allclose(both(1.0)[0], numeric, rtol=1e-5)
-
-
-@pytest.mark.weekly
-def test_gradients_of_the_bicycle():
-    """Reverse and forward through a ride, a parameter and the initial roll rate, against differences."""
-    import dataclasses
-
-    ts = jnp.linspace(0.0, 1.0, 6)
-
-    def final_roll(x, adjoint):
-        bike = dataclasses.replace(BIKE, IHzz=x[0])
-        state = jk.State(jnp.zeros(8), jnp.stack([x[1], jnp.array(-15.0), jnp.array(0.0)]))
-        return jk.simulate(bike, state, ts, adjoint=adjoint, rtol=1e-10, atol=1e-10)["roll"][-1]
-
-    x, h = jnp.array([0.00708, 0.5]), jnp.array([1e-6, 1e-5])
-    f = jax.jit(jax.value_and_grad(lambda x: final_roll(x, "reverse")))  # one program for both
-    numeric = [(f(x + e)[0] - f(x - e)[0]) / (2 * e.sum()) for e in jnp.diag(h)]
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(lambda x: final_roll(x, "forward")))(x), numeric, rtol=1e-6)
-    np.testing.assert_allclose(f(x)[1], numeric, rtol=1e-6)
-
-
-@pytest.mark.weekly
-def test_float32_results():
-    pendulum = jax.tree.map(lambda x: x.astype(jnp.float32), PENDULUM)
-    start = jax.tree.map(lambda x: x.astype(jnp.float32), START)
-    ride = jk.simulate(pendulum, start, np.linspace(0.0, 1.0, 11), {"elbow_torque": 0.0})
-    assert ride.q.dtype == ride["elbow_torque"].dtype == jnp.float32
-    reference = jk.simulate(PENDULUM, START, TS)
-    np.testing.assert_allclose(np.asarray(ride.q), np.asarray(reference.q), atol=1e-3)
 
 
 @pytest.mark.slow
@@ -358,17 +191,6 @@ def test_changing_the_accuracy_does_not_recompile():
 
 
 @pytest.mark.slow
-def test_under_jit_and_vmap():
-    run = lambda u: jk.simulate(PENDULUM, jk.State(START.q, u), TS)  # noqa: E731
-    us = jnp.array([[0.0, 0.3], [1.0, -1.0]])
-    rides = jax.jit(jax.vmap(run))(us)
-    assert rides["theta1"].shape == (2, 11)
-    assert list(rides.ok) == [True, True]
-    assert rides.reason == ["completed", "completed"]
-    np.testing.assert_allclose(rides.q[1], run(us[1]).q, atol=1e-7)
-
-
-@pytest.mark.slow
 def test_a_simulation_can_be_resumed_from_its_end():
     whole = jk.simulate(PENDULUM, START, TS, rtol=1e-11, atol=1e-11)
     first = jk.simulate(PENDULUM, START, TS[:6], rtol=1e-11, atol=1e-11)
@@ -379,33 +201,25 @@ def test_a_simulation_can_be_resumed_from_its_end():
 @pytest.mark.weekly
 def test_invalid_times_and_samples_give_status_invalid_under_jit():
     """Where no check sees the numbers."""
-    kinds = (False, True)
 
     @jax.jit
     @jax.vmap
     def statuses(ts, knots, values):
-        rides = [jk.simulate(PENDULUM, START, ts)]
-        rides += [jk.simulate(PENDULUM, START, TS, {"shoulder_torque": jk.Samples(knots, values, k)}) for k in kinds]
-        return [ride.status for ride in rides]
+        torques = [None, *({"torque": jk.Samples(knots, values, zero_order_hold=x)} for x in (False, True))]
+        return [jk.simulate(Pendulum(), jk.State([0.4], [0.0]), ts, x).status for x in torques]
 
-    def with_entry(x, place, value):
-        x = np.array(x)
-        x[place] = value
-        return x
-
-    knots, values = np.linspace(-0.5, 1.5, 9), np.ones(9)
-    wrong = [(0, -np.inf), (0, np.nan), (-1, np.inf), (-1, np.nan), (4, np.nan), (4, 9.0)]
-    of_times = statuses(
-        np.stack([with_entry(TS, *entry) for entry in wrong]),
-        np.stack([with_entry(knots, *entry) for entry in wrong]),
-        np.stack([values] * len(wrong)),
-    )
-    np.testing.assert_array_equal(of_times, jk.Status.INVALID)
-    places = [with_entry(values, i, x) for i in (0, 4, -1) for x in (np.nan, np.inf)]
-    good = [np.stack([np.asarray(x)] * (len(places) + 1)) for x in (TS, knots)]
-    _, *of_values = statuses(*good, np.stack([*places, values]))
-    np.testing.assert_array_equal(np.array(of_values)[:, :-1], jk.Status.INVALID)
-    np.testing.assert_array_equal(np.array(of_values)[:, -1], jk.Status.COMPLETED)
+    ts, knots, values = np.array(TS), np.linspace(-0.5, 1.5, 9), np.ones(9)
+    cases, of_times, of_samples = [(ts, knots, values)], [jk.Status.COMPLETED], [jk.Status.COMPLETED]
+    for i, x in ((0, -np.inf), (0, np.nan), (-1, np.inf), (-1, np.nan), (4, np.nan), (4, 9.0)):
+        for k in range(3):
+            case = [ts.copy(), knots.copy(), values.copy()]
+            case[k][i] = x
+            cases.append(case)
+            of_times.append(jk.Status.INVALID if k == 0 else jk.Status.COMPLETED)
+            valid = k == 2 and x == 9.0  # any number is a valid value
+            of_samples.append(jk.Status.COMPLETED if valid else jk.Status.INVALID)
+    found = statuses(*(np.stack(x) for x in zip(*cases, strict=True)))
+    np.testing.assert_array_equal(found, [of_times, of_samples, of_samples])
 
 
 def test_progress_is_printed_on_request_only(capfd):
@@ -417,46 +231,25 @@ def test_progress_is_printed_on_request_only(capfd):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error", "message"),
+    ("arguments", "message"),
     [
-        (
-            (PENDULUM, START, [0.0, 0.5, 0.4]),
-            ValueError,
-            r"`ts` must be finite and increase: ts\[1\] = 0.5 is followed by 0.4",
-        ),
-        ((PENDULUM, START, [0.0, 0.5, 0.5]), ValueError, "must be finite and increase"),
-        ((PENDULUM, START, [0.0, np.nan]), ValueError, "must be finite and increase"),
-        ((PENDULUM, START, [0.0]), ValueError, "at least two times"),
-        (
-            (PENDULUM, START, TS, {"elbow": 1.0}),
-            ValueError,
-            "no input named elbow; it has shoulder_torque, elbow_torque",
-        ),
-        (
-            (PENDULUM, START, TS, {"elbow_torque": np.ones(7)}),
-            ValueError,
-            r"'elbow_torque' has samples of the shape \(7,\)",
-        ),
-        ((PENDULUM, START, TS, {"elbow_torque": np.full(11, np.nan)}), ValueError, "not finite"),
-        ((PENDULUM, START, TS, 3.0), TypeError, "dict by name or a function"),
-        ((PENDULUM, (1.0, 2.0), TS), TypeError, "jaxkane.State"),
-        ((PENDULUM, jk.State(np.zeros(3), np.zeros(2)), TS), ValueError, r"state.q must have the shape \(2,\)"),
-        ((PENDULUM, jk.State(np.zeros((4, 2)), np.zeros(2)), TS), ValueError, "sweep or jax.vmap"),
-        (
-            (BIKE, jk.State(np.full(8, 0.3), np.zeros(3)), TS),
-            ValueError,
-            r"violate the configuration constraints by \[",
-        ),
+        ((PENDULUM, START, [0.0, 0.5, 0.4]), r"finite and increase: ts\[1\] = 0.5 is followed by 0.4"),
+        ((PENDULUM, START, [0.0, 0.5, 0.5]), "must be finite and increase"),
+        ((PENDULUM, START, [0.0]), "at least two times"),
+        ((PENDULUM, START, TS, {"elbow": 1.0}), "no input named elbow; it has shoulder_torque, elbow_torque"),
+        ((PENDULUM, START, TS, {"elbow_torque": np.ones(7)}), r"'elbow_torque' has samples of the shape \(7,\)"),
+        ((PENDULUM, jk.State(np.zeros(3), np.zeros(2)), TS), r"state.q must have the shape \(2,\)"),
+        ((PENDULUM, jk.State(np.zeros((4, 2)), np.zeros(2)), TS), "sweep or jax.vmap"),
+        ((BIKE, jk.State(np.full(8, 0.3), np.zeros(3)), TS), r"violate the configuration constraints by \["),
+        ((PENDULUM, jk.State([np.nan, 0.0], [0.0, 0.0]), TS), r"state.q: theta1 = nan is not finite"),
     ],
 )
-def test_invalid_arguments_raise(arguments, error, message):
-    with pytest.raises(error, match=message):
+def test_invalid_arguments_raise(arguments, message):
+    with pytest.raises(ValueError, match=message):
         jk.simulate(*arguments)
 
 
-def test_an_unknown_adjoint_and_an_unknown_name():
-    with pytest.raises(ValueError, match="`adjoint` must be one of"):
-        jk.simulate(PENDULUM, START, TS, adjoint="backwards")
+def test_an_unknown_name_in_a_trajectory_raises():
     with pytest.raises(KeyError, match="no 'theta3' in this trajectory; did you mean 'theta"):
         _ = jk.simulate(PENDULUM, START, TS)["theta3"]
 
@@ -473,23 +266,6 @@ class Pendulum(jk.System):
 
     def loads(self, t, q, u, motion, inputs):
         return [*jk.weight(motion, -9.81 * motion.N.y), jk.Torque(inputs["torque"] * motion.N.z, motion.bodies[0])]
-
-
-@pytest.mark.weekly
-def test_a_step_that_ends_a_rounding_error_before_a_sample():
-    """Steps of 2.5 ms by chance end a rounding error before samples; what is left was once too short a step."""
-    pendulum = Pendulum()
-    ts, start = jnp.linspace(0.0, 2.5, 51), jk.State(jnp.array([0.1]), jnp.zeros(1))
-    sampled = jk.simulate(pendulum, start, ts, inputs={"torque": 3.0 * jnp.sin(2.0 * ts)})
-    assert sampled.ok, sampled.reason
-
-    def motion(t, y):
-        torque = np.interp(t, ts, 3.0 * np.sin(2.0 * ts))
-        return [y[1], -9.81 / 1.1 * np.sin(y[0]) + torque / (2.0 * 1.1**2)]
-
-    by_scipy = solve_ivp(motion, (0.0, 2.5), [0.1, 0.0], t_eval=ts, rtol=1e-9, atol=1e-9, max_step=0.05).y
-    np.testing.assert_allclose(sampled.q[:, 0], by_scipy[0], atol=1e-6)
-    assert sampled.stats["accepted"] < 4 * len(ts)
 
 
 @pytest.mark.slow

@@ -6,24 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_clocks import Particle
 
 import jaxkane as jk
 
 ts = np.linspace(0.0, 1.0, 6)
 values = np.array([1.0, -2.0, 0.5, 3.0, -1.0, 4.0])
-
-
-class Cart(jk.System):
-    coordinates = ("place",)
-    speeds = ("speed",)
-    inputs = ("push",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x, u[0] * N.x, frame=N), name="cart")])
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.Force(inputs["push"] * motion.N.x, motion["cart"])
 
 
 def place(t, delay):
@@ -33,29 +21,15 @@ def place(t, delay):
     return sum(jump * s**2 / 2 for jump, s in zip(jumps, since, strict=True))
 
 
-def end(delay, adjoint="auto"):
-    push = jk.Samples(ts + delay, values, zero_order_hold=True)
-    return jk.simulate(Cart(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], {"push": push}, adjoint=adjoint)["place"]
-
-
-@pytest.mark.weekly
-def test_the_solution_and_its_derivative_by_a_delay_are_exact():
-    found, slope = jax.jit(lambda d: jax.jvp(lambda d: end(d, "forward"), (d,), (1.0,)))(0.03)
-    exact = [place(t, 0.03) for t in (0.0, 0.5, 1.0)]
-    np.testing.assert_allclose(found, exact, atol=1e-12)
-    h = 1e-6
-    np.testing.assert_allclose(slope, [(place(t, 0.03 + h) - place(t, 0.03 - h)) / (2 * h) for t in (0, 0.5, 1)], 1e-8)
-    reverse = jax.jit(jax.grad(lambda d: end(d)[-1]))(0.03)
-    assert float(reverse) == pytest.approx(float(slope[-1]), rel=1e-9)
-
-
 def test_fixed_steps_that_end_at_the_samples_are_exact():
     push = jk.Samples(ts, values, zero_order_hold=True)
-    ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())
-    np.testing.assert_allclose(ride["place"], [place(t, 0.0) for t in ts], atol=1e-13)
+    ride = jk.simulate(Particle(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())
+    np.testing.assert_allclose(ride["x"], [place(t, 0.0) for t in ts], atol=1e-13)
     np.testing.assert_array_equal(ride["push"], values)
-    ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1)  # Tsit5 reads both ends of a step
-    np.testing.assert_allclose(ride["place"], [place(t, 0.0) for t in ts], atol=1e-13)
+    ride = jk.simulate(
+        Particle(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1
+    )  # Tsit5 reads both ends of a step
+    np.testing.assert_allclose(ride["x"], [place(t, 0.0) for t in ts], atol=1e-13)
 
 
 @pytest.mark.weekly
@@ -63,8 +37,8 @@ def test_fixed_steps_that_end_at_the_samples_are_exact():
 def test_fixed_steps_have_derivatives_by_sample_values_and_nan_by_times(mode):
     def end(delay, factor):
         push = jk.Samples(ts + delay, factor * values, zero_order_hold=True)
-        ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())
-        return ride["place"][-1]
+        ride = jk.simulate(Particle(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())
+        return ride["x"][-1]
 
     np.testing.assert_allclose(mode(end, argnums=1)(0.0, 1.0), place(ts[-1], 0.0), rtol=1e-12)
     assert np.isnan(mode(end)(0.0, 1.0))
@@ -82,12 +56,7 @@ def test_a_rejected_step_after_a_jump_evaluates_its_first_stage_again():
 
 def test_an_input_of_the_time_alone_is_refused_by_name():
     with pytest.raises(TypeError, match=r"The input 'push' must be a function of \(t, state\)"):
-        jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": lambda t: 1.0})
-
-
-def test_an_invalid_zero_order_hold_option_raises():
-    with pytest.raises(TypeError, match="`zero_order_hold` must be True or False, got 'zero'"):
-        jk.Samples(ts, values, zero_order_hold="zero")
+        jk.simulate(Particle(), jk.State([0.0], [0.0]), ts, {"push": lambda t: 1.0})
 
 
 def push_of(form, delay, hold):
@@ -100,9 +69,9 @@ def push_of(form, delay, hold):
         "asked earlier": {"push": lambda t, s: samples(t - delay)},
         "compiled": {"push": jax.jit(lambda t, s: samples(t - delay))},
         "module": {"push": Earlier(samples, delay)},
-        "branch": {"push": lambda t, s: jax.lax.cond(s["place"] > -9.0, lambda t: samples(t - delay), lambda t: t, t)},
+        "branch": {"push": lambda t, s: jax.lax.cond(s["x"] > -9.0, lambda t: samples(t - delay), lambda t: t, t)},
         "batch": {"push": lambda t, s: 0.5 * jnp.sum(jax.vmap(samples)(t - delay * jnp.ones(2)))},
-        "controller": lambda t, s: {"push": samples(-delay + t) + 0.0 * s["speed"]},
+        "controller": lambda t, s: {"push": samples(-delay + t) + 0.0 * s["v"]},
     }[form]
 
 
@@ -121,8 +90,8 @@ class Earlier(eqx.Module):
 @pytest.mark.parametrize("form", FORMS)
 def test_discontinuities_of_samples_called_by_a_function_are_found(form):
     """Steps between jumps are exact, and none is rejected."""
-    ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], push_of(form, 0.03, True))
-    np.testing.assert_allclose(ride["place"][-1], place(1.0, 0.03), rtol=1e-12)
+    ride = jk.simulate(Particle(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], push_of(form, 0.03, True))
+    np.testing.assert_allclose(ride["x"][-1], place(1.0, 0.03), rtol=1e-12)
     assert ride.stats["rejected"] == 0
 
 
@@ -133,15 +102,7 @@ def by_delay(end):
 
 def end_with(system, push):
     ride = jk.simulate(system, jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], push, adjoint="forward")
-    return ride["place"][-1]
-
-
-@pytest.mark.slow
-def test_a_delay_within_an_input_function_is_differentiable():
-    rtol, h = 1e-8, 1e-6
-    slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
-    found = by_delay(lambda d: end_with(Cart(), push_of("asked earlier", d, True)))
-    np.testing.assert_allclose(found, (place(1.0, 0.03), slope), rtol=rtol)
+    return ride["x"][-1]
 
 
 @pytest.mark.weekly
@@ -149,48 +110,49 @@ def test_a_delay_within_an_input_function_is_differentiable():
 def test_samples_called_by_a_function_equal_samples_passed_directly(form):
     rtol = 1e-11
     found, given = (
-        by_delay(lambda d, form=form: end_with(Cart(), push_of(form, d, False))) for form in (form, "direct")
+        by_delay(lambda d, form=form: end_with(Particle(), push_of(form, d, False))) for form in (form, "direct")
     )
     np.testing.assert_allclose(found, given, rtol=rtol)
 
 
-class Blown(Cart):
+class Blown(Particle):
     wind: jk.Samples
 
     def loads(self, t, q, u, motion, inputs):
-        return jk.Force(self.wind(t) * motion.N.x, motion["cart"])
+        return jk.Force(self.wind(t) * motion.N.x, motion["mass"])
 
 
-@pytest.mark.weekly
-@pytest.mark.filterwarnings("ignore:Blown")
-def test_samples_stored_in_a_system_have_derivatives_by_their_times():
-    rtol, h = 1e-8, 1e-6
-    slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
-    found = by_delay(lambda d: end_with(Blown(jk.Samples(ts + d, values, zero_order_hold=True)), None))
-    np.testing.assert_allclose(found, (place(1.0, 0.03), slope), rtol=rtol)
-
-
-class Late(Cart):
+class Late(Particle):
     delay: jk.Scalar = jk.parameter(0.0)  # [s]
 
     def loads(self, t, q, u, motion, inputs):
-        return jk.Force(samples_held(t - self.delay) * motion.N.x, motion["cart"])
+        return jk.Force(samples_held(t - self.delay) * motion.N.x, motion["mass"])
 
 
-@pytest.mark.weekly
-@pytest.mark.filterwarnings("ignore:Late")
-def test_discontinuities_of_samples_captured_by_a_system_are_found():
+DELAYED = {
+    "input": lambda d: (Particle(), push_of("asked earlier", d, True)),
+    "stored": lambda d: (Blown(jk.Samples(ts + d, values, zero_order_hold=True)), None),
+    "captured": lambda d: (Late(d), None),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.weekly_cases("stored", "captured")
+@pytest.mark.filterwarnings("ignore:Blown", "ignore:Late")
+@pytest.mark.parametrize("kind", DELAYED)
+def test_a_delay_in_a_function_or_a_system_is_differentiable(kind):
     rtol, h = 1e-8, 1e-6
     slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
-    np.testing.assert_allclose(by_delay(lambda d: end_with(Late(d), None)), (place(1.0, 0.03), slope), rtol=rtol)
+    found = by_delay(lambda d: end_with(*DELAYED[kind](d)))
+    np.testing.assert_allclose(found, (place(1.0, 0.03), slope), rtol=rtol)
 
 
 @pytest.mark.parametrize(
     ("push", "options", "message"),
     [
         (lambda t, s: samples_held(0.5 * t), {}, "'push' calls Samples at a time other than t or t - delay"),
-        (lambda t, s: samples_held(s["place"]), {}, "For a table over another quantity, use jnp.interp"),
-        (lambda t, s: jk.Samples(ts + s["place"], values)(t), {}, "cannot end at their discontinuities"),
+        (lambda t, s: samples_held(s["x"]), {}, "For a table over another quantity, use jnp.interp"),
+        (lambda t, s: jk.Samples(ts + s["x"], values)(t), {}, "cannot end at their discontinuities"),
         (
             lambda t, s: samples_held(t),
             {"step": 0.1, "solver": diffrax.Bosh3()},
@@ -200,7 +162,7 @@ def test_discontinuities_of_samples_captured_by_a_system_are_found():
 )
 def test_unsupported_calls_of_samples_in_input_functions_raise(push, options, message):
     with pytest.raises(ValueError, match=message):
-        jk.simulate(Cart(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], {"push": push}, **options)
+        jk.simulate(Particle(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], {"push": push}, **options)
 
 
 samples_held = jk.Samples(ts, values, zero_order_hold=True)
@@ -215,18 +177,18 @@ def test_memory_is_proportional_to_the_number_of_samples(f):
         samples = jk.Samples(t, y, zero_order_hold=f == "held")
         if f != "motion":
             return jax.vmap(samples)(t)
-        return jk.simulate(Cart(), jk.State([0.0], [0.0]), t, {"push": samples})
+        return jk.simulate(Particle(), jk.State([0.0], [0.0]), t, {"push": samples})
 
     times = jax.ShapeDtypeStruct((n,), float)
     memory = jax.jit(values_at).lower(times, times).compile().memory_analysis()
     assert memory.temp_size_in_bytes < per_sample * n
 
 
-class Two(Cart):
+class Two(Particle):
     inputs = ("push", "pull")
 
     def loads(self, t, q, u, motion, inputs):
-        return jk.Force((inputs["push"] - 2.0 * inputs["pull"]) * motion.N.x, motion["cart"])
+        return jk.Force((inputs["push"] - 2.0 * inputs["pull"]) * motion.N.x, motion["mass"])
 
 
 @pytest.mark.weekly
@@ -239,7 +201,7 @@ def test_simultaneous_jumps_of_two_signals_have_nan_derivatives_by_delay(mode, s
         push = jk.Samples(ts[:-1] + 0.01 + delay, values[:-1], zero_order_hold=True)
         pull = jk.Samples(ts[:-1] + 0.01 + shift, values[1:], zero_order_hold=True)
         ride = jk.simulate(Two(), jk.State([0.0], [0.0]), [0.0, 1.0], {"push": push, "pull": pull}, adjoint=mode)
-        return ride["speed"][-1]
+        return ride["v"][-1]
 
     # Of the integral of a signal that is held, by its delay: minus its last value plus its first.
     derivative = jax.jacfwd if mode == "forward" else jax.grad

@@ -1,4 +1,4 @@
-"""Six systems of SymPy's own tests, described with the public API alone and held to SymPy's accelerations.
+"""Five systems of SymPy's own tests, described with the public API alone and held to SymPy's accelerations.
 
 Figures: tests/data/sympy_kane_systems.json, which SymPy 1.14's KanesMethod computed.
 """
@@ -15,25 +15,6 @@ import jaxkane as jk
 from jaxkane import Scalar, parameter
 
 FIGURES = json.loads((pathlib.Path(__file__).parents[1] / "data" / "sympy_kane_systems.json").read_text())["systems"]
-
-
-class SpringMassDamper(jk.System):
-    """test_kane.test_one_dof: a mass on a line."""
-
-    m: Scalar = parameter(positive=True)  # [kg]
-    k: Scalar = parameter()  # [N/m]
-    c: Scalar = parameter()  # [N s/m]
-
-    coordinates = ("q",)
-    speeds = ("u",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        P = O.moving(q[0] * N.x, u[0] * N.x)
-        return jk.Motion([jk.Body(self.m, 0.0, P, N, name="mass")])
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.Force(-(self.k * q[0] + self.c * u[0]) * motion.N.x, motion["mass"])
 
 
 class RollingDiscDependent(jk.System):
@@ -159,7 +140,6 @@ class PendulumOnCart(jk.System):
 
 
 SYSTEMS = {
-    "one_dof_spring_mass_damper": SpringMassDamper,
     "rolling_disc_minimal": RollingDisc,
     "rolling_disc_dependent_q_u_aux": RollingDiscDependent,
     "four_bar_linkage": FourBarLinkage,

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mechanisms import SliderCrank
+from mechanisms import Sled, SliderCrank
 
 import jaxkane as jk
 from jaxkane import Scalar, parameter
-from jaxkane.catalog import CATALOG, CompassGait
+from jaxkane.catalog import CompassGait
 
 RTOL = 1e-12
 
@@ -51,43 +51,21 @@ THREE = [0.25019093320933394, 0.794427601939151, 0.551371380490387]
 THREE_BEFORE = [-1.0991712400376326, -0.7993348603550983, 1.4942137815850476]
 FIVE = [-0.9894693908688506, 0.6424568367655326, 0.5941388575040925, -0.06413009431255845, -0.39393514636137295]
 FIVE_BEFORE = [-0.8862975515969067, -0.9805216493835016, -0.2196947764694137, 0.018193035831813198, 0.21398940829796986]
-SEVEN = [0.9910005668687853, 0.5853238384275061, 0.24435845888232532, 0.9779202953637698]
-SEVEN += [-0.5693826035288021, -0.6795759322843109, 0.22507920854606156]
-SEVEN_BEFORE = [-1.8242319681544665, -1.8572788849056154, 0.05955528108548114, -0.1351758986988436]
-SEVEN_BEFORE += [1.668671092771409, 0.5169050179640418, 0.05647058639805547]
 THREE_AFTER = [-0.7628341445235738, 0.8971463950346212, 2.523253529194818]
 THREE_AFTER_BOTH = [0.05001258516848717, 0.48084859410187786, -3.7180542874703555]
-FIVE_AFTER = [-0.9557074281794495, -1.334257728599285, -0.7459636148503581, 1.8197091532420917, -2.256063058918521]
-FIVE_AFTER_XYZ = [
-    -1.3660969652185262,
-    -0.9296782824544791,
-    2.040213282260614,
-    3.1937900338427863,
-    0.0027525998585989364,
-]
-FIVE_AFTER_BOTH = [-0.11456926433005477, -1.140670282907006, -1.867846763756749, -0.2801753155468532]
-FIVE_AFTER_BOTH += [-0.6360612801314708]
-SEVEN_AFTER = [-1.7827289017742474, -2.8790300532229764, -0.24163788782176088, 1.2789382725394245]
-SEVEN_AFTER += [5.9838897170512935, 14.841073565622176, 13.549084689798324]
-SEVEN_AFTER_XYZ = [-1.3563514393445122, -2.6637676516466544, -0.9613895286644907, 0.6879535561186859]
-SEVEN_AFTER_XYZ += [5.071222142470407, 10.659303507005815, 4.549110952643275]
-SEVEN_AFTER_BOTH = [1.0856195139841676, 0.3009631159757902, -3.5923196307916183, -1.7864524976042615]
-SEVEN_AFTER_BOTH += [2.5661152788949373, 16.566114471663127, 9.843795202223731]
+FIVE_AFTER_XYZ = [-1.3660969652185262, -0.9296782824544791, 2.040213282260614, 3.1937900338427863]
+FIVE_AFTER_XYZ += [0.0027525998585989364]
 Z, XYZ, BOTH = (tip_z, 0.5), (tip, 0.0), (tip_and_middle_z, 0.3)
 PINOCCHIO = {
     "3 z": (THREE, THREE_BEFORE, *Z, THREE_AFTER, [2.4585216212613616]),
     "3 both": (THREE, THREE_BEFORE, *BOTH, THREE_AFTER_BOTH, [-3.5064707305054093, 18.64332802349147]),
-    "5 z": (FIVE, FIVE_BEFORE, *Z, FIVE_AFTER, [-3.2862521141017305]),
     "5 xyz": (FIVE, FIVE_BEFORE, *XYZ, FIVE_AFTER_XYZ, [-1.0750988666405135, 5.149824677630524, 0.7080449645907833]),
-    "5 both": (FIVE, FIVE_BEFORE, *BOTH, FIVE_AFTER_BOTH, [-2.7727064354180477, -5.436631883634892]),
-    "7 z": (SEVEN, SEVEN_BEFORE, *Z, SEVEN_AFTER, [21.623188281537338]),
-    "7 xyz": (SEVEN, SEVEN_BEFORE, *XYZ, SEVEN_AFTER_XYZ, [0.9059103479133794, 7.313235852643972, 18.257879576082015]),
-    "7 both": (SEVEN, SEVEN_BEFORE, *BOTH, SEVEN_AFTER_BOTH, [18.659152566194383, 36.64871975241565]),
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [pytest.param(x, marks=[pytest.mark.weekly] * (x[0] > "3")) for x in PINOCCHIO])
+@pytest.mark.weekly_cases("5 *")
+@pytest.mark.parametrize("case", PINOCCHIO)
 def test_impulses_agree_with_pinocchio(case):
     q, before, residuals, e, u, p = PINOCCHIO[case]
     after = jk.impact(chain(len(q)), 0.0, q, before, residuals, e)
@@ -96,10 +74,10 @@ def test_impulses_agree_with_pinocchio(case):
     assert after.unique
 
 
-def in_plane(name):
+def in_plane(name, up="y"):
     def residuals(t, q, u, motion):
         v = motion[name].velocity
-        return v.dot(motion.N.x), v.dot(motion.N.y)
+        return v.dot(motion.N.x), v.dot(getattr(motion.N, up))
 
     return residuals
 
@@ -154,13 +132,8 @@ class Hoop(jk.System):
         return jk.Motion([hoop], residuals, points={"ground": ground, "edge": edge})
 
 
-def edge(t, q, u, motion):
-    v = motion["edge"].velocity
-    return v.dot(motion.N.x), v.dot(motion.N.z)
-
-
 def over_kerb(hoop, release=("ground",)):
-    return jk.impact(hoop, 0.0, [0.0, 0.0, 0.35], [4.5], edge, release=release)
+    return jk.impact(hoop, 0.0, [0.0, 0.0, 0.35], [4.5], in_plane("edge", "z"), release=release)
 
 
 @pytest.mark.slow
@@ -186,48 +159,6 @@ def test_an_impact_preserves_the_loop_closure_of_a_slider_crank():
     np.testing.assert_allclose(u_dep, [1.1705385664793941, 0.7015325286138013], rtol=RTOL)
     lost = 0.5 * 0.03349030561689822 * (12.0**2 - 4.8**2)
     np.testing.assert_allclose(after.energy_lost, lost, rtol=RTOL)
-
-
-def by_multipliers(system, q, u, residuals, e):
-    """The speeds after an impact and its impulses, with multipliers for all residuals and without elimination."""
-    q = tuple(jnp.asarray(q, float))
-    u_all = jnp.concatenate([jnp.asarray(u, float), jk.dependent_speeds(system, 0.0, jnp.array(q), u)])
-
-    def energy(u):
-        energies = []
-        for body in system.motion(0.0, q, tuple(u)).bodies:
-            v, w = body.center.velocity.to(body.frame), body.angular_velocity.to(body.frame)
-            energies.append(0.5 * body.mass * v @ v + 0.5 * w @ jnp.array(body.inertia, float) @ w)
-        return sum(energies)
-
-    def permanent(u):
-        return jnp.array(system.motion(0.0, q, tuple(u)).constraints)
-
-    def struck(u):
-        motion = system.motion(0.0, q, tuple(u))
-        return jnp.array([*residuals(0.0, q, tuple(u), motion)])
-
-    M, G, C, c = jax.jit(
-        lambda u: (jax.hessian(energy)(u), jax.jacfwd(permanent)(u), jax.jacfwd(struck)(u), struck(u))
-    )(u_all)
-    rows = np.concatenate([G, C])
-    zeros = np.zeros((len(rows), len(rows)))
-    right = np.concatenate([np.zeros(len(u_all) + len(G)), -(1 + e) * c])
-    solution = np.linalg.solve(np.block([[M, -rows.T], [rows, zeros]]), right)
-    return u_all + solution[: len(u_all)], solution[len(u_all) + len(G) :]
-
-
-@pytest.mark.weekly
-def test_an_impact_preserves_nonholonomic_constraints():
-    bicycle, entry = CATALOG["WhippleBicycle"].example(), CATALOG["WhippleBicycle"]
-    q, u = jnp.array(entry.q), jnp.array(entry.u)
-    struck = in_plane("S")
-    after = jk.impact(bicycle, 0.0, q, u, lambda t, q, u, motion: struck(t, q, u, motion)[1], 0.3)
-    u_all, p = by_multipliers(bicycle, q, u, lambda *args: struck(*args)[1:], 0.3)
-    scale = RTOL * np.abs(u_all).max()
-    np.testing.assert_allclose(after.u, u_all[:3], rtol=0, atol=scale)
-    np.testing.assert_allclose(jk.dependent_speeds(bicycle, 0.0, q, after.u), u_all[3:], rtol=0, atol=scale)
-    np.testing.assert_allclose(after.impulses, p, rtol=RTOL)
 
 
 class Block(jk.System):
@@ -290,31 +221,16 @@ def test_contradictory_impact_residuals_raise():
     assert np.isfinite(jax.jit(after)(u, 0.5)).all()
 
 
-class Bat(jk.System):
-    """A ball before a surface whose velocity is prescribed."""
-
-    speed: Scalar = parameter(3.0)  # of the surface [m/s]
-    coordinates, speeds = ("x",), ("v",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(0.5, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="ball")])
-
-    def gap_rate(self, t, q, u, motion):
-        return u["v"] - self.speed * t
-
-
 @pytest.mark.slow
 def test_restitution_is_relative_to_a_moving_surface():
-    bat, t = Bat(), 2.0
-    after = jk.impact(bat, t, [0.0], {"v": -4.0}, bat.gap_rate, 0.7)
+    after = jk.impact(Sled(0.5), 2.0, [0.0], {"v": -4.0}, lambda t, q, u, motion: u["v"] - 3.0 * t, 0.7)
     np.testing.assert_allclose(after.u, [6.0 - 0.7 * (-4.0 - 6.0)], rtol=RTOL)
     np.testing.assert_allclose(after.impulses, [0.5 * (13.0 + 4.0)], rtol=RTOL)
     np.testing.assert_allclose(after.energy_lost, 0.25 * (4.0**2 - 13.0**2), rtol=RTOL)
 
 
 class Carried(jk.System):
-    """A pendulum on a pivot with a prescribed velocity; its mass has a prescribed part of its velocity."""
+    """A pendulum on a pivot with a prescribed velocity."""
 
     coordinates, speeds = ("angle",), ("rate",)
 
@@ -329,7 +245,6 @@ class Carried(jk.System):
 def test_a_prescribed_pivot_keeps_its_velocity():
     system, q, u, t = Carried(), [0.4], [1.3], 0.8
     after = jk.impact(system, t, q, u, lambda t, q, u, m: m["bob"].center.velocity.dot(m.N.x), 0.25)
-    # v = t + 1.5 cos(angle) rate
     v = t + 1.5 * np.cos(0.4) * 1.3
     np.testing.assert_allclose(after.u, [(-0.25 * v - t) / (1.5 * np.cos(0.4))], rtol=RTOL)
     energies = [jk.kinetic_energy(system, t, q, x) for x in (u, after.u)]
@@ -392,15 +307,6 @@ def test_derivatives_agree_with_central_differences():
             np.testing.assert_allclose(a[(..., *place)], (high - low) / (2 * h), rtol=0, atol=1e-8 * np.abs(a).max())
 
 
-@pytest.mark.slow
-def test_a_batch_equals_its_members():
-    us = STRIKE_U[None] + jnp.array([[0.0, 0.0], [0.3, -0.1], [-0.2, 0.4]])
-    e = jnp.array([0.0, 0.5, 1.0])
-    each = [strike(u, x, 5.0, STRIKE_Q) for u, x in zip(us, e, strict=True)]
-    batch = jax.jit(jax.vmap(lambda u, x: strike(u, x, 5.0, STRIKE_Q)))(us, e)
-    np.testing.assert_allclose(batch, np.stack(each), rtol=0, atol=1e-13)
-
-
 def test_an_elastic_impact_loses_no_energy():
     after = jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe, 1.0, "foot")
     assert abs(after.energy_lost) < RTOL * jk.kinetic_energy(CompassGait(), 0.0, STRIKE_Q, STRIKE_U)
@@ -458,21 +364,14 @@ def test_an_event_impact_stores_residuals_and_coefficients():
 
 MISUSES = {
     "no residuals": (lambda: jk.Impact(), "at least one velocity residual"),
-    "no number": (lambda: jk.Impact("toe"), "numbers and Vectors"),
     "above one": (lambda: jk.Impact(1.0, restitution=1.1), "restitution is 1.1"),
-    "not a number": (lambda: jk.Impact(1.0, restitution=float("nan")), "between 0 and 1"),
-    "a word": (lambda: jk.Impact(1.0, restitution="plastic"), "one number"),
     "too many": (lambda: jk.Impact(1.0, 2.0, restitution=(0.1, 0.2, 0.3)), "2 residuals, but 3 coefficients"),
-    "release": (lambda: jk.Impact(1.0, release=(1,)), "names of points and frames"),
     "negative": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, left, -0.1), "restitution is -0.1"),
-    "returns nothing": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda *args: ()), "at least one"),
-    "no function": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, 1.0), "pass a function"),
     "position": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda t, q, u, m: q["y"]), "does not depend on"),
     "square": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, lambda t, q, u, m: u["y_dot"] ** 2), "not affine"),
     "unknown": (lambda: jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe, 0.0, "heel"), "heel"),
     "nothing": (lambda: jk.impact(CompassGait(), 0.0, STRIKE_Q, STRIKE_U, toe, 0.0, "toe"), "has no effect"),
     "inertial": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U, left, 0.0, "N"), "inertial frame"),
-    "shape": (lambda: jk.impact(Block(), 0.0, FALLS_Q, FALLS_U[:2], left), "shape"),
 }
 
 

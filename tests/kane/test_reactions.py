@@ -104,25 +104,6 @@ def test_joint_forces_of_a_pendulum_satisfy_newtons_law():
     np.testing.assert_allclose(forces["O"], m * (a1 + a2 - 2 * g), rtol=RTOL, atol=RTOL)
 
 
-@pytest.mark.slow
-def test_joint_forces_of_the_spatial_pendulum_satisfy_newtons_law():
-    system, q, u = moving("SpatialDoublePendulum")
-    forces = constraint_forces(system, 0.0, q, u)
-    weights = np.array([[0.0, 9.81 * m, 0.0] for m in (1.2, 0.8)])
-    both, second = momentum_rate(system, q, u), momentum_rate(system, q, u, bodies=slice(1, 2))
-    np.testing.assert_allclose(forces["O"], both + weights.sum(0), rtol=RTOL, atol=1e-12)
-    np.testing.assert_allclose(forces["A"], second + weights[1], rtol=RTOL, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_the_force_of_a_rail_is_normal_to_the_rail():
-    # Exercise 5.2: along the rail nothing but the loads, across it the weights and the bar's momentum
-    system, q, u = moving("SliderWithPinnedBar")
-    force = constraint_forces(system, 0.0, q, u, {"force": 3.0})["A"]
-    p_dot = momentum_rate(system, q, u, {"force": 3.0})
-    np.testing.assert_allclose(force, [0.0, p_dot[1] + 3.0 * 9.81, 0.0], rtol=RTOL, atol=1e-12)
-
-
 def test_guide_forces_of_piston_and_slider_agree_with_newton_euler():
     # Exercise 5.1, by Newton and Euler on the bar: the wall of A pushes along x, the guide of B along y.
     system, q, u = moving("BarWithPiston")
@@ -187,32 +168,6 @@ def test_constraint_moments_of_a_frame():
     # a = (-0.5 * 3^2, 0.5 * 3 / (2/3), 0); the weight of 20 N at 0.5 m bends the root, the driving torque is a load
     np.testing.assert_allclose(forces["O"], [-9.0, 4.5, 20.0], rtol=RTOL)
     np.testing.assert_allclose(forces["B"], [0.0, -10.0, 0.0], rtol=RTOL, atol=RTOL)
-
-
-class Sleigh(jk.System):
-    """Chaplygin's sleigh: a knife edge at P, from which the body is built; a scalar residual."""
-
-    coordinates = ("x", "y", "angle")
-    speeds = ("vx", "rate")
-    dependent_speeds = ("vy",)
-
-    def q_dot(self, t, q, u):
-        return u["vx"], u["vy"], u["rate"]
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        B = N.rotate(3, q["angle"], u["rate"], "B")
-        P = O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["vx"], u["vy"], 0.0))
-        body = jk.Body(2.0, (0.2, 0.2, 0.3), P.fixed(0.4 * B.x), B)
-        return jk.Motion([body], [P.velocity.dot(B.y)])
-
-
-@pytest.mark.slow
-def test_the_multiplier_of_a_scalar_residual_is_a_force_along_it():
-    system, q, u = Sleigh(), jnp.array([0.1, 0.2, 0.5]), jnp.array([1.0, 0.7])
-    (force,) = constraint_multipliers(system, 0.0, q, u)
-    across = np.array([-np.sin(0.5), np.cos(0.5), 0.0])
-    np.testing.assert_allclose(force * across, momentum_rate(system, q, u), rtol=RTOL, atol=RTOL)
 
 
 class Lift(jk.System):

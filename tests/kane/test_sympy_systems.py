@@ -1,4 +1,4 @@
-"""Six systems of SymPy's own tests agree with SymPy's accelerations."""
+"""Five systems of SymPy's own tests agree with SymPy's accelerations."""
 
 import numpy as np
 import pytest

@@ -367,6 +367,9 @@ class Problem(NamedTuple):
         corrected with the rates halfway to the event.
         """
         rates, args = self.rates(), dataclasses.replace(self.args, within=None)
+        if not self.settings.is_forward:
+            # The rates at the start are not finite in a batch member that cannot begin, such as one without mass.
+            rates = functools.partial(derivative_free_where_not_finite, rates)
         if y_dot is None:
             y_dot = rates(*constant((t, y, args)))
         y_dot = jnp.where(happened, y_dot, jnp.zeros_like(y_dot))
