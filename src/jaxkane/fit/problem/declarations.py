@@ -392,8 +392,8 @@ def scalar(
             f"{name}: `prior` must be (mean, standard deviation), 'normal' or 'lognormal', got {item.prior!r}.",
         )
     )
-    alone = item.prior is not None and not isinstance(item.prior, str) and not is_lognormal(item.prior)
-    prior = checked_prior(name, item.prior) if alone else None
+    given = None if isinstance(item.prior, str) else item.prior
+    prior = None if given is None or is_lognormal(given) else checked_prior(name, given)
     scale = abs(start) or (prior[1] if prior is not None and math.isfinite(prior[1]) else 1.0)
     if item.scale is not None:
         scale = positive_number(item.scale, f"{name}: `scale`")

@@ -113,10 +113,10 @@ def as_items(free: object, kinds: tuple[type, ...] = (Declaration,)) -> list[Any
 
     `kinds`: the types of elements that do not change.
     """
-    free = [free] if isinstance(free, (str, *kinds)) or callable(free) else free
-    if not isinstance(free, Iterable):
+    items: Any = [free] if isinstance(free, (str, *kinds)) or callable(free) else free
+    if not isinstance(items, Iterable):
         raise TypeError(f"`free` must be a name, a declaration such as Free('mass'), or a list of these, got {free!r}.")
-    return [item if isinstance(item, kinds) else Free(item) for item in free]
+    return [item if isinstance(item, kinds) else Free(item) for item in items]
 
 
 def parameters_of(
