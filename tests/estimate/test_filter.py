@@ -350,9 +350,9 @@ def test_invalid_filter_options_are_rejected(options, message):
 @pytest.fixture(scope="module")
 def rejecting():
     """A filter, its state and belief, and the belief of a filter with a lag."""
-    filter, late = (Filter(Pendulum(), {"rate": 0.1}, lag=lag) for lag in (0, 2))
+    filter, lagged = (Filter(Pendulum(), {"rate": 0.1}, lag=lag) for lag in (0, 2))
     state = jk.State(jnp.array([0.8]), jnp.array([-0.3]))
-    return filter, state, *(begin(one, state, {"angle": 0.1}) for one in (filter, late))
+    return filter, state, *(begin(one, state, {"angle": 0.1}) for one in (filter, lagged))
 
 
 NOT_FINITE = r"update: a measurement is infinite: rate = -?inf\. If it is missing, pass NaN"

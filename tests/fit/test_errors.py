@@ -28,7 +28,7 @@ from jaxkane.fit import (
     report,
     validate,
 )
-from jaxkane.fit.problem.errors import innovations
+from jaxkane.fit.problem.errors import Errors, innovations
 
 t = np.arange(0.0, 4.0, 0.1)
 SIGMA, TRUTH = 0.05, (1.2, 0.3)
@@ -374,15 +374,35 @@ def test_invalid_error_models_are_rejected(make, words):
         make()
 
 
+@pytest.mark.weekly
+def test_error_model_parameters_estimated_from_known_residuals():
+    """Of one channel each: given degrees of freedom, normal residuals, a random walk, and a channel without samples."""
+    rng = np.random.default_rng(9)
+    walk = np.cumsum(rng.normal(size=(2, 150)), axis=1)
+    e = np.stack([rng.standard_t(4, size=(2, 150)), rng.uniform(-1, 1, (2, 150)), walk, 0 * walk], axis=1)
+    weight = np.broadcast_to(np.array([1.0, 1.0, 1.0, 0.0])[:, None], e.shape)
+    models = [StudentT(4.0), StudentT(), AutoRegressive(), AutoRegressive()]
+    found = Errors.initial(models).estimated(e, weight, np.full(4, 1e-9))
+    given, normal, walked, missing = found.values
+    u = e[:, 0] / given["scale"]
+    assert given["degrees of freedom"] == 4.0
+    assert np.mean(5 * u**2 / (4 + u**2)) == pytest.approx(1.0, rel=1e-8)  # the score of the scale
+    assert normal["degrees of freedom"] > 1000  # the tails are lighter than those of a normal distribution
+    assert normal["scale"] == pytest.approx(np.sqrt(np.mean(e[:, 1] ** 2)), rel=1e-2)
+    assert 0.9 < walked["phi_1"] < 1
+    assert missing == {"scale": 1.0, "phi_1": 0.0}
+    assert found.n_estimated == 1 + 2 + 2 + 2
+
+
 def posed(errors, **more):
     return Problem.of(Track(), trials({"x": lambda k: np.zeros(t.size)}, T=1), FREE, errors=errors, **STEP, **more)
 
 
 def test_an_autoregression_needs_equal_intervals():
     data = trials({"x": lambda k: np.zeros(t.size)}, T=2)
-    late, one = np.delete(np.arange(t.size), 12), data[1]
-    measured, push = {"x": one.measured["x"][late]}, {"push": one.inputs["push"][late]}
-    data[1] = Trial(t[late], measured, push, sigma=SIGMA, initial=REST)
+    kept, one = np.delete(np.arange(t.size), 12), data[1]
+    measured, push = {"x": one.measured["x"][kept]}, {"push": one.inputs["push"][kept]}
+    data[1] = Trial(t[kept], measured, push, sigma=SIGMA, initial=REST)
     with pytest.raises(ValueError, match=r"t = 1\.1 s and 1\.3 s are not 0\.1 s apart"):
         Problem.of(Track(), data, FREE, errors=AutoRegressive(), **STEP)
     Problem.of(Track(), data, FREE, errors=StudentT(), **STEP)

@@ -292,18 +292,18 @@ def test_json_contains_the_report_without_nan(result):
     def refuse(constant):
         raise AssertionError(f"{constant} is not JSON")
 
-    told = json.loads(result.to_json(), parse_constant=refuse)
-    assert told["parameters"]["gain"]["estimate"] == result.estimates["gain"]
-    assert told["parameters"]["gain"]["standard_error"] == result.standard_errors["gain"]
-    assert (told["status"], told["ok"], told["cost"]) == (result.status, result.ok, result.cost)
-    assert told["tests"]["short"]["x"]["n"] == 6
-    assert told["notes"] == [*result.notes]
-    np.testing.assert_allclose(told["correlation"], result.correlation)
+    parsed = json.loads(result.to_json(), parse_constant=refuse)
+    assert parsed["parameters"]["gain"]["estimate"] == result.estimates["gain"]
+    assert parsed["parameters"]["gain"]["standard_error"] == result.standard_errors["gain"]
+    assert (parsed["status"], parsed["ok"], parsed["cost"]) == (result.status, result.ok, result.cost)
+    assert parsed["tests"]["short"]["x"]["n"] == 6
+    assert parsed["notes"] == [*result.notes]
+    np.testing.assert_allclose(parsed["correlation"], result.correlation)
 
 
 @pytest.mark.slow
 def test_json_of_a_parameter_that_is_not_identifiable():
-    told = json.loads(minimize(pose(trials=Trial(t, {"x": SEEN}, sigma=0.1)), LeastSquares()).to_json())
-    assert told["held_out_cost"] is None
-    assert told["parameters"]["gain"]["error"] == "Infinity"
-    assert float(told["parameters"]["gain"]["lower"]) == -np.inf
+    parsed = json.loads(minimize(pose(trials=Trial(t, {"x": SEEN}, sigma=0.1)), LeastSquares()).to_json())
+    assert parsed["held_out_cost"] is None
+    assert parsed["parameters"]["gain"]["error"] == "Infinity"
+    assert float(parsed["parameters"]["gain"]["lower"]) == -np.inf
