@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from systems import SETS, Track, coverage_band
+from systems import SETS, Track, coverage_band, responses
 
 import jaxkane as jk
 from jaxkane.fit import (
@@ -24,15 +24,11 @@ from jaxkane.fit import (
 from jaxkane.fit.result import validation
 from jaxkane.fit.result.linearized import linearized_problem, score_test
 from jaxkane.fit.result.statistics import (
-    Clusters,
     _freedom_of,
     autocorrelations,
-    jackknife,
     serial_correlation,
-    wald_test,
 )
 
-LOW, HIGH = 0.93, 0.97
 t = np.arange(0.0, 2.0, 0.1)
 SIGMA = 0.05  # [m]
 TRUTH = {"gain": 1.2, "drift": 0.3}
@@ -56,10 +52,6 @@ class Kicked(Track):
 CHANNELS = {"x": (1.0, 0.0), "x_dot": (0.0, 1.0), "sum": (1.0, 1.0), "difference": (1.0, -1.0)}
 
 
-def white(rng, n):
-    return rng.normal(size=n)
-
-
 def autoregression(rng, n, c):
     e = rng.normal(size=n)
     for i in range(1, n):
@@ -67,8 +59,11 @@ def autoregression(rng, n, c):
     return e
 
 
+def white(rng, n):
+    return rng.normal(size=n)
+
+
 def correlated(rng, n):
-    """Of neighbours by 0.9."""
     return autoregression(rng, n, 0.9)
 
 
@@ -81,7 +76,7 @@ def slow(rng, n):
     return rng.normal(size=n) + 0.4 * autoregression(rng, n, 0.97)
 
 
-def padded(rng, n):
+def sparse(rng, n):
     """A channel that was measured at every third sample."""
     e = np.full(n, np.nan)
     e[::3] = correlated(rng, len(e[::3]))
@@ -95,62 +90,58 @@ def repeated(rng, n):
     return e
 
 
-def motion(times, push):
-    """(2, n_t) of x'' = push from rest, push linear between samples."""
-    h, rows = np.diff(times), [(0.0, 0.0)]
-    for i, dt in enumerate(h):
-        x, v = rows[-1]
-        rows.append((x + v * dt + (2 * push[i] + push[i + 1]) * dt**2 / 6, v + (push[i] + push[i + 1]) * dt / 2))
-    return np.array(rows).T
-
-
-def trial(k, noise, factor, rng, times=t, channels=("x",), kicks=None):
-    """Of the motion with the true parameters from x = 0 and x_dot = 0.1. Errors are of `noise`, a function for every
-    channel or one for all; `kicks`: the trial in which the other input acts, None if there is no such input."""
+def trial(k, noise, rng, factor=1.0, times=t, channels=("x",), kicks=None):
+    """A motion from x = 0 and x_dot = 0.1 with errors of `noise`, by channel or of all, times `factor`. `kicks`: the
+    trial in which the other input acts, None if there is no such input."""
     push, kick = np.sin((1.5 + 0.3 * (k % 6)) * times + k), np.cos(2 * times) * (k == kicks)
-    state = motion(times, TRUTH["gain"] * push + TRUTH["drift"] + 0.7 * kick) + np.array([0.1 * times, 0.1 + 0 * times])
+    x, v = (A[:, 0] for A in responses(times, TRUTH["gain"] * push + TRUTH["drift"] + 0.7 * kick))
+    state = np.array([x + 0.1 * times, v + 0.1])
     of = noise if isinstance(noise, dict) else dict.fromkeys(channels, noise)
     measured = {name: np.dot(CHANNELS[name], state) + factor * SIGMA * of[name](rng, times.size) for name in channels}
     inputs = {"push": push} | ({} if kicks is None else {"kick": kick})
-    initial = (
-        {"x": np.zeros(times.size), "x_dot": np.zeros(times.size)} if "x_dot" in channels else {"x": 0.0, "x_dot": 0.0}
-    )
-    return Trial(times, measured, inputs, sigma=SIGMA, initial=initial, name=f"run {k}")
+    zero = np.zeros(times.size) if "x_dot" in channels else 0.0
+    return Trial(times, measured, inputs, sigma=SIGMA, initial={"x": zero, "x_dot": zero}, name=f"run {k}")
+
+
+POSED = {"unknown": ("x_dot",), "simulation": Simulation(step=0.1)}
+METHOD = LeastSquares(damping=1e-9)
+
+
+def posed(trials, free=("gain", "drift"), system=None):
+    return Problem.of(Track() if system is None else system, trials, free, **POSED)
 
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """Errors, the number of trials, residuals by sigma, deviations of priors, and which intervals are valid."""
+    """Errors, the number of trials, deviations of priors, the options of `trial`, and which intervals are valid."""
 
     noise: object
     trials: int
-    factor: float = 1.0
     priors: tuple | None = None
     valid: tuple = ("intervals",)
-    times: np.ndarray = dataclasses.field(default_factory=lambda: t)
-    channels: tuple = ("x",)
-    kicks: int | None = None
+    options: dict = dataclasses.field(default_factory=dict)
 
 
+ALL = ("formal", "intervals", "laplace")
 FOUR = {"channels": tuple(CHANNELS), "kicks": -1}
 LONG = {"times": np.arange(0.0, 24.0, 0.1)}
 KINDS = {
-    "white": Kind(white, 8, valid=("formal", "intervals", "laplace")),
+    "white": Kind(white, 8, valid=ALL),
     "correlated": Kind(correlated, 12),
     "slow": Kind(slow, 12),
-    "one channel of four": Kind(dict.fromkeys(CHANNELS, white) | {"sum": correlated}, 10, **FOUR),
-    "padded with NaN": Kind(padded, 12),
+    "one channel of four": Kind(dict.fromkeys(CHANNELS, white) | {"sum": correlated}, 10, options=FOUR),
+    "padded with NaN": Kind(sparse, 12),
     "padded": Kind(repeated, 12),
-    "priors": Kind(white, 8, priors=(0.02, 0.03), valid=("formal", "intervals", "laplace")),
-    "priors, sigma ten times too large": Kind(white, 8, 0.1, (0.002, 0.003), ("formal", "intervals")),
-    "priors, correlated": Kind(correlated, 8, priors=(0.04, 0.06)),
+    "priors": Kind(white, 8, (0.02, 0.03), ALL),
+    "priors, sigma ten times too large": Kind(white, 8, (0.002, 0.003), ("formal", "intervals"), {"factor": 0.1}),
+    "priors, correlated": Kind(correlated, 8, (0.04, 0.06)),
     "few trials": Kind(correlated, 4),
     "two trials, white": Kind(white, 2),
-    "one long trial, white": Kind(white, 1, **LONG),
-    "one long trial, slow": Kind(slow, 1, **LONG),
-    "one long trial, correlated": Kind(briefly_correlated, 1, **LONG),
-    "one parameter in one trial": Kind(white, 8, kicks=3),
-    "one parameter in one trial, correlated": Kind(correlated, 8, kicks=3),
+    "one long trial, white": Kind(white, 1, options=LONG),
+    "one long trial, slow": Kind(slow, 1, options=LONG),
+    "one long trial, correlated": Kind(briefly_correlated, 1, options=LONG),
+    "one parameter in one trial": Kind(white, 8, options={"kicks": 3}),
+    "one parameter in one trial, correlated": Kind(correlated, 8, options={"kicks": 3}),
 }
 
 
@@ -158,40 +149,34 @@ def covered(kind, n, seed=0):
     """How often finite intervals hold the truth, and how often they are finite, by their kind and parameter; the speed
     at the start of a trial is unknown."""
     rng, of = np.random.default_rng(seed), KINDS[kind]
-    truth = TRUTH | ({"other": 0.7} if of.kicks is not None and of.kicks >= 0 else {})
+    truth = TRUTH | ({"other": 0.7} if of.options.get("kicks", -1) >= 0 else {})
     hits, finite = ({which: dict.fromkeys(truth, 0) for which in of.valid} for _ in range(2))
     for i in range(n):
         free = tuple(truth)
         if of.priors:  # measured elsewhere, with these errors
-            free = [
-                Free(name, prior=(TRUTH[name] + d * rng.normal(), d)) for name, d in zip(free, of.priors, strict=True)
-            ]
-        trials = [trial(k, of.noise, of.factor, rng, of.times, of.channels, of.kicks) for k in range(of.trials)]
+            free = [Free(x, prior=(TRUTH[x] + d * rng.normal(), d)) for x, d in zip(free, of.priors, strict=True)]
+        trials = [trial(k, of.noise, rng, **of.options) for k in range(of.trials)]
         if i == 0 or of.priors:
-            system = Track() if of.kicks is None else Kicked()
-            problem = Problem.of(system, trials, free, unknown=("x_dot",), simulation=Simulation(step=0.1))
+            problem = posed(trials, free, Kicked() if "kicks" in of.options else None)
         else:  # the same one of other measurements: to pose it again takes a third of the time
             measured = [[np.nan_to_num(one.measured[name]) for name in problem.channels] for one in trials]
             windows = dataclasses.replace(problem.windows, measured=jnp.asarray(measured))
             problem = dataclasses.replace(problem, windows=windows, trials=tuple(trials))
-        found = minimize(problem, LeastSquares(damping=1e-9))
-        of_laplace = np.full(2, np.nan)
-        if "laplace" in of.valid:
-            of_laplace = found.laplace().covariance.diagonal() ** 0.5 * np.array(problem.parameters.scale)
+        found = minimize(problem, METHOD)
         quantile = stats.t.ppf(0.975, found.identifiability.degrees_of_freedom)
-        half = dict(zip(found.names, found.half_widths(), strict=True))
+        widths = {"formal": [quantile * x for x in found.standard_errors.values()], "intervals": found.half_widths()}
+        if "laplace" in of.valid:
+            deviations = found.laplace().covariance.diagonal() ** 0.5 * np.array(problem.parameters.scale)
+            widths["laplace"] = stats.norm.ppf(0.975) * deviations
         for j, (name, value) in enumerate(truth.items()):
-            widths = {"formal": quantile * found.standard_errors[name], "intervals": half[name]}
-            if "laplace" in of.valid:
-                widths["laplace"] = stats.norm.ppf(0.975) * of_laplace[j]
             for which in of.valid:
-                finite[which][name] += np.isfinite(widths[which])
-                hits[which][name] += abs(found.estimates[name] - value) <= widths[which] < np.inf
-            if not np.isfinite(half[name]):
+                finite[which][name] += np.isfinite(widths[which][j])
+                hits[which][name] += abs(found.estimates[name] - value) <= widths[which][j] < np.inf
+            if not np.isfinite(widths["intervals"][j]):
                 assert any("infinite" in note for note in found.notes)
                 assert found.error_kinds[name] == "none"
         # The cost is a parabola: the interval by likelihood is the same one, and holds as often.
-        if i == 0 and np.isfinite(half["gain"]):
+        if i == 0 and np.isfinite(widths["intervals"][0]):
             assert profile(found, "gain", n=3).interval == pytest.approx(found.intervals()["gain"], rel=1e-3)
     return hits, finite
 
@@ -214,35 +199,6 @@ def test_interval_coverage_of_each_kind(kind):
     elif kind == "one parameter in one trial":
         # White residuals look correlated in about one set of 300. The interval is then infinite.
         assert finite["intervals"]["other"] >= 0.98 * SETS
-
-
-SLOWLY = [
-    pytest.param(*case, marks=pytest.mark.weekly) for case in ((8, 6, 0.0), (20, 3, 0.0), (8, 6, 0.5), (12, 2, 1.0))
-]
-
-
-@pytest.mark.weekly
-@pytest.mark.parametrize(("T", "p", "spread"), [(6, 2, 0.5), *SLOWLY])
-def test_interval_coverage_with_few_trials_and_correlated_residuals(T, p, spread):
-    """Trials of unlike inputs, correlated residuals: intervals, and the test of several parameters that are zero."""
-    rng, time, n = np.random.default_rng(1), np.linspace(0.0, 4.0, 20), 500
-    root = np.linalg.cholesky(0.9 ** np.abs(np.subtract.outer(np.arange(20), np.arange(20))))
-    hits, of, false = 0, 0, 0.0
-    for _ in range(n):
-        rates = 1 + 0.7 * np.arange(p) + 0.3 * rng.normal(size=(T, 1, p))
-        sizes = np.exp(spread * rng.normal(size=(T, 1, 1)))  # of inputs: trials tell more and less
-        A = sizes * np.sin(rates * time[:, None] + rng.uniform(0, 6, (T, 1, p)))
-        e = rng.normal(size=(T, time.size)) @ root.T
-        information, gradient = A.mT @ A, np.einsum("tmi,tm->ti", A, e)
-        x = np.linalg.solve(information.sum(axis=0), gradient.sum(axis=0))
-        scores = np.einsum("tmi,tm->ti", A, e - A @ x)
-        places = np.tile(np.arange(p), (T, 1))
-        C, freedom, leverage = jackknife(Clusters(information, scores, places, np.zeros((p, p))))
-        inside = (np.abs(x) <= stats.t.ppf(0.975, freedom) * C.diagonal() ** 0.5)[leverage < 0.9]
-        hits, of, q = hits + inside.sum(), of + inside.size, min(p, 3)
-        false += (wald_test(x[:q], C.diagonal()[:q], freedom[:q]) < 0.05) / n
-    assert LOW <= hits / of <= HIGH
-    assert 0.02 < false < 0.06
 
 
 def test_autocorrelation_uses_consecutive_measurements():
@@ -288,12 +244,10 @@ def test_interval_coverage_without_friction_in_the_model():
 
     def fitted(n):
         push, x = rubbing(n, rng)
-        trials = [
-            Trial(t, {"x": y + sigma * rng.normal(size=t.size)}, {"push": u}, sigma=sigma, initial={"x": 0, "x_dot": 0})
-            for u, y in zip(push, x, strict=True)
-        ]
-        options = {"unknown": ("x_dot",), "simulation": Simulation(step=0.1)}
-        return minimize(Problem.of(Track(), trials, ("gain", "drift"), **options), LeastSquares(damping=1e-9))
+        x = x + sigma * rng.normal(size=x.shape)
+        rest = {"x": 0, "x_dot": 0}
+        return minimize(posed([Trial(t, {"x": y}, {"push": u}, sigma=sigma, initial=rest) for u, y in zip(push, x)]),
+                        METHOD)  # fmt: skip
 
     many = fitted(200).estimates
     hits = dict.fromkeys(("next run by scatter", "next run by confidence", "clustered", "bootstrap"), 0.0)
@@ -320,33 +274,27 @@ def test_interval_coverage_without_friction_in_the_model():
 
 def test_the_bootstrap_of_many_trials_agrees_with_the_jackknife():
     rng = np.random.default_rng(5)
-    trials = [trial(k, correlated, 1.0, rng) for k in range(60)]
-    options = {"unknown": ("x_dot",), "simulation": Simulation(step=0.1)}
-    problem = Problem.of(Track(), trials, (Free("gain", prior=(1.2, 0.05)), "drift"), **options)
-    found = minimize(problem, LeastSquares(damping=1e-9))
-    draws = bootstrap(found, n=4000)
+    trials = [trial(k, correlated, rng) for k in range(60)]
+    found = minimize(posed(trials, (Free("gain", prior=(1.2, 0.05)), "drift")), METHOD)
+    draws, again = bootstrap(found, n=4000), bootstrap(found, n=4000)
     assert draws.clusters == ("trial", 60)
     for name, error in found.clustered_errors.items():
         assert np.std(draws.values[name]) == pytest.approx(error, rel=0.12)
         assert np.mean(draws.values[name]) == pytest.approx(found.estimates[name], abs=0.2 * error)
         np.testing.assert_allclose(draws.intervals()[name], found.intervals()[name], atol=0.5 * error)
-    again = bootstrap(found, n=4000)
     np.testing.assert_array_equal(again.values["gain"], draws.values["gain"])
     assert "Bootstrap of 60 trials" in repr(draws)
 
 
 def test_intervals_by_held_out_scatter_equal_those_of_a_mean():
     """With one parameter and trials alike, each trial has an estimate of its own, and that of all is their mean."""
-    rng, T = np.random.default_rng(6), 5
     push = np.sin(2.0 * t)
-    steps = np.array([(2 * push[i] + push[i + 1]) / 6 for i in range(t.size - 1)])
-    v = np.concatenate([[0.0], np.cumsum((push[1:] + push[:-1]) / 2 * 0.1)])
-    y = np.concatenate([[0.0], np.cumsum(v[:-1] * 0.1 + steps * 0.01)])
-    own = 1.2 + 0.1 * rng.normal(size=T)
-    trials = [Trial(t, {"x": g * y}, {"push": push}, sigma=0.01, initial={"x": 0.0, "x_dot": 0.0}) for g in own]
+    own = 1.2 + 0.1 * np.random.default_rng(6).normal(size=5)
+    x, rest = responses(t, push)[0][:, 0], {"x": 0.0, "x_dot": 0.0}
+    trials = [Trial(t, {"x": g * x}, {"push": push}, sigma=0.01, initial=rest) for g in own]
     problem = Problem.of(Track(), trials, "gain", simulation=Simulation(step=0.1))
-    low, high = cross_validate(minimize(problem, LeastSquares(damping=1e-9))).intervals(0.9)["gain"]
-    half = stats.t.ppf(0.95, T - 1) * np.std(own, ddof=1) * (1 + 1 / T) ** 0.5
+    low, high = cross_validate(minimize(problem, METHOD)).intervals(0.9)["gain"]
+    half = stats.t.ppf(0.95, 4) * np.std(own, ddof=1) * (1 + 1 / 5) ** 0.5
     assert (low, high) == pytest.approx((own.mean() - half, own.mean() + half), abs=1e-6)
 
 
@@ -354,20 +302,15 @@ def test_intervals_by_held_out_scatter_equal_those_of_a_mean():
 def test_an_undetermined_parameter_has_an_infinite_interval():
     """Without a push its gain has no influence: infinite, or as wide as its prior says."""
     rng = np.random.default_rng(7)
-    trials = [
-        Trial(t, x.measured, {"push": 0.0 * t}, sigma=SIGMA) for x in (trial(k, white, 1.0, rng) for k in range(6))
-    ]
-    options = {"unknown": ("x_dot",), "simulation": Simulation(step=0.1)}
-    found = minimize(Problem.of(Track(), trials, ("gain", "drift"), **options), LeastSquares(damping=1e-9))
+    trials = [Trial(t, trial(k, white, rng).measured, {"push": 0.0 * t}, sigma=SIGMA) for k in range(6)]
+    found = minimize(posed(trials), METHOD)
     for intervals in (found.intervals(), bootstrap(found).intervals(), cross_validate(found).intervals()):
         assert intervals["gain"] == (-np.inf, np.inf)
         assert np.isfinite(intervals["drift"]).all()
-    known = (Free("gain", prior=(1.2, 0.1)), "drift")
-    found = minimize(Problem.of(Track(), trials, known, **options), LeastSquares(damping=1e-9))
+    found = minimize(posed(trials, (Free("gain", prior=(1.2, 0.1)), "drift")), METHOD)
     assert np.std(bootstrap(found).values["gain"]) == pytest.approx(0.1, rel=0.05)
-    for wrong in (0, -1, 99, 2.5, True, "many"):
-        with pytest.raises(ValueError, match="an integer of at least 100"):
-            bootstrap(found, n=wrong)
+    with pytest.raises(ValueError, match="an integer of at least 100"):
+        bootstrap(found, n=99)
     with pytest.raises(ValueError, match="were not estimated from these trials"):
         bootstrap(validate(found, trials))
     assert np.isnan(cross_validate(validate(found, trials)).intervals()["drift"]).all()
@@ -379,9 +322,7 @@ def test_an_undetermined_parameter_has_an_infinite_interval():
 def kicked():
     """Of eight trials with white noise, the fourth alone determines a parameter."""
     rng = np.random.default_rng(8)
-    trials = [trial(k, white, 1.0, rng, kicks=3) for k in range(8)]
-    problem = Problem.of(Kicked(), trials, (*TRUTH, "other"), unknown=("x_dot",), simulation=Simulation(step=0.1))
-    return minimize(problem, LeastSquares(damping=1e-9))
+    return minimize(posed([trial(k, white, rng, kicks=3) for k in range(8)], (*TRUTH, "other"), Kicked()), METHOD)
 
 
 @pytest.mark.weekly
@@ -434,16 +375,16 @@ def test_a_fold_that_has_not_converged_is_reported(kicked, monkeypatch):
 def test_few_trials_are_clustered_by_their_parts():
     """Errors of neighbours by 0.4: formal errors are too small, and parts of the trial are clusters."""
     rng = np.random.default_rng(9)
-    problem = Problem.of(
-        Track(), [trial(1, briefly_correlated, 1.0, rng, **LONG)], ("gain", "drift"),
-        unknown=("x_dot",), simulation=Simulation(step=0.1),
-    )  # fmt: skip
-    found = minimize(problem, LeastSquares(damping=1e-9))
+    found = minimize(posed([trial(1, briefly_correlated, rng, **LONG)]), METHOD)
     assert found.clusters == ("part", 6)
     assert found.uses_clustered_errors
     assert found.serial_correlation["x"] > 0.2
     assert any("account for this within each of 6 parts" in note for note in found.notes)
     assert "gain" in bootstrap(found, n=100).values
+    trials = [trial(k, white, rng) for k in range(4)]
+    four, three = (minimize(posed(trials[:n]), LeastSquares()) for n in (4, 3))
+    assert (four.clusters, set(four.error_kinds.values())) == (("trial", 4), {"trial"})
+    assert (three.clusters, set(three.error_kinds.values())) == (("part", 6), {"part"})
 
 
 def test_correlation_of_slow_errors_and_single_channels_is_detected():
@@ -475,33 +416,3 @@ def test_degrees_of_freedom_agree_with_a_monte_carlo_simulation():
     quantile = stats.t.ppf(0.975, _freedom_of(weights))
     assert np.mean(np.abs(t_values) > quantile) == pytest.approx(0.05, abs=4 * (0.05 * 0.95 / 2e5) ** 0.5)
     assert _freedom_of(np.full(400, 1 / 400)) == pytest.approx(400)
-
-
-def test_leverage_is_the_largest_share_of_a_cluster():
-    """Of one unknown it is the largest share of the information."""
-    information = np.array([6.0, 2.0, 1.0, 1.0])[:, None, None]
-    scores, places = np.array([1.0, -2.0, 0.5, 0.5])[:, None], np.zeros((4, 1), int)
-    clusters = Clusters(information, scores, places, np.zeros((1, 1)))
-    found = jackknife(clusters)
-    assert found.leverage == pytest.approx([0.6])
-    # Without the cluster g the estimate changes by s_g / (10 - N_g).
-    changes = (scores / (10 - information[:, 0])).ravel()
-    O = np.array([[(i == j) * n / (10 - n) ** 2 - n * m / (10 * (10 - n) * (10 - m))
-                   for j, m in enumerate(information.ravel())] for i, n in enumerate(information.ravel())])  # fmt: skip
-    assert found.covariance[0, 0] == pytest.approx(np.sum(changes**2) / np.trace(O) / 10)
-    with_prior = jackknife(clusters._replace(of_priors=np.full((1, 1), 2.0)), np.full((1, 1), 3.0))
-    assert with_prior.leverage == pytest.approx([0.5])
-
-
-@pytest.mark.weekly
-def test_four_trials_suffice_as_clusters():
-    rng = np.random.default_rng(12)
-    options = {"unknown": ("x_dot",), "simulation": Simulation(step=0.1)}
-    trials = [trial(k, white, 1.0, rng) for k in range(4)]
-    four, three = (
-        minimize(Problem.of(Track(), trials[:n], ("gain", "drift"), **options), LeastSquares()) for n in (4, 3)
-    )
-    assert four.clusters == ("trial", 4)
-    assert set(four.error_kinds.values()) == {"trial"}
-    assert three.clusters == ("part", 6)
-    assert set(three.error_kinds.values()) == {"part"}

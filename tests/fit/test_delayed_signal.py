@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
-from systems import Track
+from systems import Track, responses
 
 from jaxkane.fit import Delay, Gain, LowPass, Offset, Simulation, Trial, fit, forward_selection
 from jaxkane.fit.problem import model
@@ -97,8 +97,7 @@ def test_delays_and_time_constants_in_any_unit_of_time(unit, kind, true):
     """A time constant and a delay of some samples, without a scale."""
     t = np.arange(60.0)
     push = np.sin(0.3 * t)
-    rate = np.concatenate([[0.0], np.cumsum(0.6 * (push[1:] + push[:-1]))])  # of x'' = 1.2 push, from rest
-    x = np.concatenate([[0.0], np.cumsum(rate[:-1] + 0.2 * (2 * push[:-1] + push[1:]))])
+    x = 1.2 * responses(t, push)[0][:, 0]
     changed = (low_passed if kind is LowPass else delayed_signal)(jnp.asarray(t), jnp.asarray(x), jnp.array(true))
     seen = np.asarray(changed) + 0.01 * np.random.default_rng(0).normal(size=t.size)
     trial = Trial(unit * t, {"x": seen}, {"push": push}, sigma=0.01, initial={"x": 0.0, "x_dot": 0.0})

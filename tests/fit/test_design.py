@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from slopes import differences, slopes
-from systems import Track
+from systems import Track, responses
 
 from jaxkane.fit import Free, LeastSquares, Linear, Offset, Problem, Trial, design, minimize
 from jaxkane.fit.result.design import Design, covariance_of, objective_of
@@ -24,11 +24,7 @@ def exact_errors(push):
 
     Unknowns: gain, drift, the start of the first window, and the jumps to each later one, which move what follows.
     """
-    h, rows = 0.1, [(0.0, 0.0)]
-    for i in range(t.size - 1):
-        x, v = rows[-1]
-        rows.append((x + v * h + (2 * push[i] + push[i + 1]) * h**2 / 6, v + (push[i] + push[i + 1]) * h / 2))
-    motion = np.array(rows)[:, 0]
+    motion = responses(t, push)[0][:, 0]
     columns, jumps = [motion, t**2 / 2, np.ones_like(t), t], []
     for start in (1.0, 2.0, 3.0):
         later = t > start - 1e-9

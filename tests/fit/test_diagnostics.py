@@ -31,18 +31,19 @@ def test_valid_records_give_no_notes():
         assert told(trial({"x": y, "x_dot": v + noise}, {"push": switched, "pull": pulse})) == []
 
 
+STALE, CLIPPED = np.repeat(x[::4], 4)[:201], np.clip(2.0 * np.sin(5.0 * t) + noise, -1.2, 1.2)
+
+
 @pytest.mark.parametrize(
     ("record", "words"),
     [
-        (trial({"x": np.repeat(x[::4], 4)[:201]}), "x repeats its last value many times"),
-        (
-            trial({"x": x}, {"push": np.clip(2.0 * np.sin(5.0 * t) + noise, -1.2, 1.2)}),
-            "push has its largest value",
-        ),
+        (trial({"x": STALE}), "x repeats its last value many times"),
+        (trial({"x": x}, {"push": CLIPPED}), "push has its largest value"),
         (trial({"x": np.maximum(0.3 * np.sin(6.0 * t), -0.2)}), "x has its smallest value"),
         (trial({"x": x, "x_dot": np.degrees(v) + noise}), "x_dot seems to be in degrees"),
         (trial({"x": np.degrees(x), "x_dot": v + noise}), "x seems to be in degrees"),
         (trial({"x": x, "x_dot": -v + noise}), "x_dot and the change of x have opposite signs"),
+        (trial({"x": x, "x_dot": 0.0 * v}), "x_dot has the constant value 0. Check whether it was recorded."),
         (trial({"x": x + noise, "w": np.gradient(x + noise, t)}), "w is the difference quotient of x"),
         (trial({"x": x, "w": np.append(np.diff(x) / np.diff(t), np.nan)}), "w is the difference quotient of x"),
         (trial({"x": x[::2]}, {"push": x[::2]}, np.where(t < 2, t, t + 1)[::2]), "the times have a gap"),
@@ -54,10 +55,14 @@ def test_each_suspicious_record_is_reported(record, words):
     assert words in note
 
 
-def test_notes_of_several_trials_are_combined():
-    stale = np.repeat(x[::4], 4)[:201]
-    (note,) = told(*(trial({"x": stale + 0.001 * i}, name=f"run {i}") for i in range(5)))
+def test_notes_of_several_trials():
+    (note,) = told(*(trial({"x": STALE + 0.001 * i}, name=f"run {i}") for i in range(5)))
     assert note.startswith("run 0, run 1, run 2 and 2 more: x repeats")
+    once = trial({"x": x}, {"push": v})
+    assert told(once, once) == ["run has the same samples as run, so these are counted twice. Omit one trial."]
+    zeros = lambda n: told(*(trial({"x": x + i}, {"push": (i >= n) * v}) for i in range(4)))  # noqa: E731
+    assert zeros(1) == ["run: the input push is always zero, but not in other trials. Check the record."]
+    assert zeros(0) == zeros(2) == []
 
 
 class Sensed(Cart):

@@ -3,13 +3,12 @@
 import dataclasses
 import math
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
 from scipy import stats
-from systems import SETS, Track, coverage_band
+from systems import SETS, Track, coverage_band, responses
 
 from jaxkane.fit import (
     AutoRegressive,
@@ -38,16 +37,6 @@ STEP = {"simulation": Simulation(step=0.1)}
 FREE = ("gain", "drift")
 
 
-def columns(push):
-    """Derivatives (n_t, 2) of x and of x_dot by gain and drift, from rest."""
-    x, v = np.zeros((2, t.size)), np.zeros((2, t.size))
-    for i, h in enumerate(np.diff(t)):
-        a, b = np.array([push[i], 1.0]), np.array([push[i + 1], 1.0])
-        x[:, i + 1] = x[:, i] + v[:, i] * h + (2 * a + b) * h**2 / 6
-        v[:, i + 1] = v[:, i] + (a + b) * h / 2
-    return x.T, v.T
-
-
 def autoregression(rng, phi, n=t.size):
     e = rng.normal(size=n + 200)
     for i in range(2, n + 200):
@@ -55,15 +44,12 @@ def autoregression(rng, phi, n=t.size):
     return e[200:]
 
 
-def pushes(T):
-    return [np.sin((1.5 + 0.4 * k) * t + k) for k in range(T)]
-
-
 def trials(noise, T=3, sigma=SIGMA):
     """Of noise by channel: functions from the number of a trial to samples (n_t,) in units of 0.05."""
     made = []
-    for k, push in enumerate(pushes(T)):
-        of = dict(zip(("x", "x_dot"), columns(push), strict=True))
+    for k in range(T):
+        push = np.sin((1.5 + 0.4 * k) * t + k)
+        of = dict(zip(("x", "x_dot"), responses(t, push), strict=True))
         measured = {c: of[c] @ TRUTH + 0.05 * e(k) for c, e in noise.items()}
         made.append(Trial(t, measured, {"push": push}, sigma=sigma, initial=REST))
     return made
@@ -114,7 +100,7 @@ def minus_twice(problem, theta):
     dense, by SciPy."""
     (gain, drift, log_s, phi), more, total = theta[:4], theta[4:], 0.0
     for trial in problem.trials:
-        of = dict(zip(("x", "x_dot"), columns(trial.inputs["push"]), strict=True))
+        of = dict(zip(("x", "x_dot"), responses(t, trial.inputs["push"]), strict=True))
         e = {c: trial.measured[c] - of[c] @ (gain, drift) for c in trial.measured}
         seen = np.isfinite(e["x"])
         C = np.exp(2 * log_s) * SIGMA**2 * scipy.linalg.toeplitz(phi ** np.arange(t.size)) / (1 - phi**2)
@@ -166,7 +152,7 @@ def test_autoregression_against_statsmodels(of_second_order):
     phi = numbers["phi_1"], numbers["phi_2"]
     rows, y, blocks = [], [], []
     for trial in found.problem.trials:
-        X, measured = columns(trial.inputs["push"])[0], trial.measured["x"]
+        X, measured = responses(t, trial.inputs["push"])[0], trial.measured["x"]
         model = arima.ARIMA(measured, exog=X, order=(2, 0, 0), trend="n")
         total += model.loglike([*found.estimates.values(), *phi, (numbers["scale"] * SIGMA) ** 2])
         seen = np.isfinite(measured)
@@ -186,7 +172,7 @@ def test_autoregression_against_statsmodels(of_second_order):
 def test_huber_against_statsmodels(of_huber):
     api = pytest.importorskip("statsmodels.api")
     found, trials = of_huber, of_huber.problem.trials
-    X = np.concatenate([columns(trial.inputs["push"])[0] for trial in trials])
+    X = np.concatenate([responses(t, trial.inputs["push"])[0] for trial in trials])
     y = np.concatenate([trial.measured["x"] for trial in trials])
     robust = api.RLM(y, X, M=api.robust.norms.HuberT(1.345)).fit(tol=1e-13, maxiter=500)
     assert found.ok
@@ -209,18 +195,6 @@ def test_huber_against_statsmodels(of_huber):
 
 
 @pytest.mark.weekly
-def test_the_gradient_used_for_scoring_equals_that_of_the_likelihood(of_two_channels, of_huber):
-    for found in (of_two_channels, of_huber):
-        density, point = found.problem.log_density(), found.problem.at({"gain": 1.25})
-        with_x = lambda x, p=point: dataclasses.replace(p, parameters=x)  # noqa: E731
-        slope = jax.grad(density)(point).parameters
-        h = 1e-5 * np.eye(2)
-        for i in range(2):
-            ends = [float(density(with_x(point.parameters + sign * h[i]))) for sign in (1, -1)]
-            assert float(slope[i]) == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-5)
-
-
-@pytest.mark.weekly
 def test_estimates_do_not_depend_on_sigma_if_scales_are_estimated(of_two_channels):
     """A `sigma` that is wrong by another factor in each channel changes nothing."""
     found = of_two_channels
@@ -238,7 +212,7 @@ def test_estimates_do_not_depend_on_sigma_if_scales_are_estimated(of_two_channel
 def test_without_error_models_only_scales_are_estimated(of_second_order):
     problem = of_second_order.problem
     found = fit(Track(), problem.trials, FREE, errors={}, **STEP)
-    X = np.concatenate([columns(trial.inputs["push"])[0] for trial in problem.trials])
+    X = np.concatenate([responses(t, trial.inputs["push"])[0] for trial in problem.trials])
     y = np.concatenate([trial.measured["x"] for trial in problem.trials])
     seen = np.isfinite(y)
     x, square, *_ = np.linalg.lstsq(X[seen], y[seen])
@@ -284,7 +258,7 @@ def test_the_evidence_equals_the_marginal_density_of_the_measurements():
     found = fit(Track(drift=0.3), data, free, unknown={"x": 0.1}, errors=AutoRegressive(), **STEP)
     numbers, given, total = found.measurement_errors["x"], 0.0, 0.0
     C = (numbers["scale"] * SIGMA) ** 2 * covariance((numbers["phi_1"], 0.0)) + 0.1**2
-    X = [columns(trial.inputs["push"])[0] for trial in data]
+    X = [responses(t, trial.inputs["push"])[0] for trial in data]
     for trial, A in zip(data, X, strict=True):
         e = trial.measured["x"] - A @ (found.estimates["gain"], 0.3)
         given += stats.multivariate_normal.logpdf(e, cov=C)
@@ -379,46 +353,24 @@ def test_ctrl_c_keeps_the_last_iterate(of_two_channels, monkeypatch):
     assert found.cost == found.history[-1]
 
 
+CHAIN = {"window": 1.0, "unknown": ("x",), "defect_std": {"x": 1.0}}
+
+
 @pytest.mark.parametrize(
-    ("errors", "more", "words"),
+    ("make", "words"),
     [
-        ({"y": Huber()}, {}, "`errors` contains unknown channels: y"),
-        ({"x": "huber"}, {}, "Pass AutoRegressive"),
-        (AutoRegressive(), {"noise": {}}, "either `errors` or `noise`, not both"),
-        (
-            AutoRegressive(),
-            {"window": 1.0, "unknown": ("x",), "defect_std": {"x": 1.0}},
-            "either `errors` or `defect_std`",
-        ),
+        (lambda: posed({"y": Huber()}), "`errors` contains unknown channels: y"),
+        (lambda: posed({"x": "huber"}), "Pass AutoRegressive"),
+        (lambda: posed(AutoRegressive(), noise={}), "either `errors` or `noise`, not both"),
+        (lambda: posed(AutoRegressive(), **CHAIN), "either `errors` or `defect_std`"),
+        (lambda: AutoRegressive(3), "Pass"),
+        (lambda: StudentT(0.5), "Pass|must be positive"),
+        (lambda: StudentT(math.inf), "Pass|must be positive"),
+        (lambda: Huber(0.0), "Pass|must be positive"),
     ],
 )
-def test_invalid_error_models_are_rejected(errors, more, words):
-    data = trials({"x": lambda k: np.zeros(t.size)}, T=1)
+def test_invalid_error_models_are_rejected(make, words):
     with pytest.raises((TypeError, ValueError), match=words):
-        Problem.of(Track(), data, FREE, errors=errors, **STEP, **more)
-
-
-def test_an_autoregression_needs_equal_intervals():
-    data = trials({"x": lambda k: np.zeros(t.size)}, T=2)
-    late = np.delete(np.arange(t.size), 12)
-    data[1] = Trial(
-        t[late],
-        {"x": data[1].measured["x"][late]},
-        {"push": data[1].inputs["push"][late]},
-        sigma=SIGMA,
-        initial=REST,
-    )
-    with pytest.raises(ValueError, match=r"t = 1\.1 s and 1\.3 s are not 0\.1 s apart"):
-        Problem.of(Track(), data, FREE, errors=AutoRegressive(), **STEP)
-    Problem.of(Track(), data, FREE, errors=StudentT(), **STEP)
-
-
-@pytest.mark.parametrize(
-    "make",
-    [lambda: AutoRegressive(3), lambda: StudentT(0.5), lambda: StudentT(math.inf), lambda: Huber(0.0)],
-)
-def test_numbers_of_models_are_checked(make):
-    with pytest.raises(ValueError, match=r"Pass|must be positive"):
         make()
 
 
@@ -442,26 +394,27 @@ def test_error_model_parameters_estimated_from_known_residuals():
     assert found.n_estimated == 1 + 2 + 2 + 2
 
 
+def posed(errors, **more):
+    return Problem.of(Track(), trials({"x": lambda k: np.zeros(t.size)}, T=1), FREE, errors=errors, **STEP, **more)
+
+
+def test_an_autoregression_needs_equal_intervals():
+    data = trials({"x": lambda k: np.zeros(t.size)}, T=2)
+    kept, one = np.delete(np.arange(t.size), 12), data[1]
+    measured, push = {"x": one.measured["x"][kept]}, {"push": one.inputs["push"][kept]}
+    data[1] = Trial(t[kept], measured, push, sigma=SIGMA, initial=REST)
+    with pytest.raises(ValueError, match=r"t = 1\.1 s and 1\.3 s are not 0\.1 s apart"):
+        Problem.of(Track(), data, FREE, errors=AutoRegressive(), **STEP)
+    Problem.of(Track(), data, FREE, errors=StudentT(), **STEP)
+
+
 def test_the_search_does_not_continue_if_it_has_not_converged(of_two_channels):
     found = minimize(of_two_channels.problem.with_errors_of(None), LeastSquares(), steps=1)
     assert found.status == "steps"
     assert len(found.history) == 3
     assert found.measurement_errors["x"]["phi_1"] > 0.5
-
-
-def test_scales_equal_the_given_ones_if_interrupted_before_estimation(of_huber, monkeypatch):
-    def interrupted(self, *arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(LeastSquares, "step", interrupted)
-    found = minimize(of_huber.problem.with_errors_of(None), LeastSquares())
-    assert found.status == "interrupted"
-    assert found.measurement_errors == {"x": {"scale": 1.0}}
-
-
-def test_forward_selection_refuses_error_models(of_huber):
     with pytest.raises(ValueError, match="error models"):
-        forward_selection(of_huber, ["drift"])
+        forward_selection(of_two_channels, ["drift"])
 
 
 def outliers(rng, n):

@@ -7,14 +7,13 @@ import math
 import numpy as np
 import pytest
 from scipy import stats
-from systems import Track
+from systems import Track, responses
 
 from jaxkane.fit import (
     Free,
     LeastSquares,
     Offset,
     Problem,
-    Simulation,
     Trial,
     bootstrap,
     compare,
@@ -36,20 +35,11 @@ PRIOR = (1.1, 0.01)  # of the gain
 BIAS = 0.05  # [m], a deviation
 
 
-def responses(push):
-    """Columns (2 n_t, 5) of position and speed by gain, drift, start, speed and the position sensor's offset:
-    x'' = gain push + drift, push linear between samples."""
-    h, rows = np.diff(t), [(0.0, 0.0)]
-    for i, dt in enumerate(h):
-        x, v = rows[-1]
-        rows.append((x + v * dt + (2 * push[i] + push[i + 1]) * dt**2 / 6, v + (push[i] + push[i + 1]) * dt / 2))
-    one, zero = np.ones_like(t), np.zeros_like(t)
-    x, v = np.array(rows).T
-    return np.vstack([np.column_stack([x, t**2 / 2, one, t, one]), np.column_stack([v, t, zero, one, zero])])
-
-
 PUSHES = [np.sin((1.5 + 0.3 * k) * t + k) for k in range(N)]
-COLUMNS = [responses(push) for push in PUSHES]
+ONE, ZERO = np.ones_like(t), np.zeros_like(t)
+OWN_COLUMNS = np.vstack([np.column_stack([ONE, t, ONE]), np.column_stack([ZERO, ONE, ZERO])])
+COLUMNS = [np.hstack([np.vstack(responses(t, push)), OWN_COLUMNS]) for push in PUSHES]
+"""(2 n_t, 5) of positions, then speeds, by gain, drift, start, speed and the position sensor's offset."""
 
 
 def recorded(seed, wander=0.0):
@@ -203,29 +193,35 @@ def test_errors_by_trial(case):
     assert [*found.error_kinds.values()] == ["trial", "trial"]
 
 
-@pytest.mark.weekly
-def test_errors_by_window():
-    """Two trials of four windows: each window left out in turn, all others solved for again."""
+@pytest.mark.slow
+@pytest.mark.weekly_cases("window-*")
+@pytest.mark.parametrize(("kind", "parts", "options"), [("window", 4, {"window": 1.0}), ("part", 3, {})])
+def test_errors_by_windows_and_by_parts(kind, parts, options):
+    """Two trials: each window or part left out in turn, all others solved for again. The offset belongs to a trial;
+    starts belong to a window, or to a trial without windows."""
     records = recorded(2, wander=0.2)[:2]
-    found = fitted(records, *FREE, window=1.0)
-    assert found.clusters == ("window", 8)
-    rows = []  # by gain, drift and the two offsets, starts projected out
+    found = fitted(records, *FREE, **options)
+    assert found.clusters == (kind, 2 * parts)
+    own = [4] if kind == "window" else [2, 3, 4]  # the columns of a trial's unknowns, of which the last is the offset
+    m, rows = len(own), []
     for k, (C, record) in enumerate(zip(COLUMNS, records, strict=False)):
         A, y = weighed(C, record)
-        for w in range(4):
-            at = np.tile((np.arange(t.size) >= 10 * w) & (np.arange(t.size) < 10 * (w + 1)), 2)
-            offsets = np.zeros((at.sum(), 2))
-            offsets[:, k] = A[at, 4]
+        for w in range(parts):
+            at = np.tile(np.arange(t.size) // -(-t.size // parts) == w, 2)
+            piece = np.zeros((at.sum(), 3 + 2 * m))
+            piece[:, :2], piece[:, 2 + m * k : 2 + m * k + m], piece[:, -1] = A[at][:, :2], A[at][:, own], y[at]
             Q, _ = np.linalg.qr(A[at][:, 2:4])
-            all_of_it = np.column_stack([A[at][:, :2], offsets, y[at]])
-            rows.append(all_of_it - Q @ (Q.T @ all_of_it))
-    priors = np.column_stack([np.diag([1 / PRIOR[1], 0, 1 / BIAS, 1 / BIAS]), [PRIOR[0] / PRIOR[1], 0, 0, 0]])
-
+            rows.append(piece - Q @ (Q.T @ piece) if kind == "window" else piece)
+    priors = np.zeros((3, 3 + 2 * m))
+    priors[0, [0, -1]], priors[1, 1 + m], priors[2, 1 + 2 * m] = [1 / PRIOR[1], PRIOR[0] / PRIOR[1]], 1 / BIAS, 1 / BIAS
     best, C, _ = left_out_in_turn(rows, priors)
     np.testing.assert_allclose(list(found.estimates.values()), best[:2], rtol=TIGHT)
-    np.testing.assert_allclose(found.clustered_covariance, C[:2, :2], rtol=1e-4)
-    # With links between them windows are no longer apart.
-    chained = fitted(records, *FREE, window=1.0, defect_std={"x": 0.1, "x_dot": 0.1})
+    np.testing.assert_allclose(found.clustered_covariance, C[:2, :2], rtol=1e-3)
+
+
+@pytest.mark.weekly
+def test_linked_windows_are_not_clusters():
+    chained = fitted(recorded(2, wander=0.2)[:2], *FREE, window=1.0, defect_std={"x": 0.1, "x_dot": 0.1})
     assert chained.clusters == ("", 0)
     assert np.all(np.isnan(chained.clustered_covariance))
     with pytest.raises(ValueError, match="bootstrap: 2 trials are too few"):
@@ -375,21 +371,6 @@ def test_a_wider_prior_reduces_the_evidence(evidence):
         none.sample(-1)
 
 
-@pytest.mark.weekly
-def test_a_parameter_without_influence_does_not_change_the_other_errors():
-    """Without a push its gain is free: infinite errors of both kinds, and those of the drift as without it."""
-    trials = [Trial(t, x.measured, {"push": 0.0 * t}, sigma=SIGMA[0]) for x in trials_of(recorded(5, wander=0.2))]
-    both, alone = (
-        minimize(Problem.of(Track(), trials, (*free, OWN), **OPTIONS), LeastSquares(rtol=1e-14))
-        for free in (("gain", "drift"), ("drift",))
-    )
-    assert both.uses_clustered_errors
-    for errors, others in ((both.standard_errors, alone.standard_errors), (both.errors, alone.errors)):
-        assert errors["gain"] == np.inf
-        assert errors["drift"] == pytest.approx(others["drift"], rel=1e-2)
-    assert both.intervals()["gain"] == (-np.inf, np.inf)
-
-
 @pytest.mark.slow
 def test_identifiability_does_not_depend_on_units():
     # A push in mN with a gain in 1/g is the same experiment: so is what the data tell.
@@ -435,42 +416,6 @@ def test_as_many_unknowns_as_residuals():
     assert any("residuals for" in note for note in found.notes)
 
 
-class Doubled(Track):
-    def outputs(self, t, q, u, motion, now):
-        return {"double": 2.0 * q["x"]}
-
-
-@pytest.mark.weekly
-def test_outputs_of_a_system_are_fitted_as_channels():
-    x, push = 0.4 * t**2, {"push": np.sin(3.0 * t)}
-    fixed = {"simulation": Simulation(step=0.1), "optimizer": LeastSquares(rtol=1e-14, damping=1e-7)}
-    column = responses(push["push"])[: t.size, 0]
-    double = Trial(t, {"double": 2.0 * x}, push, sigma=0.2)
-    found = fit(Doubled(), double, "gain", **fixed)
-    assert found.estimates["gain"] == pytest.approx(column @ x / (column @ column), rel=TIGHT)
-
-
-@pytest.mark.slow
-def test_errors_by_part():
-    """Two trials of three parts: each part is left out in turn. Starts and offsets are estimated again too."""
-    records = recorded(2, wander=0.2)[:2]
-    found = fitted(records, *FREE)
-    assert found.clusters == ("part", 6)
-    rows = []  # by gain, drift, and of each trial start, speed, offset
-    for k, (C, record) in enumerate(zip(COLUMNS, records, strict=False)):
-        A, y = weighed(C, record)
-        for w in range(3):
-            at = np.tile(np.arange(t.size) // -(-t.size // 3) == w, 2)
-            own = np.zeros((at.sum(), 6))
-            own[:, 3 * k : 3 * k + 3] = A[at, 2:]
-            rows.append(np.column_stack([A[at][:, :2], own, y[at]]))
-    priors = np.zeros((3, 9))
-    priors[0, [0, -1]], priors[1, 4], priors[2, 7] = [1 / PRIOR[1], PRIOR[0] / PRIOR[1]], 1 / BIAS, 1 / BIAS
-    best, C, _ = left_out_in_turn(rows, priors)
-    np.testing.assert_allclose(list(found.estimates.values()), best[:2], rtol=TIGHT)
-    np.testing.assert_allclose(found.clustered_covariance, C[:2, :2], rtol=1e-3)
-
-
 @pytest.mark.weekly
 def test_the_held_out_cost_with_a_parameter_at_its_bound():
     """A parameter at its bound is fixed: as in a fit that does not free it."""
@@ -481,20 +426,3 @@ def test_the_held_out_cost_with_a_parameter_at_its_bound():
     at_bound = dataclasses.replace(at_bound, status="converged")
     assert at_bound.held_out_cost == pytest.approx(fixed.held_out_cost, rel=1e-3)
     assert at_bound.message.startswith("converged: gain rests at its bound")
-
-
-@pytest.mark.weekly
-def test_a_subset_of_parameters_has_only_its_own_priors():
-    """Of three parameters, the last alone with its prior: as one that was never posed with the others."""
-    records = trials_of(recorded(3))
-    priors = (Free("gain", prior=(1.0, 0.5), bounds=(0.0, 9.0)), Free("drift", prior=(0.1, 0.01)))
-    problem = Problem.of(Track(), records, priors, **OPTIONS)
-    subset = problem.parameters.subset([1], problem.start.parameters)
-    problem = dataclasses.replace(problem, model=dataclasses.replace(problem.model, parameters=subset))
-    alone = Problem.of(Track(), records, priors[1], **OPTIONS)
-    assert subset.log_prior_constants == pytest.approx(alone.parameters.log_prior_constants)
-    point = dataclasses.replace(problem.start, parameters=alone.start.parameters)
-    assert problem.cost(point) == pytest.approx(alone.cost(alone.start), rel=TIGHT)
-    assert minimize(problem, LeastSquares(), start=point).estimates == pytest.approx(
-        minimize(alone, LeastSquares()).estimates, rel=1e-5
-    )

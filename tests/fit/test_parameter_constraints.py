@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from systems import Track
+from systems import Track, responses
 
 from jaxkane.fit import (
     Free,
@@ -23,16 +23,7 @@ PUSH = np.sin(2.0 * T)
 EXACT = {"simulation": Simulation(step=0.1), "optimizer": LeastSquares(rtol=1e-14, damping=1e-7)}
 
 
-def response():
-    """(n_t, 2) position by gain and drift: x'' = gain push + drift from rest, push linear between samples."""
-    rows, v = [0.0], 0.0
-    for i, h in enumerate(np.diff(T)):
-        rows.append(rows[-1] + v * h + (2 * PUSH[i] + PUSH[i + 1]) * h**2 / 6)
-        v += (PUSH[i] + PUSH[i + 1]) * h / 2
-    return np.column_stack([rows, T**2 / 2]) / 0.05
-
-
-A = response()
+A = responses(T, PUSH)[0] / 0.05
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +37,10 @@ def solved(trial, rows=(), values=()):
     return np.linalg.lstsq(np.vstack([A, *rows]), np.append(trial.measured["x"] / 0.05, values), rcond=None)[0]
 
 
+def values_of(found):
+    return found.estimates | {name: value for name, (value, _) in found.dependent.items()}
+
+
 @pytest.mark.weekly
 @pytest.mark.parametrize("free", [("gain", "drift"), (Free("gain", bounds=(0.0, None)), Free("drift", scale=0.1))])
 def test_an_exact_sum(trial, free):
@@ -54,7 +49,7 @@ def test_an_exact_sum(trial, free):
     # gain = 1.9 - 2 drift
     own, rest = A[:, 1] - 2 * A[:, 0], trial.measured["x"] / 0.05 - 1.9 * A[:, 0]
     drift = own @ rest / (own @ own)
-    values = found.estimates | {name: value for name, (value, _) in found.dependent.items()}
+    values = values_of(found)
     assert values["drift"] == pytest.approx(drift, rel=TIGHT)
     assert values["gain"] == pytest.approx(1.9 - 2 * drift, rel=1e-9)
     assert float(found.system.gain) == pytest.approx(values["gain"], rel=1e-12)
@@ -115,7 +110,7 @@ def test_an_inequality(trial, side, bound, tmp_path):
     total = free[0] + 2 * free[1]
     active = total > bound if side == "at_most" else total < bound
     assert active == (bound in (1.7, 2.3))
-    values = found.estimates | {name: value for name, (value, _) in found.dependent.items()}
+    values = values_of(found)
     if not active:
         assert [values["gain"], values["drift"]] == pytest.approx(free, rel=TIGHT)
         return
@@ -135,7 +130,7 @@ def test_the_prior_of_a_dependent_parameter_is_used(trial):
     rows = np.vstack([A, [[100.0, 0.0], [0.0, 100.0]]])
     y = np.append(trial.measured["x"] / 0.05, [100.0, 30.0])
     own, rest = rows[:, 1] - 2 * rows[:, 0], y - 1.9 * rows[:, 0]
-    values = found.estimates | {name: value for name, (value, _) in found.dependent.items()}
+    values = values_of(found)
     assert values["drift"] == pytest.approx(own @ rest / (own @ own), rel=TIGHT)
 
 
@@ -148,7 +143,7 @@ def test_a_dependent_parameter_keeps_its_bounds(trial):
     assert found.names == ("gain",)  # which keeps the bijection that has bounds
     both = (free[0], Free("drift", start=0.1, bounds=(0.0, None)))
     kept = fit(Track(), trial, both, constraints=sums, **EXACT)
-    values = kept.estimates | {name: value for name, (value, _) in kept.dependent.items()}
+    values = values_of(kept)
     assert min(values.values()) >= 0.0
     assert values["gain"] + values["drift"] == pytest.approx(0.3, rel=1e-9)
     with pytest.raises(ValueError, match="gain starts outside its bounds"):

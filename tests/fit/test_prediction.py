@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from systems import Track
-from test_results_as_data import fit as fit
+from test_files import result as result
 
 from jaxkane.fit import LeastSquares, Problem, Simulation, Trial, compare_estimates, minimize, predict
 
@@ -80,15 +80,15 @@ def test_invalid_arguments_of_a_prediction_are_rejected(ahead, past, message, dr
         predict(*drifting, ahead, past=past)
 
 
-def test_estimates_are_compared_in_standard_errors(fit):
-    frame = compare_estimates(fit, {"gain": (1.0, 0.2), "weight": 3.0})
+def test_estimates_are_compared_in_standard_errors(result):
+    frame = compare_estimates(result, {"gain": (1.0, 0.2), "weight": 3.0})
     assert [*frame.index] == ["gain"]
-    value, error = fit.estimates["gain"], fit.errors["gain"]
+    value, error = result.estimates["gain"], result.errors["gain"]
     assert frame.z["gain"] == pytest.approx((value - 1.0) / np.hypot(error, 0.2))
-    assert not compare_estimates(fit, fit).z.any()
-    assert [*compare_estimates(fit, fit).other_error] == [*fit.errors.values()]
-    assert compare_estimates(fit, {"drift": 0.0}).z["drift"] == fit.estimates["drift"] / fit.errors["drift"]
+    assert not compare_estimates(result, result).z.any()
+    assert [*compare_estimates(result, result).other_error] == [*result.errors.values()]
+    assert compare_estimates(result, {"drift": 0.0}).z["drift"] == result.estimates["drift"] / result.errors["drift"]
     with pytest.raises(ValueError, match="no common parameter; the fit has gain, drift"):
-        compare_estimates(fit, {"weight": 3.0})
+        compare_estimates(result, {"weight": 3.0})
     with pytest.raises(TypeError, match="compare_estimates requires a Fit"):
-        compare_estimates(fit.problem, fit)
+        compare_estimates(result.problem, result)

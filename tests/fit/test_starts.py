@@ -10,6 +10,7 @@ from jaxkane.fit import LeastSquares, Problem, Simulation, Trial, minimize
 from jaxkane.fit.result.diagnostics import wrong_sigma
 
 t = np.linspace(0.0, 1.0, 3)
+E = ("e1", "e2", "e3", "e4")
 
 
 class Wire(jk.System):
@@ -37,7 +38,7 @@ class Spun(jk.System):
 
     inertia: jk.Scalar = jk.parameter(0.2, positive=True)
     follows: tuple = eqx.field(static=True, default=())
-    coordinates, speeds = ("e1", "e2", "e3", "e4"), ("w1", "w2", "w3")
+    coordinates, speeds = E, ("w1", "w2", "w3")
 
     @property
     def dependent_coordinates(self):
@@ -52,6 +53,23 @@ class Spun(jk.System):
 
     def configuration_constraints(self, t, q):
         return [sum(e * e for e in q) - 1.0]
+
+
+class Sliding(Spun):
+    """It also slides along x, of which nothing is known."""
+
+    coordinates, speeds = ("x", *E), ("x_dot", "w1", "w2", "w3")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate_euler(q["e1":"e4"], u["w1":"w3"], "B")
+        return jk.Motion([jk.Body(1.0, (self.inertia, 0.2, 0.2), O.moving(q["x"] * N.x, u["x_dot"] * N.x), B)])
+
+    def q_dot(self, t, q, u):
+        return u["x_dot"], *jk.rotations.euler_parameter_rates(q["e1":"e4"], u["w1":"w3"])
+
+    def configuration_constraints(self, t, q):
+        return [jk.rotations.euler_parameter_norm(q["e1":"e4"])]
 
 
 def posed(system, free, *trials, **options):
@@ -91,19 +109,26 @@ def bead(initial, **measured):
 @pytest.mark.weekly
 @pytest.mark.parametrize("follows", [(), ("y",)])
 def test_known_initial_coordinates_are_kept_in_assembly(follows):
-    system = Wire(follows=follows)
-    np.testing.assert_allclose(starts(posed(system, "mass", bead({"x": 0.3}))), [[0.3, 0.7]], atol=1e-9)
+    system, x = Wire(follows=follows), np.array([0.2, 0.3, 0.4])
+    for trial, options, expected in (
+        (bead({"x": 0.3}), {}, [0.3, 0.7]),
+        (bead({}, x=x), {}, [0.2, 0.8]),
+        (bead({}), {"unknown": ("x",)}, [0.0, 1.0]),
+    ):
+        np.testing.assert_allclose(starts(posed(system, "mass", trial, **options)), [expected], atol=1e-9)
     np.testing.assert_allclose(jk.assemble(system, {"x": 0.3}).q, [0.3, 0.7], atol=1e-9)
-    measured = posed(system, "mass", bead({}, x=np.array([0.2, 0.3, 0.4])))
-    np.testing.assert_allclose(starts(measured), [[0.2, 0.8]], atol=1e-9)
-    unknown = posed(system, "mass", bead({}), unknown=("x",))
-    np.testing.assert_allclose(starts(unknown), [[0.0, 1.0]], atol=1e-9)
+    if not follows:  # both are given, and are moved to the nearest that are consistent
+        both = bead({"x": 0.3, "y": 0.5})
+        np.testing.assert_allclose(starts(posed(system, "mass", both)), [[0.4, 0.6]], atol=1e-9)
 
 
-@pytest.mark.slow
-def test_inconsistent_initial_coordinates_are_moved_to_the_nearest():
-    both = {"x": 0.3, "y": 0.5}
-    np.testing.assert_allclose(starts(posed(Wire(), "mass", bead(both))), [[0.4, 0.6]], atol=1e-9)
+@pytest.mark.weekly
+@pytest.mark.parametrize("follows", [(), ("e4",)])
+def test_missing_euler_parameters_default_to_no_rotation(follows):
+    for initial, expected in (({}, [0, 0, 0, 1]), ({"e1": 0.6, "e2": 0.0, "e3": 0.0}, [0.6, 0, 0, 0.8])):
+        turned = Trial(t, {"w1": np.zeros(3)}, sigma=0.1, initial=initial)
+        found = starts(posed(Spun(follows=follows), "inertia", turned))
+        np.testing.assert_allclose(found, [expected], atol=1e-9)
 
 
 @pytest.mark.slow
@@ -115,49 +140,14 @@ def test_a_trial_without_the_initial_values_of_the_others_is_reported():
     np.testing.assert_allclose(starts(of_each), [[0.3, 0.7], [0.0, 1.0]], atol=1e-9)
 
 
-@pytest.mark.weekly
-@pytest.mark.parametrize("follows", [(), ("e4",)])
-def test_missing_euler_parameters_default_to_no_rotation(follows):
-    turned = Trial(t, {"w1": np.zeros(3)}, sigma=0.1)
-    np.testing.assert_allclose(starts(posed(Spun(follows=follows), "inertia", turned)), [[0, 0, 0, 1]], atol=1e-9)
-    axis = {"e1": 0.6, "e2": 0.0, "e3": 0.0}
-    turned = Trial(t, {"w1": np.zeros(3)}, sigma=0.1, initial=axis)
-    np.testing.assert_allclose(starts(posed(Spun(follows=follows), "inertia", turned)), [[0.6, 0, 0, 0.8]], atol=1e-9)
-
-
-E = ("e1", "e2", "e3", "e4")
-
-
-class Sliding(Spun):
-    """It also slides along x, of which nothing is known."""
-
-    coordinates, speeds = ("x", *E), ("x_dot", "w1", "w2", "w3")
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        place = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
-        return jk.Motion(
-            [jk.Body(1.0, (self.inertia, 0.2, 0.2), place, N.rotate_euler(q["e1":"e4"], u["w1":"w3"], "B"))]
-        )
-
-    def q_dot(self, t, q, u):
-        return u["x_dot"], *jk.rotations.euler_parameter_rates(q["e1":"e4"], u["w1":"w3"])
-
-    def configuration_constraints(self, t, q):
-        return [jk.rotations.euler_parameter_norm(q["e1":"e4"])]
-
-
-@pytest.mark.slow_cases(all_but=["dependent"])
+@pytest.mark.slow_cases("all", "sliding")
 @pytest.mark.parametrize("system", [Spun(), Spun(follows=("e4",)), Sliding()], ids=["all", "dependent", "sliding"])
 def test_four_measured_euler_parameters_are_brought_to_unit_norm(system):
     raw = np.array([0.1, -0.5, 0.7, 1e-3])
     measured = Trial(t, {name: np.full(3, x) for name, x in zip(E, raw, strict=True)}, sigma=0.1)
     for unknown in ((), E, E[:3]):
         problem = posed(system, "inertia", measured, unknown=unknown)
-        window = jax.tree.map(lambda x: x[0], problem.windows)
-        first = problem.model.consistent(window, problem.start.window_starts[0], problem.start.parameters)
-        found = np.asarray(first)[: len(system.coordinates)][-4:]
-        np.testing.assert_allclose(found, raw / np.linalg.norm(raw), atol=1e-12)
+        np.testing.assert_allclose(starts(problem)[0][-4:], raw / np.linalg.norm(raw), atol=1e-12)
         # The fourth follows from the norm of three: to estimate it, too, is no remedy for large residuals.
         (note,) = wrong_sigma(problem, 4.0, 100.0)
         fixed = ", ".join(name for name in E if name not in system.dependent_coordinates)
@@ -174,29 +164,12 @@ def turning(sigma=0.01):
     return Trial(t, measured, sigma=sigma, initial={"w1": 1.0, "w2": 2.0, "w3": -0.5})
 
 
-SLOW = pytest.mark.weekly
-
-
 @pytest.mark.weekly
-@pytest.mark.parametrize(
-    ("system", "window"),
-    [
-        pytest.param(Spun(), None, marks=SLOW),
-        pytest.param(Spun(), 1.0, marks=SLOW),
-        (Spun(follows=("e4",)), 1.0),
-        pytest.param(Sliding(), None, marks=SLOW),
-        pytest.param(Sliding(), 1.0, marks=SLOW),
-    ],
-)
-def test_four_unknown_euler_parameters_are_three_degrees_of_freedom(system, window):
-    problem = Problem.of(
-        eqx.tree_at(lambda s: s.inertia, system, np.array(0.25)),
-        turning(),
-        "inertia",
-        unknown=(*E, "w1", "w2", "w3"),
-        window=window,
-        simulation=Simulation(step=0.05),
-    )
+@pytest.mark.parametrize(("follows", "window"), [((), None), (("e4",), 1.0)])
+def test_four_unknown_euler_parameters_are_three_degrees_of_freedom(follows, window):
+    system, unknown = Spun(inertia=0.25, follows=follows), (*E, "w1", "w2", "w3")
+    options = {"unknown": unknown, "window": window, "simulation": Simulation(step=0.05)}
+    problem = Problem.of(system, turning(), "inertia", **options)
     found = minimize(problem, LeastSquares())
     assert found.status == "converged"
     assert not any("body" in note for note in found.notes)
@@ -206,29 +179,6 @@ def test_four_unknown_euler_parameters_are_three_degrees_of_freedom(system, wind
     # Of the unknowns of a window the norm alone is not measured, and is counted among what is given.
     windows = len(problem.slices)
     assert problem.size == (4 * 41 + windows, 1 + 7 * windows)
-
-
-@SLOW
-def test_recorded_tosses_start_at_the_measured_poses():
-    """Their quaternions have the norm 1 but for 1e-4."""
-    cube = {"mass": 0.37, "inertia": (0.0006167,) * 3}
-    other = jk.joints.Link("other", parent="cube", joints=jk.joints.hinge("hinge", (0, 1, 0)), **cube)
-    elbow = jk.joints.mechanism([jk.joints.Link("cube", joints=jk.joints.free("cube"), **cube), other])
-    names = {name: f"cube_{name}" for name in ("x", "y", "z", *E)} | {"hinge": "hinge", "hinge_rate": "hinge_rate"}
-    names |= {f"{kind}{i + 1}": f"cube_{to[i]}" for kind, to in TURNS.items() for i in range(3)}
-    renamed = lambda group: {names[name]: x for name, x in group.items()}  # noqa: E731
-    tosses = [
-        Trial(x.t, renamed(x.measured), sigma=renamed(x.sigma), initial=renamed(x.initial))
-        for x in jk.data.tossed_elbow().trials
-    ]
-    problem = Problem.of(elbow, tosses, "mass.cube", simulation=Simulation(step=0.02))
-    places = [elbow.coordinates.index(f"cube_{name}") for name in E]
-    found, raw = starts(problem)[:, places], np.asarray(problem.windows.start)[:, places]
-    np.testing.assert_allclose(np.sum(found**2, axis=1), 1.0, atol=1e-12)
-    np.testing.assert_allclose(found, raw, atol=1e-4)
-
-
-TURNS = {"omega": ("w1", "w2", "w3"), "v": ("vx", "vy", "vz")}
 
 
 @pytest.mark.weekly

@@ -75,31 +75,11 @@ def test_derivatives_of_laws_are_finite_at_rest(law, sharp, dtype):
         np.testing.assert_allclose(forward, (f(v + step) - f(v - step)) / (2 * step), rtol=1e-5, atol=2e-6)
 
 
-@pytest.mark.slow
-def test_derivatives_of_laws_at_rest_agree_with_closed_forms():
-    at_rest = lambda law: float(jax.grad(law)(0.0))  # noqa: E731
-    assert at_rest(lambda v: coulomb(v, 0.7, width=0.02)) == pytest.approx(0.7 / 0.02, rel=RTOL)
-    level = 0.3 + 0.2 * np.exp(-((0.02 / 0.1) ** 2))
-    assert at_rest(lambda v: stribeck(v, 0.3, 0.5, 0.1, width=0.02)) == pytest.approx(level / 0.02, rel=RTOL)
-    assert at_rest(lambda v: quadratic(v, 0.8)) == 0.0
-    inside = 1.0 - 0.2 / np.hypot(0.2, 0.01)
-    assert at_rest(lambda x: dead_zone(x, -0.2, 0.2, width=0.01)) == pytest.approx(inside, rel=1e-10)
-
-
 def test_the_error_of_smoothing_agrees_with_the_documented_formula():
     x, width = np.array([0.5, 2.0, 30.0]), 1e-3
     np.testing.assert_allclose(np.asarray(smooth_abs(jnp.array(x), width)) - x, width**2 / (2 * x), rtol=1e-4)
     np.testing.assert_allclose(1 - np.asarray(smooth_sign(jnp.array(x), width)), width**2 / (2 * x**2), rtol=1e-4)
     assert float(smooth_abs(jnp.array(0.0), width)) == pytest.approx(width, rel=RTOL)
-
-
-@pytest.mark.slow
-def test_a_stribeck_curve_peaks_at_static_friction_and_then_decreases():
-    v = jnp.linspace(1e-4, 1.0, 4000)
-    force = stribeck(v, 0.3, 0.5, 0.1, width=1e-4)
-    assert float(jnp.max(force)) == pytest.approx(0.5, rel=1e-3)
-    assert float(force[-1]) == pytest.approx(0.3, rel=1e-8)
-    assert np.all(np.diff(np.asarray(force)[50:1500]) < 0)
 
 
 def test_dead_zones_with_one_and_two_ends():
@@ -131,16 +111,6 @@ def test_lugre_friction_at_steady_rate_equals_the_stribeck_curve():
     force, z_dot = lugre(jnp.array(v), jnp.array(z), damping=30.0, viscous=0.4, **BRISTLES)
     np.testing.assert_allclose(z_dot, 0.0, atol=1e-15)
     np.testing.assert_allclose(force, np.sign(v) * level(v) + 0.4 * v, rtol=RTOL)
-
-
-@pytest.mark.slow
-def test_lugre_friction_at_rest_is_a_spring_and_a_damper():
-    force = lambda v, z: lugre(v, z, damping=30.0, viscous=0.4, **BRISTLES)  # noqa: E731
-    (dv, dz), (z_dot_v, z_dot_z) = jax.jacfwd(force, (0, 1))(0.0, 0.0)
-    assert (float(dv), float(dz)) == pytest.approx((30.4, 1e4), rel=RTOL)
-    assert (float(z_dot_v), float(z_dot_z)) == (1.0, 0.0)
-    back = jax.jacrev(force, (0, 1))(0.0, 1e-5)
-    np.testing.assert_allclose(back, jax.jacfwd(force, (0, 1))(0.0, 1e-5))
 
 
 @pytest.mark.slow
@@ -254,94 +224,7 @@ def test_derivatives_of_a_system_at_rest_agree_with_closed_forms(kernels):
     np.testing.assert_allclose(by_parameters.air[:, 1], -v[:, 1] * np.abs(v[:, 1]) / 1.5, rtol=1e-10)
 
 
-@pytest.mark.slow
-def test_a_system_in_single_precision(by_xla):
-    small = jax.tree.map(lambda x: x.astype(jnp.float32), Bench())
-    u = jnp.array([0.02, -2.0, 5.0], jnp.float32)
-    q = jnp.zeros(3, jnp.float32)
-    volts = {"voltage": jnp.float32(12.0)}
-    found = jk.accelerations(small, jnp.float32(0.0), q, u, volts)
-    assert found.dtype == jnp.float32
-    expected = jk.accelerations(Bench(), 0.0, q.astype(float), u.astype(float), {"voltage": 12.0})
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
-
-
-def test_stribeck_friction_of_a_sliding_point_and_of_a_hinge():
-    class Sliding(jk.System):
-        coordinates, speeds = ("x", "angle"), ("v", "w")
-
-        def motion(self, t, q, u):
-            N, O = jk.inertial()
-            B = N.rotate(3, q[1], u[1])
-            P = O.moving(q[0] * N.x, u[0] * N.x)
-            return jk.Motion([jk.Body(1.0, 0.0, P, name="sled"), jk.Body(1.0, (1.0, 1.0, 2.0), O, B, name="arm")])
-
-        def loads(self, t, q, u, motion, inputs):
-            mu = lambda v: 0.3 + 0.2 * jnp.exp(-((v / 0.1) ** 2))  # noqa: E731
-            law = lambda w: stribeck(w, 0.3, 0.5, 0.1) + 0.02 * w  # noqa: E731
-            return (
-                jk.loads.friction(motion["sled"], None, 1.0, mu),
-                jk.loads.torsional_damper(motion["arm"], None, 2.0 * motion.N.z, law),
-            )
-
-    u = np.array([0.12, -0.12])
-    sliding, turning = jk.accelerations(Sliding(), 0.0, jnp.zeros(2), jnp.array(u))
-    expected = float(stribeck(jnp.array(0.12), 0.3, 0.5, 0.1))
-    assert float(sliding) == pytest.approx(-expected, rel=RTOL)
-    assert float(turning) == pytest.approx((expected + 0.02 * 0.12) / 2.0, rel=RTOL)
-
-
-@pytest.mark.slow
-def test_a_gear_with_backlash_transmits_torque_outside_the_gap_only():
-    class Gear(jk.System):
-        coordinates, speeds = ("motor", "link"), ("motor_rate", "link_rate")
-
-        def motion(self, t, q, u):
-            N, O = jk.inertial()
-            L = N.rotate(3, q["link"], u["link_rate"])
-            link = jk.Body(1.0, (1.0, 1.0, 0.5), O, L, name="link")
-            return jk.Motion([link, jk.loads.rotor(1e-4, N.z, u["motor_rate"], N, O)])
-
-        def loads(self, t, q, u, motion, inputs):
-            N, twist = motion.N, q["motor"] / 50.0 - q["link"]
-            torque = 200.0 * dead_zone(twist, -0.01, 0.01, width=1e-6)
-            return jk.Torque(torque * N.z, motion["link"]), jk.Torque(-torque / 50.0 * N.z, motion["rotor"])
-
-    at = jax.jit(jax.vmap(lambda motor: jk.accelerations(Gear(), 0.0, jnp.stack([motor, 0.0 * motor]), jnp.zeros(2))))
-    twist = np.array([-0.03, -0.009, 0.0, 0.009, 0.03])
-    torque = 200.0 * np.array([-0.02, 0.0, 0.0, 0.0, 0.02])
-    motor, link = at(jnp.array(50.0 * twist)).T
-    np.testing.assert_allclose(link, torque / 0.5, atol=1e-7)
-    np.testing.assert_allclose(motor, -torque / 50.0 / 1e-4, atol=1e-5)
-
-
 # Rotors.
-
-
-class Arms(jk.System):
-    """Two arms in a plane, the second driven by a geared motor on the first; J is its rotor's."""
-
-    J: jk.Scalar = jk.parameter(3e-4, positive=True)
-    ratio: jk.Scalar = jk.parameter(40.0)
-    coordinates = ("q1", "q2")
-    speeds = ("u1", "u2")  # relative angles
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        A = N.rotate(3, q[0], u[0])
-        B = A.rotate(3, q[1], u[1])
-        arms = [jk.Body(0.0, (0.0, 0.0, I), O, F, name=n) for I, F, n in ((0.5, A, "first"), (0.2, B, "second"))]
-        return jk.Motion([*arms, jk.loads.rotor(self.J, A.z, self.ratio * u[1], A, arms[0])])
-
-
-@pytest.mark.slow
-def test_the_reflected_inertia_of_a_geared_rotor():
-    """2 T = 0.5 u1^2 + 0.2 (u1 + u2)^2 + J (u1 + ratio u2)^2."""
-    M = jk.mass_matrix(Arms(), 0.0, jnp.array([0.3, 0.2]), jnp.array([1.0, 2.0]))
-    J, N = 3e-4, 40.0
-    np.testing.assert_allclose(M, [[0.7 + J, 0.2 + J * N], [0.2 + J * N, 0.2 + J * N**2]], rtol=RTOL)
-    slope = jax.jacfwd(lambda J: jk.mass_matrix(Arms(J=J), 0.0, jnp.zeros(2), jnp.zeros(2)))(3e-4)
-    np.testing.assert_allclose(slope, [[1.0, N], [N, N**2]], rtol=RTOL)
 
 
 class Gimbal(jk.System):
@@ -390,15 +273,6 @@ def test_bouc_wen_hysteresis_is_passive_and_bounded(share):
     assert np.min(np.asarray(force) * v - 500.0 * z * np.asarray(z_dot)) > -1e-12
     _, outwards = bouc_wen(jnp.array(v), jnp.full_like(v, 4e-3), **YIELDS | {"share": share})
     assert np.max(np.asarray(outwards)) < 1e-12
-
-
-@pytest.mark.slow
-def test_bouc_wen_hysteresis_is_elastic_and_then_has_the_yield_force():
-    force = lambda v, z: bouc_wen(v, z, **YIELDS)  # noqa: E731
-    (dv, dz), (z_dot_v, z_dot_z) = jax.jacrev(force, (0, 1))(0.0, 0.0)
-    assert (float(dv), float(dz), float(z_dot_v), float(z_dot_z)) == pytest.approx((0.0, 500.0, 1.0, 0.0), abs=1e-9)
-    pulled, z_dot = force(0.2, 4e-3)
-    assert (float(pulled), float(z_dot)) == pytest.approx((2.0, 0.0), abs=1e-9)
 
 
 class Held(jk.System):
@@ -473,32 +347,3 @@ def test_derivatives_by_element_states_at_rest_agree_with_closed_forms(kernels):
     np.testing.assert_allclose(forward[0], np.diag([-40.4, -5.0]), rtol=RTOL)
     np.testing.assert_allclose(forward[1], np.diag([-1e3, -500.0]), rtol=RTOL)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=RTOL), forward, reverse)
-
-
-class Tilted(jk.System):
-    """A pendulum on a table that is not level, whose encoder does not begin at its zero."""
-
-    tilt: jk.Scalar = jk.parameter(0.02, unit="rad")
-    zero: jk.Scalar = jk.parameter(-0.3, unit="rad")
-    coordinates, speeds = ("angle",), ("rate",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        B = N.rotate(3, q["angle"], u["rate"])
-        return jk.Motion([jk.Body(1.0, 0.0, O.fixed(-0.5 * B.y), name="bob")])
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -9.81 * motion.N.rotate(3, self.tilt, 0.0).y)
-
-    def outputs(self, t, q, u, motion, now):
-        return {"encoder": q["angle"] + self.zero}
-
-
-@pytest.mark.slow
-def test_zero_offsets_can_be_parameters():
-    """It hangs along the vertical, which is off by the tilt; the encoder reads that less its zero."""
-    f = jax.jit(lambda tilt, angle: jk.accelerations(Tilted(tilt=tilt), 0.0, angle[None], jnp.zeros(1))[0])
-    np.testing.assert_allclose(f(0.05, jnp.array(0.05)), 0.0, atol=1e-14)
-    np.testing.assert_allclose(jax.grad(f)(0.05, jnp.array(0.05)), 9.81 / 0.5, rtol=RTOL)
-    ride = jk.simulate(Tilted(), jk.State({"angle": 0.02}, {}), np.array([0.0, 0.1]))
-    np.testing.assert_allclose(ride["encoder"], -0.28, atol=1e-12)
