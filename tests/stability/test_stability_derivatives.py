@@ -98,10 +98,7 @@ def test_critical_values_for_given_values_in_any_order():
     assert critical_speeds(Pushed(), jnp.zeros(0), sprung).values.shape == (0,)
     # Without a damper it becomes neutral; with a spring that passes its limit flatly, the crossing is too flat.
     flat = lambda system, x: sprung(system, (x - 0.3) ** 3 - LIMIT)  # noqa: E731
-    for system, values, at in (
-        (Pushed(damper=0.0), [-20.0, -3.0, 5.0], sprung),
-        (Pushed(), [-1.0, 0.0, 1.0], flat),
-    ):
+    for system, values, at in ((Pushed(damper=0.0), [-20.0, -3.0, 5.0], sprung), (Pushed(), [-1.0, 0.0, 1.0], flat)):
         with pytest.warns(UserWarning, match="falls by 1 more than the detected"):
             critical_speeds(system, jnp.array(values), at)
 
