@@ -154,7 +154,7 @@ def test_a_folder_of_another_sweep_is_refused(rides, folder, change, message):
 def test_two_devices_give_identical_results(rides, script, tmp_path):
     flags = os.environ.get("XLA_FLAGS", "")  # the same code, to the last bit
     two = {**os.environ, "XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count=2"}
-    subprocess.run([sys.executable, script, tmp_path / "sweep", tmp_path / "q.npy"], env=two, check=True, timeout=120)
+    subprocess.run([sys.executable, script, tmp_path / "sweep", tmp_path / "q.npy"], env=two, check=True, timeout=300)
     np.testing.assert_array_equal(np.load(tmp_path / "q.npy"), rides.q)
 
 
@@ -172,7 +172,7 @@ np.testing.assert_allclose(rides["y"][:, 0], np.sqrt(1 - x**2), atol=1e-12)
 """
     clean = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     clean["PYTHONPATH"] = os.pathsep.join(sys.path)  # with the folder of `mechanisms`
-    run = subprocess.run([sys.executable, "-c", code], env=clean, capture_output=True, text=True, timeout=120)
+    run = subprocess.run([sys.executable, "-c", code], env=clean, capture_output=True, text=True, timeout=300)
     assert run.returncode == 0, run.stderr
 
 
