@@ -308,3 +308,19 @@ def moved(system, ts, q, u, u_dep=None):
 def declared(system):
     """The declarations of a system's parameters by name, with `positive`, `shape`, `unit` and `within`."""
     return {f.name: f.metadata["jaxkane"] for f in dataclasses.fields(system) if "jaxkane" in f.metadata}
+
+
+class Pendulum(jk.System):
+    """A bob at 1 m from a pin, N.y up, with a torque about the pin."""
+
+    mass: Scalar = parameter(2.0)  # [kg]
+    coordinates, speeds, inputs = ("angle",), ("rate",), ("torque",)
+    units = {"angle": "rad", "rate": "rad/s", "torque": "N m"}
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        L = N.rotate(3, q["angle"], u["rate"], "L")
+        return jk.Motion([jk.Body(self.mass, 0.0, O.fixed(-1.0 * L.y), name="bob")], frames={"L": L})
+
+    def loads(self, t, q, u, motion, inputs):
+        return (*jk.weight(motion, -9.81 * motion.N.y), jk.Torque(inputs["torque"] * motion.N.z, motion["L"]))

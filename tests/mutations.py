@@ -14,17 +14,13 @@ and takes longer.
 """
 
 import argparse
-import concurrent.futures
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import NamedTuple
-
-import psutil
 
 ROOT = Path(__file__).resolve().parents[1]
 CACHE = "JAXKANE_TEST_CACHE"
@@ -195,101 +191,42 @@ MUTATIONS = (
 # fmt: on
 
 
-def why_it_does_not_fit(mutation: Mutation, source: Path) -> str:
-    """Why a mutation of the library in `source` is not possible; an empty text if it is."""
-    path = source / "jaxkane" / mutation.file
-    if not path.is_file():
-        return f"{mutation.file} does not exist"
-    text = path.read_text(encoding="utf-8")
-    n = text.count(mutation.old)
-    if n != 1:
-        return f"its old text occurs {n} times in {mutation.file} instead of once. Change the mutation"
-    if path.suffix == ".py":
-        try:
-            compile(text.replace(mutation.old, mutation.new), str(path), "exec")
-        except SyntaxError as error:
-            return f"its new text is not valid: {error}"
+def why_it_does_not_fit(mutation: Mutation) -> str:
+    """Why a mutation of the library is not possible; an empty text if it is."""
+    text = (ROOT / "src/jaxkane" / mutation.file).read_text(encoding="utf-8")
+    if text.count(mutation.old) != 1:
+        return f"its old text occurs {text.count(mutation.old)} times in {mutation.file} instead of once"
     missing = [name for name in mutation.near.split() if not (ROOT / "tests" / name).exists()]
     return f"these tests do not exist: {', '.join(missing)}" if missing else ""
 
 
-def environment_of(copy: Path, cache: str) -> dict[str, str]:
-    """The environment in which Python imports the library from a copy of `src`."""
-    return os.environ | {"PYTHONPATH": str(copy), CACHE: cache}
-
-
-def check_import(copy: Path, cache: str) -> None:
-    """Assert that the copy has precedence over the installed library."""
-    command = [sys.executable, "-c", "import jaxkane; print(jaxkane.__file__)"]
-    run = subprocess.run(command, env=environment_of(copy, cache), cwd=ROOT, capture_output=True, text=True, check=True)
-    file = run.stdout.split()[-1]
-    assert Path(file).is_relative_to(copy), f"jaxkane is imported from {file} instead of {copy}"
-
-
-class Outcome(NamedTuple):
-    """The result of the tests of one mutation.
-
-    - `kind`: "killed", "survived" or "not tested". `text`: by which test, or why.
-    - `seconds`: of processor time.
-    """
-
-    kind: str
-    text: str
-    seconds: float
-
-
-def tested(mutation: Mutation, tests: list[str], with_slow: bool, cache: str) -> Outcome:
-    """The outcome of the nearest tests with one mutation."""
+def outcome(mutation: Mutation, with_slow: bool, cache: str) -> str:
+    """Whether the nearest tests find one mutation, and by which test."""
     with tempfile.TemporaryDirectory(prefix="jaxkane-mutation-") as folder:
         copy = Path(folder) / "src"
         # With the compiled modules: their times are those of the source files, so Python uses all but the mutated one.
         shutil.copytree(ROOT / "src", copy)
         path = copy / "jaxkane" / mutation.file
-        text = path.read_text(encoding="utf-8")
-        path.write_text(text.replace(mutation.old, mutation.new), encoding="utf-8")
+        path.write_text(path.read_text(encoding="utf-8").replace(mutation.old, mutation.new), encoding="utf-8")
+        environment = os.environ | {"PYTHONPATH": str(copy), CACHE: cache}
+        # The copy must have precedence over the installed library.
+        command = [sys.executable, "-c", "import jaxkane; print(jaxkane.__file__)"]
+        file = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        assert Path(file.split()[-1]).is_relative_to(copy), file
         options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "-m", "" if with_slow else "not slow"]
+        tests = [str(Path("tests") / name) for name in mutation.near.split()]
         command = [sys.executable, "-m", "pytest", *options, *tests]
-        with open(Path(folder) / "output", "w+", encoding="utf-8") as output:
-            code, seconds = _finished(command, environment_of(copy, cache), output)
-            output.seek(0)
-            lines = output.read().splitlines()
-    last = lines[-1].strip("= ") if lines else "no output"
+        try:
+            run = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=LONGEST)
+        except subprocess.TimeoutExpired:
+            return f"killed by a time-out of {LONGEST:g} s"
+    lines = run.stdout.splitlines()
     failed = [line.split(" - ")[0].split(" ", 1)[1] for line in lines if line.startswith(("FAILED ", "ERROR "))]
-    if code is None:
-        return Outcome("killed", f"by a time-out of {LONGEST:g} s", seconds)
     if failed and "::" not in failed[0]:  # the tests cannot be imported, perhaps also without the mutation
-        return Outcome("not tested", f"({failed[0]} cannot be imported)", seconds)
-    if code not in (0, 5):  # 5: all tests are slow
-        return Outcome("killed", f"by {failed[0] if failed else f'the exit code {code} ({last})'}", seconds)
-    return Outcome("survived", f"({last})", seconds)
-
-
-def _finished(command: list[str], environment: dict[str, str], output) -> tuple[int | None, float]:
-    """The exit code of a process, None after a time-out, and the processor time of it and its children."""
-    process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
-    end, late = time.monotonic() + LONGEST, False
-    while True:
-        pid, status, usage = os.wait4(process.pid, os.WNOHANG)
-        if pid:
-            process.returncode = os.waitstatus_to_exitcode(status)
-            return None if late else process.returncode, usage.ru_utime + usage.ru_stime
-        if not late and time.monotonic() > end:
-            late, started = True, psutil.Process(process.pid)
-            for each in (*started.children(recursive=True), started):
-                each.kill()
-        time.sleep(0.1)
-
-
-def chosen(only: list[str] | None) -> list[tuple[int, Mutation]]:
-    """The mutations with their numbers, all or those with one of the numbers or a part of the names."""
-    numbered = [*enumerate(MUTATIONS, start=1)]
-    found = []
-    for each in only or ():
-        matches = [(i, m) for i, m in numbered if (str(i) == each if each.isdigit() else each in m.name)]
-        if not matches:
-            sys.exit(f"--only: no mutation is {each!r}. See --list.")
-        found += [match for match in matches if match not in found]
-    return numbered if only is None else found
+        return f"not tested: {failed[0]} cannot be imported"
+    if run.returncode in (0, 5):  # 5: all tests are slow
+        return "survived"
+    return f"killed by {failed[0] if failed else f'the exit code {run.returncode}'}"
 
 
 def main() -> None:
@@ -297,36 +234,22 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", metavar="NAME_OR_NUMBER", help="mutations by number or part of the name")
     parser.add_argument("--all", action="store_true", help="run the slow tests too")
     parser.add_argument("--list", action="store_true", help="list the mutations and check that they fit the source")
-    parser.add_argument("--tests", nargs="+", metavar="PATH", help="run these tests instead of the nearest ones")
-    parser.add_argument("--jobs", type=int, default=1, help="number of mutations at a time")
     options = parser.parse_args()
-    mutations = chosen(options.only)
-    wrong = [(i, m.name, why) for i, m in mutations if (why := why_it_does_not_fit(m, ROOT / "src"))]
-    if options.list:
+    mutations = [
+        (i, m)
+        for i, m in enumerate(MUTATIONS, start=1)
+        if options.only is None or any(i == int(x) if x.isdigit() else x in m.name for x in options.only)
+    ]
+    wrong = {i: why for i, m in mutations if (why := why_it_does_not_fit(m))}
+    if options.list or wrong:
         for i, m in mutations:
-            print(f"{i:3} {m.name}\n    {m.file}; {m.near}")
-    for i, name, why in wrong:
-        print(f"Mutation {i} ({name}) does not fit: {why}.", file=sys.stderr)
-    if wrong or options.list:
+            print(f"{i:3} {m.name}\n    {m.file}; {m.near} {wrong.get(i, '')}")
         sys.exit(1 if wrong else 0)
-    cache = os.environ.get(CACHE) or str(Path(tempfile.gettempdir()) / "jaxkane-mutation-programs")
-    with tempfile.TemporaryDirectory(prefix="jaxkane-mutation-") as folder:
-        shutil.copytree(ROOT / "src", Path(folder) / "src")
-        check_import(Path(folder) / "src", cache)
-    outcomes = []
-
-    def run(numbered: tuple[int, Mutation]) -> None:
-        i, mutation = numbered
-        tests = options.tests or [str(Path("tests") / name) for name in mutation.near.split()]
-        outcome = tested(mutation, tests, options.all, cache)
-        outcomes.append(outcome)
-        print(f"{i:3} {mutation.name}: {outcome.kind} {outcome.text}, {outcome.seconds:.0f} s", flush=True)
-
-    with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
-        list(pool.map(run, mutations))
-    kinds = [outcome.kind for outcome in outcomes]
-    counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in ("killed", "survived", "not tested"))
-    print(f"{counts}; {sum(outcome.seconds for outcome in outcomes):.0f} s of processor time")
+    cache, found = os.environ.get(CACHE) or str(Path(tempfile.gettempdir()) / "jaxkane-mutation-programs"), []
+    for i, m in mutations:
+        found.append(outcome(m, options.all, cache))
+        print(f"{i:3} {m.name}: {found[-1]}", flush=True)
+    print(f"{sum(text.startswith('killed') for text in found)} of {len(found)} mutations are found")
 
 
 if __name__ == "__main__":

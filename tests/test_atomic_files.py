@@ -7,28 +7,15 @@ import re
 
 import numpy as np
 import pytest
-from mechanisms import moved
+from mechanisms import Sled, moved
 
 import jaxkane as jk
-
-
-class Weight(jk.System):
-    """A particle that falls."""
-
-    coordinates, speeds = ("x",), ("v",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="weight")])
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, 9.81 * motion.N.x)
 
 
 @pytest.fixture(scope="module")
 def animation():
     t = np.linspace(0.0, 0.5, 6)
-    return jk.animate(Weight(), moved(Weight(), t, 4.905 * t[:, None] ** 2, 9.81 * t[:, None]))
+    return jk.animate(Sled(), moved(Sled(), t, 4.905 * t[:, None] ** 2, 9.81 * t[:, None]))
 
 
 def full(*args):
@@ -100,7 +87,7 @@ def test_temporary_files_of_a_killed_writer_are_removed_by_the_next_write(animat
 def test_pictures_and_exports_replace_files_atomically(animation, tmp_path, monkeypatch):
     writers = {
         "ride.gif": lambda path: animation.save(path, size=(40, 30), fps=5),
-        "weight.c": lambda path: jk.export.c(Weight(), path, ("rates",)),
+        "weight.c": lambda path: jk.export.c(Sled(), path, ("rates",)),
     }
     for name, write in writers.items():
         (tmp_path / name).write_bytes(b"old")

@@ -7,57 +7,16 @@ import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
-from benchmarks import _peers, assemblies, chain, first_calls
+from benchmarks import _peers, assemblies, chain
 from benchmarks._figures import Figure, digits, line
 from benchmarks._picture import draw, times_faster
 from benchmarks._process import child
 from benchmarks._report import Results, markdown
-from benchmarks._timing import in_turns
 
 ROOT = Path(__file__).parents[1]
 CHAIN = chain.Chain(n=4)
-
-
-def rotation(axis, angle):
-    """exp(angle [axis]x), Rodrigues."""
-    K = np.cross(np.eye(3), axis)
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
-
-
-def joint_torques(system, q, u, u_dot):
-    """Newton's and Euler's equations link by link, in the inertial frame: what the joints would have to give."""
-    axes = np.eye(3)
-    R, w, alpha, a = np.eye(3), np.zeros(3), np.zeros(3), np.array([0.0, 0.0, float(system.gravity)])
-    I, m, l = np.diag([float(x) for x in system.inertia]), float(system.mass), float(system.length)
-    links = []
-    for i in range(system.n):
-        axis = R @ axes[i % 2]
-        R = R @ rotation(axes[i % 2], q[i])
-        alpha = alpha + axis * u_dot[i] + np.cross(w, axis * u[i])
-        w = w + axis * u[i]
-        down = R @ np.array([0.0, 0.0, -l])
-        a_center, a = (a + np.cross(alpha, r) + np.cross(w, np.cross(w, r)) for r in (down / 2, down))
-        J = R @ I @ R.T
-        links.append((axis, down, m * a_center, J @ alpha + np.cross(w, J @ w)))
-    force, moment, torques = np.zeros(3), np.zeros(3), []
-    for axis, down, F, T in reversed(links):
-        moment = moment + np.cross(down, force) + np.cross(down / 2, F) + T
-        force = force + F
-        torques.append(axis @ moment)
-    return np.array(torques)
-
-
-@pytest.mark.slow
-def test_joint_torques_of_a_freely_moving_chain_are_zero():
-    rtol = 1e-12
-    q, u = chain.states(CHAIN.n, 3)
-    u_dot = chain.accelerations_by_jaxkane(CHAIN, q, u)
-    for state in zip(q, u, u_dot):
-        held = joint_torques(CHAIN, *state[:2], np.zeros(CHAIN.n))
-        assert np.abs(joint_torques(CHAIN, *state)).max() < rtol * np.abs(held).max()
 
 
 @pytest.mark.parametrize("peer", ["mujoco", "pinocchio"])
@@ -143,29 +102,6 @@ def test_the_table_has_parallel_columns_and_keeps_local_measurements(tmp_path):
     assert not draw([], tmp_path / "speed.png")
 
 
-def test_compared_functions_are_timed_alternately():
-    order = []
-    best = in_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, seconds=0.0, rounds=2)
-    assert order == ["a", "b"] * 3  # once to warm up, and two rounds
-    assert set(best) == {"a", "b"}
-    assert all(0 <= seconds < 1 for seconds in best.values())
-
-
 def test_a_failed_child_process_reports_the_reason():
     with pytest.raises(RuntimeError, match="No module named no_such_module"):
         list(child("no_such_module"))
-
-
-@pytest.mark.weekly
-def test_the_baseline_of_first_calls_solves_its_equation():
-    rtol = 1e-7
-    slopes = first_calls.floor("sensitivities", samples=3, parameters=4)()
-    np.testing.assert_allclose(slopes, np.full(4, -5 * np.exp(-5) / 4), rtol=rtol)  # y = exp(-k t), k their mean
-    for call, shape in {"simulate": (3, 11), "gradient": (4,), "sweep": (first_calls.MEMBERS, 3, 11)}.items():
-        assert jax.eval_shape(first_calls.floor(call, samples=3, parameters=4)).shape == shape
-
-
-def test_overlapping_intervals_of_first_calls_are_counted_once():
-    assert first_calls.union([(5.0, 6.0), (1.0, 3.0), (2.0, 4.0), (1.5, 2.0)]) == 4.0
-    seconds = {"floor": 2.0, "native": 3.0, "XLA alone": 7.0}
-    assert first_calls.row("sweep", seconds) == "| sweep | 2 s | 3 s | 1.5 | 7 s | 3.5 |"

@@ -24,7 +24,7 @@ def assert_equal(whole, parts):
 
 
 def test_matrix_products_in_user_code_are_correct_in_large_batches():
-    """As a user writes them. See `jaxkane._scalarjit.compat.switch_off_wrong_fusions`."""
+    """As a user writes them. See `switch_off_wrong_fusions` of the compiler."""
     turn, rows = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.5], [0.0, 0.0, 1.0]]), np.arange(3.0 * N).reshape(N, 3)
     squares = jax.jit(jax.vmap(lambda row: jnp.sum((turn @ row) ** 2)))(rows)
     np.testing.assert_allclose(squares, np.sum((rows @ turn.T) ** 2, axis=1), rtol=1e-12)

@@ -8,27 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import Pendulum
 
 import jaxkane as jk
 from jaxkane.joints import Actuator, Coupling, Link, Loop, Site, hinge, mechanism
 
 TS = jnp.linspace(0.0, 0.2, 3)
 BAR = {"mass": 1.0, "center": (0.5, 0.0, 0.0), "inertia": (0.01, 0.1, 0.1)}
-
-
-class Pendulum(jk.System):
-    mass: jk.Scalar = jk.parameter(2.0)
-    coordinates = ("angle",)
-    speeds = ("rate",)
-    inputs = ("torque",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        L = N.rotate(3, q["angle"], u["rate"], "L")
-        return jk.Motion([jk.Body(self.mass, 0.0, O.fixed(-1.0 * L.y), name="bob")], frames={"L": L})
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -9.81 * motion.N.y)
 
 
 def fresh():
@@ -40,7 +26,7 @@ def acceleration(system, q=(0.3,), u=(0.5,)):
     return float(jk.accelerations(system, 0.0, jnp.array(q), jnp.array(u))[0])
 
 
-# What is set on a class that stands already.
+# Methods and names that are assigned to a class.
 
 
 def damped(self, t, q, u, motion, inputs):
@@ -102,11 +88,7 @@ def test_names_and_units_assigned_to_a_class_are_checked():
         ({"angle": None}, TypeError, r"'angle', got None"),
         ({3: "rad"}, TypeError, r"got 3"),
         (["angle"], TypeError, r"must be a dict of strings by name.*got \['angle'\]"),
-        (
-            {"angel": "rad"},
-            ValueError,
-            r"not a coordinate, speed, input or state: angel; did you mean 'angle'",
-        ),
+        ({"angel": "rad"}, ValueError, r"not a coordinate, speed, input or state: angel; did you mean 'angle'"),
     ],
 )
 def test_invalid_units_raise(units, error, match):
@@ -125,7 +107,7 @@ def test_inherited_units_may_contain_additional_names():
 KEPT = {}
 
 
-def saveat_and_adjoint(part):
+def keeping(part):
     """A description that holds on to a part of its motion."""
 
     def motion(self, t, q, u):
@@ -150,7 +132,7 @@ def saveat_and_adjoint(part):
 @pytest.mark.parametrize("part", ["motion", "center", "number", "loads", "rates"])
 def test_stored_results_of_an_earlier_call_are_rejected(part):
     KEPT.clear()
-    pendulum = saveat_and_adjoint(part)()
+    pendulum = keeping(part)()
     with pytest.raises(TypeError, match=r"Keeping: its description returns .* of an earlier call, which it has stored"):
         [acceleration(pendulum, q=(angle,)) for angle in (0.3, 0.4)]
     with pytest.raises(TypeError, match=r"Keeping: its description returns .* of an earlier call, which it has stored"):
@@ -160,7 +142,7 @@ def test_stored_results_of_an_earlier_call_are_rejected(part):
 def test_a_stored_motion_of_plain_numbers_is_rejected():
     """Which would be a motion that does not depend on the coordinates."""
     KEPT.clear()
-    pendulum = saveat_and_adjoint("motion")()
+    pendulum = keeping("motion")()
     pendulum.motion(0.0, [0.3], [0.1])
     with pytest.raises(TypeError, match=r".* of an earlier call, which it has stored"):
         pendulum.motion(0.0, [0.4], [0.1])
@@ -184,14 +166,9 @@ def test_a_parameter_change_that_prevents_loop_closure_is_rejected():
     system = four_bar(jnp.zeros(()))
     broken = system.replace({"site.ground.y": 0.1})
     state = jk.assemble(system, {"q1": 0.9})
-    match = (
-        r"Mechanism: the configuration constraints can be met, but the constraints implied by them are violated by 0.1"
-    )
-    with pytest.raises(ValueError, match=match):
+    with pytest.raises(ValueError, match=r"can be met, but the constraints implied by them are violated by 0.1"):
         jk.assemble(broken, {"q1": 0.9})
-    with pytest.raises(
-        ValueError, match=r"a condition that the configuration constraints imply is violated by \[-?0.1"
-    ):
+    with pytest.raises(ValueError, match=r"the configuration constraints imply is violated by \[-?0.1"):
         jk.simulate(broken, state, TS)
 
     found = jax.jit(lambda y: jk.assemble(system.replace({"site.ground.y": y}), {"q1": 0.9}).q)
@@ -241,24 +218,6 @@ def test_reading_a_structural_zero_raises_an_explanation():
 # Times and tables.
 
 
-@pytest.mark.parametrize(
-    ("t", "error", "match"),
-    [
-        (float("nan"), ValueError, "the time t = nan is not finite"),
-        (None, TypeError, r"the time `t` must be one number, got None"),
-        (1j, TypeError, r"the time `t` must be one number"),
-    ],
-)
-def test_the_time_passed_to_assemble_must_be_a_number(t, error, match):
-    with pytest.raises(error, match=f"Pendulum: {match}"):
-        jk.assemble(Pendulum(), {}, t=t)
-
-
-def test_a_table_of_labels_alone_is_refused():
-    with pytest.raises(ValueError, match=r"columns of `table` \(label\) are text. .* all members would be equal"):
-        jk.sweep.sweep(Pendulum(), jk.State([0.1], [0.0]), TS, table={"label": ["a", "b"]})
-
-
 def test_named_parameters_are_a_pytree_like_a_dict():
     arm = mechanism([Link("a", joints=hinge("q", damping=0.1), **BAR)])
     doubled = jax.tree.map(lambda x: 2.0 * x, arm.center)
@@ -275,17 +234,9 @@ def test_named_parameters_are_a_pytree_like_a_dict():
 @pytest.mark.parametrize(
     ("element", "error", "match"),
     [
-        (
-            lambda A, O: jk.loads.coulomb(0.1, 1.0, width=0.0),
-            ValueError,
-            "of the smoothing must be positive, got 0.0",
-        ),
-        (lambda A, O: jk.loads.drag(O, 1.0, speed=-1), ValueError, "of the smoothing must be positive, got -1"),
+        (lambda A, O: jk.loads.coulomb(0.1, 1.0, width=0.0), ValueError, "smoothing must be positive, got 0.0"),
         (lambda A, O: jk.loads.dead_zone(0.1, 0.2, -0.2), ValueError, r"got 0.2 and -0.2. `lower` must be less"),
         (lambda A, O: jk.loads.dead_zone(0.1, -np.inf, 0.2), ValueError, r"got -inf and 0.2.*Pass None"),
-        (lambda A, O: jk.loads.rotor(1.0, (1, 0, 0), 1.0, A, O), TypeError, r"the axis is a Vector such as A.x"),
-        (lambda A, O: jk.loads.rotor(1.0, A.x, 1.0, "A", O), TypeError, r"the carrier is a Frame or a Body, got 'A'"),
-        (lambda A, O: jk.loads.rotor(1.0, A.x, 1.0, A, "O"), TypeError, r"the mass centre of 'rotor' is a Point"),
         (
             lambda A, O: jk.loads.rotor(1.0, A.x, 1.0, jk.Body(1.0, 0.0, O, name="dot"), O),
             ValueError,
@@ -359,25 +310,14 @@ def test_non_numeric_values_are_rejected_in_a_simulation(wrong):
         ("'torque'", lambda: simulate(start, TS, {"torque": lambda t, state: value})),
         ("'torque'", lambda: simulate(start, TS, lambda t, state: {"torque": value})),
         ("function of the inputs", lambda: simulate(start, TS, lambda t, state: value)),
-        ("`stabilize`", lambda: simulate(start, TS, stabilize=value)),
-        ("state", lambda: simulate(value, TS)),
         (r"state\.q", lambda: simulate(jk.State({"angle": value}, [0.5]), TS)),
         ("instance of a System", lambda: jk.simulate(value, start, TS)),
-        ("instance of a System", lambda: jk.accelerations(value, 0.0, [0.3], [0.5])),
-        ("instance of a System", lambda: jk.assemble(value, [0.3])),
     ]
     if wrong != "three numbers":
         cases += [
-            ("`ts`", lambda: simulate(start, value)),
             ("'torque'", lambda: simulate(start, TS, {"torque": value})),
             ("values", lambda: jk.Samples([0.0, 1.0], value)),
-            ("ts", lambda: jk.Samples(value, [0.0, 1.0])),
         ]
-    if value is not None:
-        cases += [
-            (f"`{name}`", lambda name=name: simulate(start, TS, **{name: value})) for name in ("rtol", "atol", "step")
-        ]
-        cases += [("`max_steps`", lambda: simulate(start, TS, max_steps=value))]
     for label, call in cases:
         with pytest.raises((TypeError, ValueError), match=label) as caught:
             call()
@@ -410,38 +350,15 @@ def parts():
         (lambda N, O, P, B: jk.rotations.euler_parameter_norm(jnp.ones(7)), "Euler parameters are four numbers"),
         (lambda N, O, P, B: jk.rotations.of_rotation_vector((1.0, 2.0)), "three components, got 2"),
         (lambda N, O, P, B: jk.rotations.angle_rates("1-2", (1.0, 2.0), (1.0, 2.0, 3.0)), "a sequence of three axes"),
-        (lambda N, O, P, B: jk.Body("m", 0.0, O), "must be one number, got 'm'"),
-        (lambda N, O, P, B: jk.Body(1.0, "abc", O, N), "three principal moments or a .* matrix, got 'abc'"),
-        (lambda N, O, P, B: jk.Body(1.0, 0.0, O, name=3), "the name must be a string, got 3"),
-        (lambda N, O, P, B: jk.Motion(3.0), r"the bodies must be a list, got 3\.0"),
-        (lambda N, O, P, B: jk.Motion([jk.Body(1.0, 0.0, O)], None), "the constraints must be a list, got None"),
-        (lambda N, O, P, B: jk.Motion([jk.Body(1.0, 0.0, O)], points=[O]), "the points must be a dict by name"),
-        (lambda N, O, P, B: jk.weight(3.0, N.x), r"must be a Motion, got 3\.0"),
         (lambda N, O, P, B: jk.parameter(shape=3), "the shape must be a tuple"),
-        (lambda N, O, P, B: jk.loads.spring(3.0, P, 1.0), r"Pass a Point or a Body, got 3\.0"),
         (lambda N, O, P, B: jk.loads.damper(O, P, "c"), "must be one number, got 'c'"),
-        (lambda N, O, P, B: jk.loads.actuator(O, P, "F"), "must be one number, got 'F'"),
-        (
-            lambda N, O, P, B: jk.loads.torsional_damper(O, None, N.z, 1.0),
-            "A hinge connects Frames or Bodies, got Point",
-        ),
-        (lambda N, O, P, B: jk.loads.torsional_damper(B, None, 3, 1.0), "needs a Vector such as .* got 3"),
-        (lambda N, O, P, B: jk.loads.drag(P, "c"), "must be one number, got 'c'"),
+        (lambda N, O, P, B: jk.loads.torsional_damper(O, None, N.z, 1.0), "connects Frames or Bodies, got Point"),
         (lambda N, O, P, B: jk.loads.stribeck(1.0, 1.0, 2.0, -0.1), r"`falloff` must be positive, got -0\.1"),
         (lambda N, O, P, B: jk.loads.dc_motor(1.0, 1.0, 1.0, 0.0), r"the resistance must be positive, got 0\.0"),
         (lambda N, O, P, B: jk.sensors.gyroscope(O), "The frame of a sensor must be a Frame, got Point"),
-        (lambda N, O, P, B: jk.sensors.marker(3.0, O, N), "Pass a Point or a Body"),
         (lambda N, O, P, B: jk.sensors.low_pass(1.0, 1.0, -0.1), r"the time constant must be positive, got -0\.1"),
         (lambda N, O, P, B: jk.sensors.delayed(1.0, (1.0, 2.0), -1.0), r"the delay must be positive, got -1\.0"),
         (lambda N, O, P, B: jk.sensors.encoder(1.0, resolution=0.0), r"the resolution must be positive, got 0\.0"),
-        (lambda N, O, P, B: hinge("h", "z"), "The axis of 'h' must be finite numbers, got 'z'"),
-        (lambda N, O, P, B: hinge("h", reference=np.nan), "The reference of 'h' must be finite numbers"),
-        (lambda N, O, P, B: mechanism([Link("a", joints=3, **BAR)]), "a Joint or a list of Joints, got 3"),
-        (lambda N, O, P, B: mechanism([Link("a", joints=hinge("h"), **BAR)], name=3), "`name` must be a string, got 3"),
-        (
-            lambda N, O, P, B: mechanism([Link("a", joints=hinge("h"), **BAR | {"mass": "m"})]),
-            "a real number .* got 'm'",
-        ),
         (
             lambda N, O, P, B: mechanism([Link("a", joints=hinge("h"), **BAR)], loops=[Coupling("h", None, ())]),
             "at least one number, got none",

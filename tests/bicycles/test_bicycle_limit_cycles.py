@@ -1,6 +1,5 @@
 """Limit cycles of a motorcycle with tyres that saturate: weave and wobble, from the Hopf points of straight running."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -53,35 +52,11 @@ def test_weave_and_wobble_have_limit_cycles():
 
 
 def check(orbit):
-    """The orbit repeats itself in a simulation, and its multipliers are those of finite differences."""
-    rtol, atol, multiplier_atol, size = 1e-7, 1e-9, 1e-5, 1e-5
-    system, period = orbit.system, orbit.period
-
-    @jax.jit
-    def end(q, u, x, periods):
-        ts = jnp.linspace(0.0, periods * period, 21)
-        ride = jk.simulate(system, jk.State(q, u, x), ts, rtol=1e-11, atol=1e-11, max_steps=100_000)
-        return ride.end
-
-    start = orbit.state
+    """The orbit repeats itself in a simulation."""
+    rtol, atol, system, start = 1e-7, 1e-9, orbit.system, orbit.state
+    ts = jnp.linspace(0.0, 4.0 * orbit.period, 21)
+    later = jk.simulate(system, start, ts, rtol=1e-11, atol=1e-11, max_steps=100_000).end
     drifts = [i for i, name in enumerate(system.coordinates) if name not in ("roll", "steer", "pitch")]
-    later = end(start.q, start.u, start.x, 4.0)
     np.testing.assert_allclose(np.delete(later.q, drifts), np.delete(start.q, drifts), rtol=rtol, atol=atol)
     np.testing.assert_allclose(later.u, start.u, rtol=rtol, atol=atol)
     np.testing.assert_allclose(later.x, start.x, rtol=rtol, atol=atol)
-
-    # The pitch follows from roll and steer.
-    steer = system.coordinates.index("steer")
-
-    def after(z):
-        state = jk.assemble(system, {"roll": z[0], "steer": z[1]})
-        later = end(state.q, z[2 : 2 + len(start.u)], z[2 + len(start.u) :], 1.0)
-        return np.concatenate([[later.q[0], later.q[steer]], later.u, later.x])
-
-    z = np.concatenate([[start.q[0], start.q[steer]], start.u, start.x])
-    steps = np.eye(len(z)) * size
-    matrix = np.stack([(after(z + h) - after(z - h)) / (2 * size) for h in steps], axis=1)
-    found = np.linalg.eigvals(matrix)
-    expected = np.append(np.asarray(orbit.multipliers), 1.0)  # the last one is trivial
-    for value in expected:
-        np.testing.assert_allclose(np.min(np.abs(found - value)), 0.0, atol=multiplier_atol)

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -26,7 +25,6 @@ from jaxkane.bicycles import (
     Road,
     ScheduledGains,
     Slope,
-    SteerByWire,
     SteeringMotor,
     Trailer,
     Tyre,
@@ -45,6 +43,8 @@ TRAILER = Trailer(
     hitch_x=-0.1, hitch_z=-0.5, length=1.2, wheel_radius=0.25, mass=20.0, center=0.1, height=0.2, Ixx=1.0, Iyy=1.0,
     Izz=1.2,
 )  # fmt: skip
+CONTROLLED = BENCHMARK.with_parts(control=LeanSteerGains())
+SCHEDULED = ScheduledGains([4.0], "rol", [[1.0]], [1.0])
 GAINS = LeanSteerGains(roll=-50.0, steer=35.0, roll_rate=-13.0, steer_rate=3.5, command="steer_command")
 
 
@@ -62,37 +62,17 @@ class Aside(Part):
 @pytest.mark.parametrize(
     ("made", "error", "words"),
     [
-        (
-            lambda: BENCHMARK.with_parts(rear_tyre=LateralSlip(9e3)),
-            TypeError,
-            "`rear_tyre` must be a Tyre, got a Later",
-        ),
+        (lambda: BENCHMARK.with_parts(rear_tyre=LateralSlip(9e3)), TypeError, "`rear_tyre` must be a Tyre"),
         (lambda: BENCHMARK.with_parts(extra=[HeadTwist(1e3)]), ValueError, r"with_parts\(head="),
         (lambda: BENCHMARK.with_parts(extra=[ARMS, RIDER]), ValueError, "before them has shoulders"),
         (lambda: BENCHMARK.with_parts(extra=[Aside()]), ValueError, "Aside.lateral: Bicycle has no lean"),
         (lambda: BENCHMARK.with_parts(front_tyre=Tyre(crown=0.35)), ValueError, r"front_tyre\.crown = 0\.35 m"),
-        (
-            lambda: BENCHMARK.with_parts(road=Road(lambda x, y: 0.0), extra=[TRAILER]),
-            ValueError,
-            "cannot be used on a Road",
-        ),
-        (lambda: Tyre(lateral=9e3), TypeError, "law of lateral slip or None, got 9000.0"),
+        (lambda: BENCHMARK.with_parts(road=Road(lambda x, y: 0.0), extra=[TRAILER]), ValueError, "be used on a Road"),
         (lambda: Tyre(lateral=LongitudinalSlip(1e4)), TypeError, "got a LongitudinalSlip"),
-        (lambda: Tyre(longitudinal=LateralSlip(1e4)), TypeError, "got a LateralSlip"),
-        (lambda: LateralSlip(None), TypeError, "cornering_stiffness must be a real number"),
-        (lambda: LeaningRider(*np.ones(9), stiffness=None), TypeError, "stiffness must be a real number"),
         (lambda: Named(), TypeError, r"must be a tuple of names, .* got 'drop'"),
         (lambda: separate_rider(BENCHMARK.with_parts(rider=RIDER), RIDER), ValueError, "already has a separate rider"),
-        (
-            lambda: scheduled_lqr(BENCHMARK.with_parts(control=LeanSteerGains()), [4.0], np.ones(4), 0.1),
-            ValueError,
-            "already has a cont",
-        ),
-        (
-            lambda: BENCHMARK.with_parts(control=ScheduledGains([4.0], "rol", [[1.0]], [1.0])),
-            ValueError,
-            "Bicycle has no rol; did you mean 'roll'",
-        ),
+        (lambda: scheduled_lqr(CONTROLLED, [4.0], np.ones(4), 0.1), ValueError, "already has a cont"),
+        (lambda: BENCHMARK.with_parts(control=SCHEDULED), ValueError, "no rol; did you mean 'roll'"),
     ],
 )
 def test_incompatible_parts_are_rejected_on_assembly(made, error, words):
@@ -113,38 +93,23 @@ def changed(part, **more):
     ("made", "words"),
     [
         (lambda: Slope(10.0), r"Slope\.angle = 10 rad must lie between -1\.57 and 1\.57 rad\. In degrees\?"),
-        (lambda: Slope(np.pi / 2), r"Slope\.angle = 1\.5708 rad"),
-        (lambda: Slope(0.1, towards=90.0), r"Slope\.towards = 90 rad .* In degrees\?"),
         (lambda: BENCHMARK.with_parts(zB=0.9), r"Bicycle\.zB = 0\.9 m must lie .* With the other sign\?"),
-        (lambda: BENCHMARK.with_parts(zH=0.7), r"Bicycle\.zH = 0\.7 m .* With the other sign\?"),
         (lambda: BENCHMARK.with_parts(lam=18.0), r"Bicycle\.lam = 18 rad .* In degrees\?"),
         (lambda: BENCHMARK.with_parts(c=80.0), r"Bicycle\.c = 80 m .* In millimetres\?"),
-        (lambda: BENCHMARK.with_parts(rF=350.0), r"Bicycle\.rF = 350 m .* In millimetres\?"),
         (lambda: BENCHMARK.with_parts(w=-1.0), r"Bicycle\.w = -1\.0 must be positive"),
-        (lambda: BENCHMARK.with_parts(mB=-1.0), r"Bicycle\.mB = -1\.0 must be positive"),
         (lambda: BENCHMARK.with_parts(g=-9.81), r"Bicycle\.g = -9\.81 m/s\^2 .* With the other sign\?"),
         (lambda: jk.catalog.WhippleBicycle.from_parameters(PLAIN | {"zB": 0.9}), r"WhippleBicycle\.zB = 0\.9 m"),
-        (lambda: changed(RIDER, z=1.0), r"RigidRider\.z = 1 m .* With the other sign\?"),
         (lambda: changed(RIDER, mass=800.0), r"RigidRider\.mass = 800 kg .* In newtons\?"),
         (lambda: changed(RIDER, shoulder=[330.0, 200.0, -1470.0]), r"RigidRider\.shoulder = .* In millimetres\?"),
         (lambda: LeaningRider(**LEANING | {"hinge_z": 0.8}), r"LeaningRider\.hinge_z = 0\.8 m .* other sign\?"),
-        (lambda: LeaningRider(**LEANING, hinge_tilt=10.0), r"LeaningRider\.hinge_tilt = 10 rad .* In degrees\?"),
         (lambda: Arms.of_person(83.5, 183.0, grip=[0.55, 0.28, -1.05]), r"Arms\.upper_length = 34\.038 m"),
         (lambda: changed(TRAILER, hitch_z=0.5), r"Trailer\.hitch_z = 0\.5 m .* With the other sign\?"),
-        (lambda: changed(TRAILER, height=-0.2), r"Trailer\.height = -0\.2 m .* With the other sign\?"),
         (lambda: HeadTwist(1e3, height=400.0), r"HeadTwist\.height = 400 m .* In millimetres\?"),
-        (lambda: SteerByWire(**BAR | {"z": 1.0}), r"SteerByWire\.z = 1 m .* With the other sign\?"),
-        (lambda: Drag(height=-1.1), r"Drag\.height = -1\.1 m"),
         (lambda: ConstantSpeed(250.0), r"ConstantSpeed\.speed = 250 m/s .* In km/h\?"),
         (lambda: SteeringMotor(lag=20.0), r"SteeringMotor\.lag = 20 s .* In milliseconds\?"),
-        (lambda: SteeringMotor(delay=30.0), r"SteeringMotor\.delay = 30 s .* In milliseconds\?"),
         (lambda: Tyre(rolling_resistance=-0.005), r"Tyre\.rolling_resistance = -0\.005 must .* With the other sign\?"),
-        (lambda: Tyre(rolling_resistance=5.0), r"Tyre\.rolling_resistance = 5 must lie between 0 and 1"),
-        (lambda: Tyre(load_lag=20.0), r"Tyre\.load_lag = 20 s"),
         (lambda: LateralSlip(9e3, relaxation_length=100.0), r"LateralSlip\.relaxation_length = 100 m .* In milli"),
-        (lambda: LateralSlip(9e3, pneumatic_trail=30.0), r"LateralSlip\.pneumatic_trail = 30 m"),
         (lambda: MagicFormula(14.0, friction=700.0), r"MagicFormula\.friction = 700 must lie between 0 and 10"),
-        (lambda: MagicFormula(14.0, shape=13.0), r"MagicFormula\.shape = 13 must lie between 0 and 3"),
         (lambda: changed(schwalbe_energizer(), largest_slip=10.0), r"largest_slip = 10\.0 rad .* In degrees\?"),
         (lambda: PathFollower(LaneChange(), limit=17.0), r"PathFollower\.limit = 17 rad .* In degrees\?"),
     ],
@@ -166,10 +131,6 @@ def test_a_batch_member_with_an_implausible_parameter_has_status_invalid():
     "ask",
     [
         lambda bicycle: jk.accelerations(bicycle, 0.0, jnp.zeros(8), jnp.zeros(5)),
-        pytest.param(
-            lambda bicycle: jk.simulate(bicycle, straight_ahead(bicycle, 5.0), jnp.array([0.0, 0.1])),
-            marks=pytest.mark.weekly,
-        ),
         lambda bicycle: linearize(bicycle, straight_ahead(bicycle, 5.0), states=bicycle.lateral),
     ],
 )
@@ -184,22 +145,9 @@ def test_a_load_beyond_the_measured_range_is_reported_with_the_tyre(ask):
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        (
-            {"rider": (LeaningRider(**LEANING), LeaningRider(**LEANING))},
-            r"'rider_lean' .* in rider\[0\], .* rider\[1\]",
-        ),
-        (
-            {"rider": RIDER, "extra": [RIDER]},
-            r"extra\[0\], a RigidRider: .* point with the name 'left_shoulder'.*write your own Part",
-        ),
-        (
-            {"extra": [TRAILER, TRAILER]},
-            r"'trailer_angle' appears twice in `coordinates`: in extra\[0\], a Trailer and in extra\[1\], a T",
-        ),
-        (
-            {"control": (LeanSteerGains(), LeanSteerGains())},
-            r"'desired_roll' .* in control\[0\], a LeanSteerGains and",
-        ),
+        ({"rider": (LeaningRider(**LEANING),) * 2}, r"'rider_lean' .* in rider\[0\], .* rider\[1\]"),
+        ({"rider": RIDER, "extra": [RIDER]}, r"extra\[0\], a RigidRider: .*'left_shoulder'.*write your own Part"),
+        ({"control": (LeanSteerGains(), LeanSteerGains())}, r"'desired_roll' .* in control\[0\], a LeanSteerGains"),
         ({"drive": (Drag(), Drag())}, r"drive\[1\], a Drag: .* point with the name 'center of drag'"),
     ],
 )
@@ -207,15 +155,6 @@ def test_two_parts_of_the_same_kind_are_rejected(parts, words):
     """Their values would have one name."""
     with pytest.raises(ValueError, match=words):
         jk.accelerations(BENCHMARK.with_parts(**parts), 0.0, jnp.zeros(8), jnp.zeros(3))
-
-
-@pytest.mark.slow
-def test_separate_rider_rejects_a_remaining_frame_with_invalid_inertia():
-    """Here the moments of inertia would be 0.54, 7.82 and 8.86 kg m^2."""
-    with pytest.raises(ValueError, match=r"cannot include the rider's body\. Without it: .*triangle inequality"):
-        separate_rider(BENCHMARK, LeaningRider(**LEANING | {"Iyy": 1.2}))
-    rest = separate_rider(BENCHMARK, LeaningRider(**LEANING))
-    assert jnp.isfinite(jk.accelerations(rest, 0.0, jnp.zeros(9), jnp.zeros(4))).all()
 
 
 @pytest.mark.slow
@@ -234,13 +173,6 @@ def test_a_parameter_of_a_part_has_the_same_name_everywhere():
                 ask(bicycle, wrong)
     with pytest.raises(ValueError, match=r"Trailer\.mass = -1\.0 must be positive"):
         bicycle.with_parts(**{name: -1.0})
-
-
-@pytest.mark.weekly
-def test_a_sweep_table_can_name_a_parameter_of_a_part():
-    bicycle = BENCHMARK.with_parts(extra=[TRAILER])
-    swept = sweep(bicycle, jk.assemble(bicycle, {}), jnp.array([0.0, 0.01]), table={"extra[0].mass": [20.0, 30.0]})
-    assert swept.counts == {"completed": 2}
 
 
 def test_arms_can_be_passed_in_the_rider_field():
@@ -347,10 +279,7 @@ def test_implausible_units_in_files_are_rejected(suffix, tmp_path):
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        (
-            {"steering": SteeringMotor(lag=0.1)},
-            "steer_motor_torque, but the canonical equations contain only roll and steer",
-        ),
+        ({"steering": SteeringMotor(lag=0.1)}, "steer_motor_torque, but the canonical equations contain only roll"),
         (
             {"control": ScheduledGains([2.0, 4.0], ["roll"], [[-20.0], [-10.0]], [-20.0, -10.0])},
             "contain terms of the speed other",
@@ -360,10 +289,3 @@ def test_implausible_units_in_files_are_rejected(suffix, tmp_path):
 def test_canonical_matrices_are_rejected_if_they_omit_terms_of_the_parts(parts, words):
     with pytest.raises(ValueError, match=words):
         canonical(BENCHMARK.with_parts(**parts))
-
-
-def test_parts_can_be_combined_under_jit():
-    thick = jax.jit(
-        lambda x: BENCHMARK.with_parts(rear_tyre=Tyre(crown=0.02), front_tyre=Tyre(crown=x)).front_tyre.crown
-    )
-    assert thick(0.03) == 0.03

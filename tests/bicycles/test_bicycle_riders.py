@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from mechanisms import moved
-from programs import operations
 
 import jaxkane as jk
 from jaxkane import Status
@@ -17,7 +16,6 @@ from jaxkane.bicycles import (
     Arms,
     Bicycle,
     LeaningRider,
-    Part,
     RigidRider,
     Trailer,
     Tyre,
@@ -75,29 +73,6 @@ def test_the_linear_model_with_a_leaning_rider_agrees_with_bicycle_parameters(tm
         found = np.linalg.eigvals(found)
         for value in np.array(values) @ [1.0, 1.0j]:
             assert np.abs(found - value).min() < 1e-9
-
-
-@pytest.mark.weekly
-def test_rider_feedback_agrees_with_bicycle_parameters():
-    """1e-9 asked. T = -K x, with the torques of roll and steer."""
-
-    class Feedback(Part):
-        gains: jax.Array
-
-        def commands(self, bicycle, t, q, u, motion, values):
-            x = (q["roll"], q["steer"], u["roll_rate"], u["steer_rate"])
-            torques = [-sum(k * y for k, y in zip(row, x, strict=True)) for row in self.gains]
-            return dict(zip(("roll_torque", "steer_torque"), torques, strict=True))
-
-    known = LITERATURE["feedback"]
-    gains = jnp.array(
-        [[known["gains"][f"kT{of}_{x}"] for x in ("phi", "del", "phid", "deld")] for of in ("phi", "del")]
-    )
-    values = {name: x for name, x in known["parameters"].items() if name != "v"}
-    bicycle = Bicycle.from_parameters({**values, "control": Feedback(gains)})
-    A, B = linear_models(bicycle, LITERATURE["speeds"], ("roll", "steer", "roll_rate", "steer_rate"))
-    np.testing.assert_allclose(A, known["A"], rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(B[..., [0, 2]], known["B"], rtol=1e-12, atol=1e-13)
 
 
 def assembled(model):
@@ -363,30 +338,3 @@ def test_the_energy_balance_of_a_rider_with_arms_holds():
     ride = jk.simulate(bicycle, start, jnp.linspace(0.0, 0.3, 61), torque, rtol=1e-11, atol=1e-11)
     audit = jk.audit(bicycle, ride)
     assert abs(float(audit.energy_balance)) < 1e-9
-
-
-@pytest.mark.weekly
-def test_parameters_of_a_rider_can_be_exported_and_fitted(tmp_path):
-    """The stiffness of a hinge is found to three standard errors from a ride with noise, begun 20 % off."""
-    truth = browser_jason(stiffness=128.0, damping=50.0)
-    start = jk.assemble(truth, {"rider_lean": 0.1}, {"rear_wheel_rate": -6.0 / truth.rR})
-    ts = jnp.linspace(0.0, 1.5, 151)
-    ride, rng = jk.simulate(truth, start, ts), np.random.default_rng(0)
-    channels = {name: np.array(ride[name]) + 1e-3 * rng.normal(size=151) for name in ("roll", "steer", "rider_lean")}
-    initial = dict(zip((*truth.coordinates, *truth.speeds), map(float, (*start.q, *start.u)), strict=True))
-    trial = jk.fit.Trial(ts, channels, sigma=1e-3, initial=initial)
-    guess = browser_jason(stiffness=1.2 * 128.0, damping=0.8 * 50.0)
-    free = ("rider.stiffness", "rider.damping")
-    found = jk.fit.fit(guess, trial, free, optimizer=jk.fit.LeastSquares())
-    for name, value in zip(free, (128.0, 50.0), strict=True):
-        assert abs(found.estimates[name] - value) < 3 * found.standard_errors[name], name
-    written = jk.export.c(truth, tmp_path / "rider.c", ("rates",))
-    assert "rider_stiffness" in written.header.read_text()
-
-
-@pytest.mark.slow
-def test_a_bicycle_with_arms_is_one_program_of_scalars():
-    """About 6500 operations, against 2000 of the bicycle alone: the loops are solved block by block."""
-    bicycle = with_arms()
-    q, u = jnp.full(len(bicycle.coordinates), 0.01), jnp.zeros(len(bicycle.speeds))
-    assert operations("rates", bicycle, q, u) <= 6600

@@ -67,14 +67,6 @@ def test_stiff_tyres_approach_ideal_rolling(relaxation):
     np.testing.assert_allclose((10.0 * found[1] - found[0]) / 9.0, whipple, atol=1e-6)
 
 
-@pytest.mark.weekly
-def test_tyres_with_large_stiffness_per_load_approach_ideal_rolling():
-    """1e-6 asked at 1e8, met where that is the stiffness over the load [1/rad], 3e10 to 6e10 N/rad."""
-    tyre = Tyre(lateral=MagicFormula(1e8))
-    found = slow_eigenvalues(Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre))
-    np.testing.assert_allclose(found, slow_eigenvalues(Bicycle.benchmark()), atol=1e-6)
-
-
 # Sharp (1971), tables 1 to 3, model 1, as printed; read in the public transcription 0tmeF/MotoDynamics,
 # docs/research/sharp-1971-estabilidad-lineal.md. Real parts of capsize, weave, wobble [1/s]; imaginary parts [rad/s].
 SHARP = {
@@ -146,20 +138,6 @@ MOVING = {"roll_rate": 0.3, "rear_wheel_rate": -16.0, "steer_rate": -0.4}
 
 
 @pytest.mark.weekly
-def test_a_road_of_constant_grade_equals_a_slope():
-    """1e-12. Its normal is the same everywhere; gravity is tilted against it."""
-    slope = Bicycle.benchmark().with_parts(road=Slope(jnp.arctan(0.1)))
-    road = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * x))
-    along = np.sqrt(1.01)  # x of the road is horizontal
-
-    def found(bicycle, **place):
-        start = jk.assemble(bicycle, LEANING | place, MOVING)
-        return jk.accelerations(bicycle, 0.0, start.q, start.u)
-
-    np.testing.assert_allclose(found(road, x=0.5 / along), found(slope), rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.weekly
 def test_linear_models_on_a_grade():
     """1e-12: at an instant of a ride up a `Road` that rises evenly, and of the steady one up a `Slope`.
 
@@ -174,16 +152,6 @@ def test_linear_models_on_a_grade():
     start = jk.assemble(road, {"x": 2.0}, {"rear_wheel_rate": -5.0 / bicycle.rR})
     here = linearize(road, start, up.inputs, states=road.lateral, outputs=(), steady=False)
     np.testing.assert_allclose(here.A, linearize(slope, up, states=slope.lateral).A, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.weekly
-def test_a_linear_model_on_a_road_uses_compiled_scalar_programs(native):
-    """Written out, its derivatives would be eight thousand operations of XLA."""
-    bicycle = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * jnp.sin(x)))
-    start = jk.assemble(bicycle, {"roll": 0.05}, {"rear_wheel_rate": -5.0 / bicycle.rR})
-    options = {"states": bicycle.lateral, "outputs": (), "steady": False}
-    program = str(jax.make_jaxpr(lambda start: linearize(bicycle, start, **options).A)(start))
-    assert program.count(" = mul ") < 300
 
 
 def test_linear_models_along_a_road_raise_with_advice():
@@ -342,26 +310,6 @@ def with_load_transfer(lag, **more):
 
 
 @pytest.mark.weekly
-def test_tyre_loads_equal_the_constraint_forces_in_a_steady_turn():
-    """1e-10 of the weight: loads and lateral forces of the tyres, against the forces of constraint at the contacts."""
-    bicycle = with_load_transfer(0.02, rolling_resistance=0.005)
-    leaning = jk.assemble(bicycle, {"roll": 0.3, "steer": 0.12})
-    held, found = ("roll", "rear_wheel_rate"), ("steer_torque", "drive_torque")
-    turn = steady_turn(bicycle, leaning.q, {"rear_wheel_rate": -5.0 / 0.3}, hold=held, find=found)
-    at = (bicycle, 0.0, turn.q, turn.u, turn.inputs | dict(zip(bicycle.states, turn.x, strict=True)))
-    carried, outputs = jk.constraint_forces(*at), jk.outputs(*at)
-    loads = {"rear": -float(carried["P"][2]), "front": -float(carried["Q"][2])}
-    weight = 94.0 * 9.81
-    np.testing.assert_allclose(sum(loads.values()), weight, rtol=1e-12)
-    law = bicycle.front_tyre.lateral
-    for end, load in loads.items():
-        slip = turn[f"{end}_lateral_deflection"] / law.relaxation_length
-        np.testing.assert_allclose(outputs[f"{end}_lateral_force"], law.force(slip, load, 0.0), atol=1e-10 * weight)
-    np.testing.assert_allclose(turn["front_load_transfer"], 7.849 / weight, rtol=1e-3)
-    np.testing.assert_allclose(turn["rear_load_transfer"], -turn["front_load_transfer"], rtol=1e-9)
-
-
-@pytest.mark.weekly
 def test_tyre_loads_equal_the_constraint_forces_during_braking():
     """1e-10: the transfer stands still at what the moments about the rear contact give.
 
@@ -455,23 +403,6 @@ def test_a_measured_tyre_outside_its_range_of_validity():
     assert np.all(np.isfinite(jax.grad(law.force, argnums=(0, 1, 2))(0.0, 0.0, 0.0)))
     assert schwalbe_energizer().moment(0.0, 0.01, 400.0, 0.0) < 0.0  # turns out of its slip
     assert MagicFormula89(law.force_coefficients).moment(0.0, 0.05, 400.0, 0.1) == 0.0
-
-
-@pytest.mark.weekly
-def test_a_bicycle_with_measured_tyres_has_a_slower_weave():
-    """Its weave is slower than with ideal tyres, and damped at 6 m/s; with their offsets it cannot ride straight on."""
-
-    def on(**law):
-        tyre = Tyre(crown=0.022, lateral=schwalbe_energizer(relaxation_length=0.1, **law))
-        return Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre)
-
-    speeds = jnp.linspace(5.0, 6.0, 5)
-    weave, ideal = (eigenvalues(each, speeds)["weave"][-1, 0] for each in (on(), Bicycle.benchmark()))
-    assert weave.real < 0.0
-    assert 0.9 * abs(ideal.imag) < abs(weave.imag) < abs(ideal.imag)
-    uneven = on(offsets=True)
-    with pytest.raises(ValueError, match="this motion is not steady"):
-        linearize(uneven, straight_ahead(uneven, 5.0))
 
 
 def test_invalid_tyres_and_roads_are_rejected():

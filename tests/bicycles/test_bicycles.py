@@ -89,13 +89,3 @@ class Ahead(Part):
             moment = (self.share * radius * contact.heading).cross(-carried[end] * contact.normal)
             found.append(jk.Torque(moment, motion[f"{end} wheel"]))
         return found
-
-
-@pytest.mark.weekly
-def test_longitudinal_slip_does_not_change_eigenvalues_and_mode_names():
-    """1e-10: to first order upright riding does not notice it."""
-    tyre = Tyre(longitudinal=LongitudinalSlip(2e4))
-    bicycle, speeds = Bicycle.benchmark().with_parts(rear_tyre=tyre), jnp.array([4.0, 5.0])
-    found, known = eigenvalues(bicycle, speeds), eigenvalues(Bicycle.benchmark(), speeds)
-    assert found.modes == known.modes
-    np.testing.assert_allclose(found.eigenvalues, known.eigenvalues, rtol=1e-10)

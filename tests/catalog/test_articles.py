@@ -97,24 +97,3 @@ def test_the_rattleback_reverses_its_spin():
     spin = np.einsum("ti,ti->t", speeds, ns)
     assert spin[0] < -4.9
     assert spin.max() > 4.9
-
-
-def matrix(spin):
-    """The linear equations of n_x, n_y and omega about steady spin. Complex steps have no rounding error."""
-
-    def rates(x):
-        n = np.array([x[0], x[1], np.sqrt(1.0 - x[0] ** 2 - x[1] ** 2)])
-        n_dot, w_dot = newton_euler(n, x[2:])
-        return np.concatenate([n_dot[:2], w_dot])
-
-    at = np.array([0.0, 0.0, 0.0, 0.0, spin])
-    return np.stack([rates(at + 1e-30j * e).imag / 1e-30 for e in np.eye(5)], axis=1)
-
-
-@pytest.mark.slow
-def test_steady_spin_is_more_unstable_in_one_direction():
-    for spin, growth in ((-5.0, 2.12), (5.0, 0.20)):
-        model = jk.stability.linearize(Rattleback(), jk.State(jnp.zeros(5), jnp.array([0.0, 0.0, spin])))
-        found, expected = np.asarray(model.eigenvalues), np.linalg.eigvals(matrix(spin))
-        np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(expected), rtol=0, atol=1e-9)
-        np.testing.assert_allclose(found.real.max(), growth, atol=0.01)

@@ -53,18 +53,11 @@ def modes(system, q, u, inputs):
 
 
 FUNCTIONS = {f.__name__: f for f in (equations, forces, kinematics, modes)}
-QUICK = {("RodOnPin", f) for f in ("equations", "forces", "kinematics")} | {("BarWithPiston", "equations")}
 
 
 @pytest.mark.weekly
-@pytest.mark.parametrize(
-    ("name", "f"),
-    [
-        pytest.param(name, f, marks=[] if (name, f) in QUICK else [pytest.mark.weekly])
-        for name in SYSTEMS
-        for f in FUNCTIONS
-    ],
-)
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("f", FUNCTIONS)
 def test_derivatives_in_three_modes_agree_with_differences(name, f):
     """Along one direction of parameters, state and inputs, of one weighted sum of all that a function gives."""
     rtol = 1e-6

@@ -1,6 +1,5 @@
 """Classes that inherit from the catalogue's add bodies, loads, coordinates and parameters in a few lines."""
 
-import dataclasses
 import pickle
 
 import jax
@@ -122,33 +121,6 @@ class Loaded(WhippleBicycle):
         return motion.extended([jk.Body(self.load, 0.0, place, name="basket")])
 
 
-def merged(loaded):
-    """The same bicycle with the basket in its front assembly, by the parallel axis theorem."""
-    m, M = float(loaded.load), float(loaded.mH)
-    x, z = (np.array([float(a), float(b)]) for a, b in ((loaded.xH, loaded.x_load), (loaded.zH, loaded.z_load)))
-    weights = np.array([M, m])
-    xc, zc = weights @ x / (M + m), weights @ z / (M + m)
-    dx, dz = x - xc, z - zc
-    more = {
-        "IHxx": weights @ dz**2,
-        "IHyy": weights @ (dx**2 + dz**2),
-        "IHzz": weights @ dx**2,
-        "IHxz": -weights @ (dx * dz),
-    }
-    values = {name: getattr(loaded, name) for name in vars(WhippleBicycle.benchmark())}
-    values |= {"mH": M + m, "xH": xc, "zH": zc} | {name: values[name] + x for name, x in more.items()}
-    return WhippleBicycle(**values)
-
-
-@pytest.mark.slow
-def test_a_basket_adds_its_inertia_to_the_front_assembly():
-    q, u = (jnp.array(x) for x in (CATALOG["WhippleBicycle"].q, CATALOG["WhippleBicycle"].u))
-    loaded = Loaded.benchmark()
-    assert isinstance(loaded, Loaded)
-    f = jax.jit(lambda bicycle: jk.accelerations(bicycle, 0.0, q, u, {"steer_torque": 2.0}))
-    np.testing.assert_allclose(f(loaded), f(merged(loaded)), rtol=1e-10)
-
-
 def test_parameters_with_defaults_may_be_left_out(tmp_path):
     values = {name: float(x) for name, x in vars(WhippleBicycle.benchmark()).items()}
     del values["g"], values["steer_damping"]
@@ -160,72 +132,6 @@ def test_parameters_with_defaults_may_be_left_out(tmp_path):
     assert read_bicycle_file(path)[0]["load"] == 1.5
     with pytest.raises(ValueError, match=r"Loaded: wrong parameters; missing: mB; unknown: ballast"):
         Loaded.from_parameters({name: x for name, x in values.items() if name != "mB"} | {"ballast": 1.0})
-
-
-class Leaning(WhippleBicycle):
-    """A bicycle whose rider leans to the side on a hinge along the frame, with a spring and a damper."""
-
-    rider: jk.Scalar = jk.parameter(40.0, positive=True, unit="kg")
-    height: jk.Scalar = jk.parameter(0.4, unit="m")
-    stiffness: jk.Scalar = jk.parameter(1500.0, unit="N m/rad")
-    coordinates = (*WhippleBicycle.coordinates, "lean")
-    speeds = (*WhippleBicycle.speeds, "lean_rate")
-
-    def q_dot(self, t, q, u):
-        return (*super().q_dot(t, q, u), u["lean_rate"])
-
-    def motion(self, t, q, u):
-        motion = super().motion(t, q, u)
-        L = motion["B"].rotate(1, q["lean"], u["lean_rate"], "L")
-        center = motion["rear frame"].center.fixed(-self.height * L.z)
-        return motion.extended([jk.Body(self.rider, 0.0, center, name="torso")], frames={"L": L})
-
-    def loads(self, t, q, u, motion, inputs):
-        B = motion["B"]
-        spring = jk.loads.torsional_spring(motion["L"], B, B.x, q["lean"], self.stiffness)
-        return super().loads(t, q, u, motion, inputs), spring
-
-
-@pytest.fixture(scope="module")
-def leaning():
-    return Leaning.benchmark()
-
-
-def not_leaning(leaning):
-    """The bicycle whose frame and torso are one body, by the parallel axis theorem."""
-    values = {name: getattr(leaning, name) for name in vars(WhippleBicycle.benchmark())}
-    m, M, h = 40.0, 85.0, 0.4
-    more = M * m / (M + m) * h**2
-    values |= {"mB": M + m, "zB": values["zB"] - m * h / (M + m)}
-    return WhippleBicycle(**values | {"IBxx": values["IBxx"] + more, "IByy": values["IByy"] + more})
-
-
-@pytest.mark.slow
-def test_a_non_leaning_rider_adds_his_inertia_to_the_frame(leaning):
-    """2 T of the four speeds at zero lean: its block of the bicycle's three is that of frame and torso in one; the
-    torso alone has m h^2 about its hinge."""
-    m, h = 40.0, 0.4
-    state = jk.assemble(leaning, {"roll": 0.2, "steer": 0.1}, {"rear_wheel_rate": -15.0, "roll_rate": 0.3})
-    M4, _ = jk.equations_of_motion(leaning, 0.0, state.q, state.u)
-    M3, _ = jk.equations_of_motion(not_leaning(leaning), 0.0, state.q[:-1], state.u[:-1])
-    np.testing.assert_allclose(M4[:3, :3], M3, rtol=1e-9, atol=1e-9)
-    assert float(M4[3, 3]) == pytest.approx(m * h**2, rel=1e-9)
-
-
-@pytest.mark.weekly
-def test_eigenvalues_of_a_bicycle_with_an_additional_rider_coordinate(leaning):
-    """All that moves is in the model; a stiff rider has the modes of one who is part of the frame, and another."""
-    stiff = dataclasses.replace(leaning, stiffness=1e8)
-    found = jk.stability.eigenvalues(stiff, [4.0])
-    expected = np.sort_complex(jk.stability.eigenvalues(not_leaning(leaning), [4.0]).eigenvalues[0])
-    slow = np.asarray(found.eigenvalues[0])
-    slow = slow[(np.abs(slow) < 100.0) & (np.abs(slow) > 1e-6)]  # without the stiff pair, and that of the speed
-    np.testing.assert_allclose(np.sort_complex(slow), expected, rtol=1e-3)
-    assert set(found.states) == {"roll", "steer", "lean", "roll_rate", "steer_rate", "lean_rate", "rear_wheel_rate"}
-    with pytest.raises(
-        ValueError, match=r"canonical: Leaning has the speeds and states .*lean_rate, but the canonical equations"
-    ):
-        jk.stability.canonical(leaning)
 
 
 # What is added to a motion.

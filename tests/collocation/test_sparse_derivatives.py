@@ -9,13 +9,10 @@ from jaxkane.catalog import CATALOG
 from jaxkane.collocation import Phases, Problem, check_derivatives
 
 WITHOUT_CONTACTS = [name for name in CATALOG if getattr(jk.catalog, name).contacts is jk.System.contacts]
-# Dense derivatives of a whole program compile for 5 to 10 s.
-IN_CI = {"WhippleBicycle", "RotatingFrameAndBarChosenSpeeds", "SimplestWalker"}
-SYSTEMS = [pytest.param(name, marks=[] if name in IN_CI else pytest.mark.weekly) for name in WITHOUT_CONTACTS]
 
 
 @pytest.mark.weekly
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", WITHOUT_CONTACTS)
 def test_derivatives_of_the_catalogue(name):
     rtol = 1e-10
     entry = CATALOG[name]

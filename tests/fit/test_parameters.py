@@ -23,6 +23,7 @@ from jaxkane.fit import (
     profile,
 )
 from jaxkane.fit.problem.parameters import Interval, log_gaussian_mass
+from jaxkane.fit.problem.specification import parameters_of
 
 
 class Springs(eqx.Module):

@@ -234,30 +234,15 @@ def ahead():
 
 CASES = {
     "a class for a system": (lambda: linearize(type(BIKE), ahead()), TypeError, "instance of a System"),
-    "text for a motion": (lambda: linearize(BIKE, "ahead"), TypeError, "`motion` must be a State"),
     "another system's steady motion": (lambda: linearize(BIKE, AT_REST), ValueError, "belongs to another system"),
-    "a state named twice": (
-        lambda: linearize(BIKE, ahead(), states=("roll", "roll")),
-        ValueError,
-        "roll is named twice",
-    ),
     "an output that is two numbers": (
         lambda: linearize(BIKE, ahead(), outputs={"both": lambda t, q, u: jnp.stack([q["roll"], q["steer"]])}),
         TypeError,
         "output 'both' must be one number",
     ),
     "text for a speed": (lambda: straight_ahead(BIKE, "4"), ValueError, "speed must be one finite number"),
-    "texts for values": (
-        lambda: stability.eigenvalues(BIKE, ["4", "5"]),
-        TypeError,
-        "`values` of the parameter must be real",
-    ),
     "values in two axes": (lambda: stability.eigenvalues(BIKE, np.ones((2, 2))), TypeError, "must be real numbers"),
-    "none are kept": (
-        lambda: stability.critical_speeds(BIKE, most=0),
-        ValueError,
-        "positive number of values to keep; got 0",
-    ),
+    "none are kept": (lambda: stability.critical_speeds(BIKE, most=0), ValueError, "positive number.*got 0"),
     "a state for a steady motion": (
         lambda: stability.family(BIKE, ahead(), towards={}),
         TypeError,
@@ -268,13 +253,6 @@ CASES = {
         ValueError,
         "belongs to another system",
     ),
-    "text for a system": (lambda: stability.equilibrium("bicycle"), TypeError, "instance of a System"),
-    "text to be held": (
-        lambda: stability.equilibrium(BIKE, hold={"roll": "0"}),
-        TypeError,
-        "roll in `hold` must be a number or None, got '0'",
-    ),
-    "no system": (lambda: stability.cyclic_coordinates(None), TypeError, "instance of a System"),
 }
 AT_REST = stability.SteadyMotion(
     *(jnp.zeros(n) for n in (2, 2, 0, 0)), {}, 0.0, 0.0, (("theta1", "theta2"), ("theta1_dot", "theta2_dot"), (), ())

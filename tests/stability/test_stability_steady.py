@@ -141,21 +141,6 @@ def test_steady_precession_of_the_top_and_its_derivatives():
     np.testing.assert_allclose(curvature, second, rtol=1e-8, atol=1e-12)
 
 
-@pytest.mark.weekly
-def test_fast_and_slow_precession_belong_to_one_family():
-    """Followed at one nutation, the spin falls to its least value, where the two meet, and rises again."""
-    rtol = 1e-10
-    slow = steady_turn(TOP, {}, {"precession_rate": 2.0}, hold={"nutation": 0.5, "spin_rate": 300.0})
-    turns = family(TOP, slow, hold=("nutation",), towards={"spin_rate": -1}, until={"spin_rate": 320.0}, max_step=0.1)
-    assert turns.reason == "spin_rate = 320"
-    np.testing.assert_allclose(turns["nutation"], 0.5, atol=1e-12)
-    least = 2 * np.sqrt((TOP.across - TOP.axial) * np.cos(0.5) * TOP.mass * 9.81 * TOP.distance) / TOP.axial
-    assert least <= float(turns["spin_rate"].min()) < 1.01 * least
-    a, c = (TOP.across - TOP.axial) * np.cos(0.5), TOP.mass * 9.81 * TOP.distance
-    fast = (TOP.axial * 320.0 + np.sqrt((TOP.axial * 320.0) ** 2 - 4 * a * c)) / (2 * a)
-    np.testing.assert_allclose(turns["precession_rate"][-1], fast, rtol=rtol)
-
-
 @pytest.mark.slow
 def test_a_disc_that_rolls_on_a_circle_agrees_with_the_closed_form():
     """r/4 u3^2 tan(lean) - 3/2 r u2 u3 = g sin(lean): moments about the centre of a uniform disc."""
@@ -244,37 +229,6 @@ def test_rest_with_a_turned_front_wheel_is_an_equilibrium():
     assert residuals(jax.tree.map(lambda x: x[None], at)) < 1e-11
 
 
-@pytest.mark.weekly
-def test_reversed_handlebar_family_extends_from_capsize_to_flat_spinning():
-    atol = 1e-11
-    q = jk.assemble(BIKE, {"steer": np.pi + 0.01, "roll": 0.02}).q
-    start = steady_turn(BIKE, q, {"rear_wheel_rate": -26.3}, hold=("steer",))
-    turns = family(BIKE, start, towards={"steer": 1}, until={"roll": 1.4}, max_step=0.1)
-    assert residuals(turns) < atol
-    assert turns.reason == "roll = 1.4"
-    fold = np.argmax(np.asarray(turns["steer"]))
-    assert 0 < fold < len(turns) - 1  # steers away from straight back and returns
-    assert float(turns["yaw_rate"][-1]) > 4.0
-
-
-@pytest.mark.weekly
-def test_the_pivoting_family_connects_two_limits():
-    """The third family: other speeds are independent, since the rear wheel's does not determine the yaw rate there."""
-    atol = 1e-11
-    bicycle = with_speeds(BIKE, ("roll_rate", "yaw_rate", "steer_rate"))
-    q = jk.assemble(BIKE, {"steer": 1.6}).q
-    pivot = steady_turn(bicycle, q, {"yaw_rate": 2.0}, hold={"rear_wheel_rate": 0.0})
-    assert abs(float(pivot["roll"])) < 0.02
-    assert abs(np.rad2deg(pivot["steer"]) - 90) < 3
-    flat = family(bicycle, pivot, towards={"steer": -1}, until={"roll": 1.2}, max_step=0.2)
-    fast = family(bicycle, pivot, towards={"steer": 1}, until={"yaw_rate": 15.0}, max_step=0.2)
-    assert float(flat.residual.max()) < atol
-    assert float(fast.residual.max()) < atol
-    assert (flat.reason, fast.reason) == ("roll = 1.2", "yaw_rate = 15")
-    assert abs(float(fast["roll"][-1])) < 0.1 < float(fast["rear_wheel_rate"][-1])  # near upright, rolling backwards
-    assert abs(np.rad2deg(fast["steer"][-1]) - 90) < 10
-
-
 def test_accelerations_do_not_depend_on_the_choice_of_independent_speeds():
     rtol = 1e-12
     bicycle = with_speeds(BIKE, ("yaw_rate", "pitch_rate", "roll_rate"))
@@ -340,23 +294,6 @@ class Row(jk.System):
     coordinates = property(lambda self: tuple(f"x{i}" for i in range(self.n + 1)))
     speeds = ("v0",)
     dependent_speeds = property(lambda self: tuple(f"v{i + 1}" for i in range(self.n)))
-
-
-@pytest.mark.weekly
-def test_derivatives_of_a_steady_turn_agree_with_differences():
-    rtol = 1e-7
-
-    @jax.jit
-    def steer(bicycle):
-        turn = steady_turn(bicycle, {"steer": 0.3}, {"rear_wheel_rate": -12.0}, hold={"roll": 0.4})
-        return jnp.stack([turn["steer"], turn["yaw_rate"]])
-
-    found = jax.jit(jax.jacfwd(lambda x: steer(dataclasses.replace(BIKE, c=x[0], zB=x[1]))))(jnp.array([0.08, -0.9]))
-    for i, (name, x) in enumerate({"c": 0.08, "zB": -0.9}.items()):
-        h = 1e-4
-        a, b = (steer(dataclasses.replace(BIKE, **{name: x + s * h})) for s in (1, -1))
-        c, d = (steer(dataclasses.replace(BIKE, **{name: x + s * 2 * h})) for s in (1, -1))
-        np.testing.assert_allclose(found[:, i], (8 * (a - b) - (c - d)) / (12 * h), rtol=rtol)
 
 
 @pytest.mark.weekly

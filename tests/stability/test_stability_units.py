@@ -1,25 +1,17 @@
 """Steady motions, linear models, families and regulators at small and large lengths, masses and times."""
 
+import contextlib
 import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from benchmarks.chain import Chain
 
 import jaxkane as jk
 from jaxkane import Scalar, parameter
-from jaxkane.stability import (
-    LinearModel,
-    _sizes,
-    _steady,
-    equilibrium,
-    family,
-    linearize,
-    lqr,
-    steady_turn,
-    straight_ahead,
-)
+from jaxkane.stability import LinearModel, equilibrium, family, linearize, lqr, steady_turn, straight_ahead
 
 BIKE = jk.catalog.WhippleBicycle.benchmark()
 SCALES = [(1e-7, 1.0), (1e-2, 1.0), (1.0, 1e-9), (1.0, 1e6), (1e8, 1e5)]  # of length and time
@@ -81,30 +73,6 @@ def test_equilibrium_of_a_loop_does_not_depend_on_the_units(length, time):
     np.testing.assert_allclose(A[1, 0] * time**2, -curvature / 2.0 * (x / 0.7) ** 2, rtol=1e-9)
 
 
-def scaled_bicycle(length):
-    """A model of the benchmark on a smaller or larger scale, of the same density and gravity."""
-    powers = {"w": 1, "c": 1, "rR": 1, "rF": 1, "xB": 1, "zB": 1, "xH": 1, "zH": 1}
-    powers |= {k: 3 for k in ("mR", "mB", "mH", "mF")}
-    powers |= {f.name: 5 for f in dataclasses.fields(BIKE) if f.name.startswith("I")}
-    return dataclasses.replace(BIKE, **{k: getattr(BIKE, k) * length**n for k, n in powers.items()})
-
-
-@pytest.mark.slow
-def test_steady_turns_of_a_scaled_bicycle_are_similar():
-    """Lengths 1:100 and times 1:10: what was held is held, the wheels touch the ground, the steer is the same."""
-    rtol = 1e-10
-    turns = []
-    for length in (1.0, 0.01):
-        system, rate = scaled_bicycle(length), -12.0 / length**0.5
-        turn = steady_turn(system, {"steer": 0.1}, {"rear_wheel_rate": rate}, hold={"roll": 0.1})
-        assert float(turn["roll"]) == 0.1
-        jk.accelerations(system, 0.0, turn.q, turn.u)
-        turns.append(
-            [turn["steer"], turn["pitch"], turn["rear_wheel_rate"] * length**0.5, turn["yaw_rate"] * length**0.5]
-        )
-    np.testing.assert_allclose(turns[1], turns[0], rtol=rtol)
-
-
 def pendulum(period):
     """A double pendulum that takes about this time [s]."""
     return jk.catalog.DoublePendulum(gravity=40.0 / period**2)
@@ -122,27 +90,15 @@ def test_steadiness_does_not_depend_on_the_period(period):
 
 
 @pytest.mark.slow
-def test_term_sizes_of_scalar_and_array_programs_agree(monkeypatch):
-    """Above twelve speeds forces are projected in one program for each direction, and there is no NumPy."""
-    system = jk.catalog.RotatingFrameAndBar()
-    q, u, values = jnp.array([0.5, 0.8]), jnp.array([0.3, -0.2]), {k: jnp.ones(()) for k in system.inputs}
-    args = system, jnp.zeros(()), q, u, values, (abs(q), abs(u), values), np.array([1])
-    expected = _sizes.sizes_of(*args)
-    by_numpy = _sizes.sizes_of(*jax.device_get(args))
-    monkeypatch.setattr(_sizes, "is_written_out", lambda n: False)
-    monkeypatch.setattr(_steady, "rates_by_numpy", lambda *args: None)
-    for x, y, z in zip(_sizes.sizes_of(*args), by_numpy, expected, strict=True):
-        np.testing.assert_allclose(x, z, rtol=1e-13)
-        np.testing.assert_allclose(y, z, rtol=1e-13)
-    assert float(np.min(expected.f)) > 0.0
-    # A speed that is zero has the size sqrt(a s): theta's where it is accelerated by a along its own value s.
-    at_rest = _sizes.sizes_of(*args[:3], 0 * u, values, (abs(q), 0 * u, values), np.array([1]))
-    mass = float(jk.mass_matrix(system, 0.0, q, u)[1, 1])
-    assert float(at_rest.u[1]) == pytest.approx((float(at_rest.f[1]) / mass * 0.8) ** 0.5, rel=1e-12)
-    assert float(at_rest.q_dot[1]) == float(at_rest.u[1])
-    linearize(system, jk.State(q, jnp.array([0.5, 0.0])), steady=False)
+def test_a_small_acceleration_in_a_fast_motion_is_not_steady():
+    """Of a bar that turns in a frame: theta is accelerated by the rate of the frame. With 14 speeds, too."""
+    system, chain = jk.catalog.RotatingFrameAndBar(), Chain(n=14)
     with pytest.raises(ValueError, match="theta_dot is accelerated by"):
-        linearize(system, jk.State(q, jnp.array([0.5, 0.0])))
+        linearize(system, jk.State([0.5, 0.8], [0.5, 0.0]))
+    for at, accelerated in ((0.0, False), (1e-6, True)):
+        motion = jk.State(jnp.full(14, at), jnp.zeros(14))
+        with pytest.raises(ValueError, match="is accelerated by") if accelerated else contextlib.nullcontext():
+            linearize(chain, motion)
 
 
 @pytest.mark.slow
@@ -263,12 +219,6 @@ def test_non_finite_numbers_raise():
 def test_an_empty_list_of_parameter_values_raises():
     with pytest.raises(ValueError, match=r"WhippleBicycle: `values` is empty\. Pass at least one"):
         jk.stability.eigenvalues(BIKE, np.zeros(0))
-
-
-def test_held_quantities_are_not_unknowns():
-    equations = _steady.SteadyEquations(BIKE, ("steer_torque",), ("roll", "rear_wheel_rate", "yaw_rate", "yaw"))
-    assert equations.names == ("steer", "pitch", "roll_rate", "steer_rate", "steer_torque")
-    assert equations.hold == ("yaw_rate",)
 
 
 @pytest.mark.slow

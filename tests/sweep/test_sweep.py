@@ -1,6 +1,5 @@
 """Many motions at once: each as if it were alone."""
 
-import jax
 import numpy as np
 import pytest
 from mechanisms import Bead, Slider
@@ -27,30 +26,6 @@ def starts(n):
 @pytest.fixture(scope="module")
 def rides():
     return jk.sweep.sweep(RING, starts(6), TS)
-
-
-@pytest.mark.weekly
-def test_members_equal_separate_simulations(rides):
-    state = starts(6)
-    assert rides.q.shape == (6, 6, 2)
-    assert rides["x"].shape == (6, 6)
-    for i in (0, 5):
-        alone = jk.simulate(Ring(), jk.State(state.q[i], state.u[i]), TS)
-        np.testing.assert_allclose(rides.q[i], alone.q, atol=1e-12)
-        assert int(rides.stats["steps"][i]) == int(alone.stats["steps"])
-        for end in (rides.trajectory.end, rides.member(i).end):
-            q = end.q if end.q.ndim == 1 else end.q[i]
-            np.testing.assert_allclose(q, alone.end.q, atol=1e-12)
-
-
-@pytest.mark.weekly
-def test_chunks_on_a_gpu_are_larger_and_one_batch(monkeypatch, tmp_path):
-    found = {}
-    for device in ("cpu", "gpu"):  # the library reads nothing else about the device
-        monkeypatch.setattr(jax, "default_backend", lambda device=device: device)
-        found[device] = jk.sweep.sweep(Ring(), starts(300), TS, folder=tmp_path / device)
-    assert [len([*(tmp_path / device).glob("*.npz")]) for device in found] == [2, 1]
-    np.testing.assert_allclose(found["gpu"].q, found["cpu"].q, rtol=0, atol=1e-12)
 
 
 @pytest.mark.weekly

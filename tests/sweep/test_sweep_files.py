@@ -171,10 +171,7 @@ def test_temporary_files_of_a_killed_writer_are_removed(name, tmp_path, rides):
             (text, r"sweep\.json is damaged, or not the manifest of a sweep: .*Choose another folder, or delete")
             for text in (b"", bytes(100), b"\xff\xfe\x00", b'{"system": {"cl', b"[1, 2]", b'{"name": "vacuum"}')
         ),
-        (
-            b'{"system": {}, "times": "", "layout": {}}',
-            r"differs in .*program \(nothing there",
-        ),
+        (b'{"system": {}, "times": "", "layout": {}}', r"differs in .*program \(nothing there"),
     ],
 )
 def test_unreadable_manifests_are_rejected(bytes_, message, copy):
@@ -216,19 +213,13 @@ def test_damaged_chunks_are_recomputed_with_one_warning(copy, finished, rides):
         assert contents(copy) == contents(finished)
 
 
-def test_a_chunk_with_wrong_shapes_is_recomputed(copy, rides):
-    first, _, last = sorted(copy.glob("chunk-*.npz"))
-    last.write_bytes(first.read_bytes())  # 32 members where 6 belong
-    with pytest.warns(UserWarning, match="1 chunks cannot be read"):
-        np.testing.assert_array_equal(run(copy).q, rides.q)
-
-
 def test_swapped_chunks_are_recomputed(copy, finished, rides):
-    first, second, _ = sorted(copy.glob("chunk-*.npz"))
+    first, second, last = sorted(copy.glob("chunk-*.npz"))
     whole = first.read_bytes()
     first.write_bytes(second.read_bytes())
     second.write_bytes(whole)
-    with pytest.warns(UserWarning, match=r"2 chunks cannot be read .*the file was renamed"):
+    last.write_bytes(whole)  # 32 members where 6 belong
+    with pytest.warns(UserWarning, match=r"3 chunks cannot be read .*the file was renamed"):
         np.testing.assert_array_equal(run(copy).q, rides.q)
     assert contents(copy) == contents(finished)
 
@@ -390,36 +381,25 @@ def test_duplicate_values_and_invalid_options_are_rejected():
     for arguments, options, error, words in (
         ((Drop(), REST), {"foo": 1}, ValueError, "sweep has no option foo; there are rtol"),
         ((Drop(), REST), {"devices": [1]}, TypeError, "`devices` must contain at least one of jax"),
-        (
-            (Drop(), lambda system, row: {"height": 1.0}),
-            {},
-            TypeError,
-            "must return a jaxkane.State for each row, got dict",
-        ),
+        ((Drop(), lambda system, row: {"height": 1.0}), {}, TypeError, "must return a jaxkane.State.*got dict"),
         ((lambda row: row["mass"], REST), {}, TypeError, "must return a System for each row"),
     ):
         with pytest.raises(error, match=words):
             jk.sweep.sweep(*arguments, TS, table=table, **options)
     with pytest.raises(TypeError, match="The column 'mass' of a table is traced"):
         jax.jit(lambda mass: jk.sweep.sweep(Drop(), REST, TS, table={"mass": mass}).q)(np.ones(2))
-    with pytest.raises(ValueError, match=r"grid: label must be a row of numbers .* labels in a dict"):
-        jk.sweep.grid(label=["a", "b"])
     for push in (np.arange(5.0), np.ma.array([[1.0], [2.0]], mask=[[True], [False]])):
         with pytest.raises(ValueError, match="The input 'push'"):
             jk.sweep.sweep(Drop(), REST, TS, {"push": push}, table=table)
-    for chunk in (0, "32", 2.5):
-        with pytest.raises(ValueError, match=f"`chunk` must be a positive number of members; got {chunk!r}"):
-            run(chunk=chunk)
+    with pytest.raises(ValueError, match="`chunk` must be a positive number of members; got 0"):
+        run(chunk=0)
 
 
 @pytest.mark.parametrize(
     ("reduce", "message"),
     [
-        (
-            "x",
-            r"`reduce` must be a function of a Trajectory, e.g. lambda trajectory: trajectory\['roll'\]\[-1\]; got 'x'",
-        ),
-        (lambda ride: "far", "`reduce` must return numbers and arrays, also in dicts and tuples; got 'far'"),
+        ("x", r"`reduce` must be a function of a Trajectory, .*; got 'x'"),
+        (lambda ride: "far", "`reduce` must return numbers and arrays, .*; got 'far'"),
         (lambda ride: {"end": np.array("far")}, "`reduce` must return numbers and arrays"),
         (lambda ride: None, r"got None. Does it end without a `return`\?"),
         (lambda ride: 1.0 if ride["x"][-1] > 0.0 else 0.0, "sweep: `reduce` uses a traced value"),
