@@ -152,20 +152,10 @@ def assert_same_steps(filter, belief, in_c, rtol, n=5, dt=0.02):
 
 @pytest.mark.weekly
 @needs_compiler
-@pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.weekly)])
-def test_filter_steps_in_c_agree_with_the_library(method, tmp_path):
-    """Inputs, states of the first order, outputs, parameters that drift, gaps and late measurements."""
-    filter, belief = of_servo(method=method)
-    assert_same_steps(filter, belief, compiled(filter, belief, tmp_path), 1e-12)
-
-
-@pytest.mark.weekly
-@needs_compiler
-@pytest.mark.parametrize(
-    "of", [of_circle, *(pytest.param(of, marks=pytest.mark.weekly) for of in (of_crank, of_bicycle))]
-)
-@pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.weekly)])
-def test_filter_steps_in_c_satisfy_the_constraints(of, method, tmp_path):
+@pytest.mark.parametrize("of", [of_servo, of_circle, of_crank, of_bicycle])
+@METHODS
+def test_filter_steps_in_c_agree_with_the_library(of, method, tmp_path):
+    """Inputs, states of the first order, outputs, constraints, parameters that drift, gaps and late measurements."""
     filter, belief = of(method=method)
     assert_same_steps(filter, belief, compiled(filter, belief, tmp_path), 1e-12)
 

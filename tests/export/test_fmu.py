@@ -246,20 +246,8 @@ def test_the_source_compiles_without_warnings(fmu_of, tmp_path):
             with zipfile.ZipFile(fmu_of(system, fmi)) as archive:
                 file = tmp_path / f"{name}{fmi[0]}.c"
                 file.write_bytes(archive.read(f"sources/{file.name}"))
-            command = [
-                CC,
-                "-std=c99",
-                "-Wall",
-                "-Wextra",
-                "-pedantic",
-                "-Werror",
-                "-O1",
-                "-c",
-                file,
-                "-o",
-                tmp_path / "o",
-            ]
-            subprocess.run(command, check=True)
+            flags = ("-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror", "-O1")
+            subprocess.run([CC, *flags, "-c", file, "-o", tmp_path / "o"], check=True)
 
 
 @needs_compiler
@@ -332,11 +320,7 @@ def test_parameters_inputs_and_states_can_be_set_between_steps(fmi, fmu_of):
         unit.step(3.0, 0.25)
         expected = after(0.25, start, 1.0, mass=4.0)
         np.testing.assert_allclose(unit.get(*names), expected, rtol=0, atol=atol)
-        save, restore = (
-            (unit.unit.getFMUstate, unit.unit.setFMUstate)
-            if unit.is_2
-            else (unit.unit.getFMUState, unit.unit.setFMUState)
-        )
+        save, restore = (getattr(unit.unit, f"{way}FMU{'state' if unit.is_2 else 'State'}") for way in ("get", "set"))
         state = save()
         unit.set({"command": -2.0, "stiffness": 50.0, "lag": 0.3})
         for t in (3.25, 3.35):
@@ -401,17 +385,12 @@ def test_events_reset_states_and_end_the_simulation(fmi, kind, fmu_of):
     assert len(rows) == 51
     g, fall = 9.81, np.sqrt(2 / 9.81)
     for t, h, v, bounces in rows:
-        at, speed, n = 0.0, 0.0, 0
-        length = fall
+        at, n, speed, length = -fall, 0, g * fall, 2 * fall  # a bounce before the start has its top at the start
         while t - at > length:
             at, n = at + length, n + 1
             speed = 0.8**n * g * fall
             length = 2 * speed / g
-        expected = (
-            (1.0 - g * t * t / 2, -g * t)
-            if n == 0
-            else (speed * (t - at) - g * (t - at) ** 2 / 2, speed - g * (t - at))
-        )
+        expected = speed * (t - at) - g * (t - at) ** 2 / 2, speed - g * (t - at)
         np.testing.assert_allclose((h, v, bounces), (*expected, n), rtol=0, atol=50 * atol)
     early = fmpy.simulate_fmu(path, stop_time=2.5, **options, start_values={"duration": 0.33})
     assert early["time"][-1] == pytest.approx(0.33, abs=0.03)
@@ -566,20 +545,14 @@ def many(n):
         (Driven, {"fmi": "1.0"}, ValueError, r"`fmi` must be '2.0' or '3.0', got '1.0'"),
         (Driven, {"kind": "cosimulation"}, ValueError, r"no kind cosimulation; did you mean 'co-simulation'"),
         (Driven, {"step": 0.0}, ValueError, r"`step` \[s\] must be positive and finite, got 0.0"),
+        (lambda: many(0), {}, ValueError, r"Many has no coordinates\. Name them"),
         (Driven, {"state": jk.State([1.0, 2.0], [0.0])}, ValueError, r"no start values. Driven: q must have the shape"),
-        (lambda: Driven, {}, TypeError, r"must be an instance of a System"),
         (lambda: Driven(jnp.ones(3)), {}, ValueError, r"Driven is a batch: mass has"),
         (BouncingBall, {}, ValueError, r"BouncingBall: an FMU cannot represent contacts: floor. Replace them"),
         (lambda: jk.with_multipliers(Bob()), {}, ValueError, r"Bob: an FMU cannot represent multipliers"),
         (lambda: many(13), {}, ValueError, r"at most 12 independent speeds, and this system has 13"),
-        (lambda: many(0), {}, ValueError, r"Many has no coordinates\. Name them"),
         (lambda: with_members(events=jumps_by_a_loop), {}, ValueError, r"`then` of the event e.*contains scan"),
-        (
-            lambda: with_members(inputs=("command", "a\nb")),
-            {},
-            ValueError,
-            r"an FMU cannot contain the name or unit 'a\\n",
-        ),
+        (lambda: with_members(inputs=("command", "a\nb")), {}, ValueError, r"cannot contain the name or unit 'a\\n"),
     ],
 )
 def test_systems_not_supported_by_fmi_are_rejected(system, options, error, match, tmp_path):

@@ -155,22 +155,7 @@ CHANGES = {
         "void* data;\n  XLA_FFI_DataType dtype;",
         "struct XLA_FFI_Buffer has changed",
     ),
-    "another field": (
-        "  const XLA_FFI_Api* api;\n",
-        "  const XLA_FFI_Api* api;\n  void* more;\n",
-        "struct XLA_FFI_CallFrame has changed",
-    ),
     "another version": ("XLA_FFI_API_MAJOR 0", "XLA_FFI_API_MAJOR 1", "XLA_FFI_API_MAJOR has changed"),
-    "another name": (
-        "XLA_FFI_Metadata_Extension",
-        "XLA_FFI_MetadataExtension",
-        "struct XLA_FFI_Metadata_Extension has changed",
-    ),
-    "arguments otherwise than results": (
-        "  void** rets;",
-        "  int64_t more;\n  void** rets;",
-        "struct XLA_FFI_Rets has changed",
-    ),
     "nothing in it": (None, "", "XLA_FFI_API_MAJOR has changed"),
 }
 
