@@ -43,11 +43,6 @@ def double_pendulum():
     return me.LagrangesMethod(L + m * g * l * (2 * sm.cos(a) + sm.cos(b)), [a, b])
 
 
-def bead_on_a_parabola():
-    L = m * (x.diff() ** 2 + y.diff() ** 2) / 2 - m * g * y
-    return me.LagrangesMethod(L, [x, y], hol_coneqs=[y - k * x**2])
-
-
 def skate():
     """A knife edge: a holonomic and a nonholonomic constraint, and a coordinate that has no mass."""
     L = m * (x.diff() ** 2 + y.diff() ** 2) / 2 + m * l**2 * a.diff() ** 2 / 2 - m * g * y
@@ -60,7 +55,6 @@ MODELS = {
     "elastic_pendulum": (elastic_pendulum, ()),
     "polar": (polar, ()),
     "double_pendulum": (double_pendulum, ()),
-    "bead_on_a_parabola": (bead_on_a_parabola, ("y",)),
     "skate": (skate, ("b", "y")),
 }
 

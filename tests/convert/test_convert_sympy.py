@@ -5,7 +5,6 @@ Figures: tests/data/sympy_kane_systems.json, which SymPy 1.14's KanesMethod comp
 
 import dataclasses
 import json
-import re
 import sys
 from pathlib import Path
 
@@ -357,14 +356,3 @@ def test_the_error_without_sympy_states_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "sympy", None)
     with pytest.raises(ImportError, match="pip install sympy"):
         jk.convert.from_sympy(None, {})
-
-
-@pytest.mark.weekly
-def test_the_code_of_the_page_on_importing_models_runs(me):
-    pytest.importorskip("mujoco")
-    page = (Path(__file__).parents[2] / "docs" / "bringing_models.md").read_text(encoding="utf-8")
-    names = {}
-    for block in re.findall(r"```py(?:thon)?\n(.*?)```", page, re.DOTALL):
-        exec(compile(block, "bringing_models.md", "exec"), names)
-    assert names["system"].coordinates == ("q",)
-    assert float(names["ride"].q[-1, 0]) != 0.5

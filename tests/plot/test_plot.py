@@ -154,6 +154,8 @@ def test_names_are_not_interpreted_as_mathematics():
 def test_units_passed_as_an_argument():
     axes = jk.plot.trajectories(trajectory(), ["x"], units={"x": "rad"}, degrees=True)
     assert axes[0].get_ylabel() == "x\n[deg]"
+    with pytest.raises(ValueError, match="none of x is declared to be an angle"):
+        jk.plot.trajectories(trajectory(), ["x"], degrees=True)
     with pytest.raises(KeyError, match="no 'pitch' in this trajectory"):
         jk.plot.trajectories(trajectory(), ["pitch"])
     with pytest.raises(ValueError, match="2 axes are needed"):

@@ -89,35 +89,6 @@ def test_a_program_written_as_reduce_windows_agrees_with_plain_jax(name, f, long
     assert_equal_trees(jax.jit(TRANSFORMATIONS[name](ScalarFunction(f)))(*ARGUMENTS), by_plain_jax(name, f))
 
 
-def many(a, x, flag):
-    y, z, w = x
-    smooth = jnp.sin(a) + jnp.arctan2(y, z) * jnp.tanh(w) + jnp.cbrt(y) ** 3 - jnp.exp2(w) / jnp.log1p(z * z)
-    steps = jnp.where((y > w) & ~flag | (z != y), a, jnp.floor(z)) + jax.lax.rem(z, a) + jnp.sign(w) * jnp.round(y)
-    others = jnp.clip(w, -0.1, 0.1) + jnp.maximum(y, w) ** 2.5 + jax.scipy.special.erf(z) + a**3 + flag.astype(a.dtype)
-    return {"numbers": jnp.stack([smooth, steps, others]), "is_less": y < w, "given": x, "fixed": jnp.array([1.0, a])}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_every_operation_written_as_reduce_windows_agrees_with_plain_jax(dtype, by_xla, monkeypatch):
-    monkeypatch.setattr(xla, "_SHORT", 0)
-    monkeypatch.setattr(xla, "_LONG", 0 if dtype == np.float32 else 1000)
-    values = np.array([[0.3, -1.5, 2.5], [0.0, -0.0, np.inf], [np.nan, 1.0, -1.0], [0.5, 0.5, 1e30]])
-    x = jnp.asarray(values, dtype)
-    a, flag = jnp.array(0.7, dtype), jnp.array([True, False, False, True])
-    for f in (
-        lambda f: [f(a, y, is_set) for y, is_set in zip(x, flag, strict=True)],
-        lambda f: jax.vmap(f, (None, 0, 0))(a, x, flag),
-        lambda f: jax.vmap(lambda a: jax.vmap(f, (None, 0, 0))(a, x, flag))(jnp.stack([a, 2 * a])),
-    ):
-        found = jax.jit(lambda f=f: f(ScalarFunction(many)))()
-        jax.tree.map(
-            lambda x, y: np.testing.assert_allclose(x, y, rtol=20 * jnp.finfo(dtype).eps, strict=True),
-            found,
-            jax.jit(lambda f=f: f(many))(),
-        )
-
-
 @pytest.mark.parametrize("name", TRANSFORMATIONS)
 @pytest.mark.parametrize("long", [False, True], ids=["short", "long"])
 def test_on_a_gpu_a_short_program_is_one_kernel(name, long, monkeypatch):

@@ -13,7 +13,7 @@ from operations import ODD, OPERATIONS
 
 import jaxkane as jk
 from jaxkane._scalarjit import program as programs
-from jaxkane._scalarjit.backends import llvm
+from jaxkane._scalarjit.backends import llvm, xla
 from jaxkane._scalarjit.backends import native as native_kernels
 from jaxkane._scalarjit.scalar_function import ScalarFunction
 
@@ -34,11 +34,15 @@ def every_operation(x):
     return {name: operation(x) for name, operation in OPERATIONS.items()}
 
 
-# Whoever is told that something cannot be part of one function, or of a kernel, compares XLA with itself.
+# A warning that something cannot be part of a function or kernel means that XLA is compared with itself.
 @pytest.mark.weekly
 @pytest.mark.filterwarnings("error:.*its description uses")
-@pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.weekly)], indirect=True)
-def test_every_operation_agrees_with_xla(plainly, kernels):
+@pytest.mark.parametrize(("kernels", "windows"), [("native", None), ("XLA", None), ("XLA", 0), ("XLA", 1000)])
+def test_every_operation_agrees_with_xla(plainly, kernels, windows, monkeypatch):
+    """Also if the program is written as reduce windows, short or long ones."""
+    if windows is not None:
+        monkeypatch.setattr(xla, "_SHORT", 0)
+        monkeypatch.setattr(xla, "_LONG", windows)
     x, expected = plainly
     program = ScalarFunction(every_operation)
     assert native_kernels.Scalars(jax.make_jaxpr(every_operation)(x[0])).graph.nodes, "cannot be written as scalars"
