@@ -127,16 +127,19 @@ def test_values_and_derivatives_in_c_agree_with_the_library(name, tmp_path):
         assert_close(found, expected, of_derivatives if function in JACOBIANS else rtol, function)
 
 
-class Balanced(jk.System):
-    """A particle between two equal forces: 0.1 * 3 - 0.3 is 5.6e-17."""
-
-    left: jk.Scalar = jk.parameter(0.1)
-    right: jk.Scalar = jk.parameter(0.3)
+class Bare(jk.System):
     coordinates, speeds = ("x",), ("v",)
 
     def motion(self, t, q, u):
         N, O = jk.inertial()
         return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x))])
+
+
+class Balanced(Bare):
+    """A particle between two equal forces: 0.1 * 3 - 0.3 is 5.6e-17."""
+
+    left: jk.Scalar = jk.parameter(0.1)
+    right: jk.Scalar = jk.parameter(0.3)
 
     def loads(self, t, q, u, motion, inputs):
         return jk.Force((3.0 * self.left - self.right) * motion.N.x, motion.bodies[0])
@@ -175,14 +178,6 @@ def test_the_header_compiles_as_cpp(tmp_path):
     assert "inputs[0]: for" in header
     assert "q[0]: angle [rad]" in header
     assert "void double__rates(" in header
-
-
-class Bare(jk.System):
-    coordinates, speeds = ("x",), ("v",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x))])
 
 
 def test_parameters_with_similar_names_have_unique_identifiers(tmp_path):
@@ -325,12 +320,8 @@ def of_states(f):
     """A system whose first-order states have the rates f(inputs)."""
     n = jax.eval_shape(flat(f), TAKEN).size
 
-    class Operated(jk.System):
-        coordinates, speeds, inputs, states = ("x",), ("v",), ("a", "b", "c"), tuple(f"s{i}" for i in range(n))
-
-        def motion(self, t, q, u):
-            N, O = jk.inertial()
-            return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+    class Operated(Bare):
+        inputs, states = ("a", "b", "c"), tuple(f"s{i}" for i in range(n))
 
         def state_rates(self, t, q, u, x, motion, now):
             return list(flat(f)(jnp.stack([now["a"], now["b"], now["c"]])))

@@ -255,21 +255,6 @@ def test_equinox_checks_of_the_user_raise_with_a_cache(cache, python):
     assert python(code).stdout.splitlines() == ["True True True False", "None True"]
 
 
-def test_concurrent_traces_restore_the_setting_of_equinox_checks(monkeypatch, tmp_path):
-    """The first sets it, and the last restores it, in whatever order they end."""
-    monkeypatch.setattr(checks, "EQX_ON_ERROR", "raise")
-    before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    try:
-        first, second = storable_checks(), storable_checks()
-        first.__enter__()
-        second.__enter__()
-        first.__exit__(None, None, None)
-        assert checks.EQX_ON_ERROR == "nan"
-        second.__exit__(None, None, None)
-        assert checks.EQX_ON_ERROR == "raise"
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)
 
 
 @pytest.mark.parametrize("devices", ["2", True, 2.5, 0])

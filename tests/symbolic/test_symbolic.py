@@ -201,15 +201,9 @@ def at_numbers(model, system, **more):
     return [np.asarray(x, float) for x in f(*values.values())]
 
 
-@pytest.mark.slow
-def test_linear_models_with_constraints_agree_with_the_stability_module():
-    rtol = 1e-12
-    bob = Bob()
-    model = jk.symbolic.linearize(bob, {"y": "-length"}, states=("x", "vx"))
-    exact_model = jk.stability.linearize(bob, jk.assemble(bob, {"x": 0.0, "y": -1.0}), states=("x", "vx"))
-    A, _ = at_numbers(model, bob)
-    assert_close(A, exact_model.A, rtol)
-    assert str(sp.simplify(model.A[1, 0])) == "-981/(100*length)"
+def test_a_linear_model_with_a_constraint():
+    model = jk.symbolic.linearize(Bob(), {"y": "-length"}, states=("x", "vx"))
+    assert str(sp.simplify(model.A)) == "Matrix([[0, 1], [-981/(100*length), 0]])"
 
 
 def test_a_linear_model_with_dependent_coordinates():
@@ -258,26 +252,6 @@ def test_linearization_at_an_invalid_state_is_rejected():
         jk.symbolic.linearize(pendulum, states=("mass",))
     with pytest.raises(ValueError, match=r"1 configuration constraints .* 0 are named"):
         jk.symbolic.linearize(Bob(), {"y": -1}, dependent=())
-
-
-@pytest.mark.slow
-def test_a_model_imported_from_sympy_exports_the_same_equations():
-    """A model of `sympy.physics.mechanics`, made a system, has SymPy's own mass matrix and right side again."""
-    me = pytest.importorskip("sympy.physics.mechanics")
-    q, u = me.dynamicsymbols("q u")
-    m, l, g = sp.symbols("m l g")
-    N, O = me.ReferenceFrame("N"), me.Point("O")
-    O.set_vel(N, 0)
-    A = N.orientnew("A", "Axis", [q, N.z])
-    A.set_ang_vel(N, u * N.z)
-    P = O.locatenew("P", -l * A.y)
-    P.v2pt_theory(O, N, A)
-    kane = me.KanesMethod(N, [q], [u], kd_eqs=[q.diff() - u])
-    kane.kanes_equations([me.Particle("P", P, m)], [(P, -m * g * N.y)])
-    found = jk.symbolic.equations(jk.convert.from_sympy(kane, {m: 1.0, l: 0.5, g: 9.81})).simplified()
-    back = {found.symbols[x.name]: x for x in (m, l, g)} | dict(zip((*found.q, *found.u), (q, u), strict=True))
-    assert sp.simplify(found.M.xreplace(back) - kane.mass_matrix).is_zero_matrix
-    assert sp.simplify(found.f.xreplace(back) - kane.forcing).is_zero_matrix
 
 
 def test_the_error_without_sympy_states_the_package_to_install(monkeypatch):
