@@ -100,14 +100,10 @@ class Controller:
         self.rng, self.push = np.random.default_rng(1), push
 
     def method(self, t, state):
-        counts[id(self)] = counts.get(id(self), 0) + 1
         return self.push + 0.0 * self.rng.random()
 
     def __call__(self, t, state):
         return {"push": self.push}
-
-
-counts: dict[int, int] = {}
 
 
 @dataclasses.dataclass
@@ -178,21 +174,6 @@ def test_reduce_functions_are_freed_with_their_programs(system):
     gone = swept(2.0)
     gc.collect()
     assert gone() is None
-
-
-@pytest.mark.slow
-def test_methods_of_objects_without_weak_references_are_compiled_once(system):
-    controller, other = Controller(1.0), Controller(1.0)
-    pushed = [last(system, {"push": controller.method}, step=0.1)]
-    n = counts[id(controller)]
-    pushed.append(last(system, {"push": controller.method}, step=0.1))
-    assert counts[id(controller)] == n
-    assert pushed == pytest.approx([expected(4.0, 1.0)] * 2, rel=1e-5)
-    controller.rng = np.random.default_rng(1)  # another object
-    last(system, {"push": controller.method}, step=0.1)
-    assert counts[id(controller)] > n
-    last(system, {"push": other.method}, step=0.1)
-    assert counts[id(other)] > 0
 
 
 @pytest.mark.slow

@@ -21,7 +21,6 @@ import pytest
 
 import jaxkane as jk
 from jaxkane._scalarjit.cache_key import version_of
-from jaxkane._scalarjit.scalar_function import ScalarFunction
 
 RTOL = 1e-12
 TS = np.linspace(0.0, 0.2, 3)
@@ -409,23 +408,6 @@ def test_unchanged_systems_are_not_retraced(monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
     assert accelerate(system) == pytest.approx(1.62, rel=RTOL)
     assert len(calls) > n
-
-
-def test_restored_values_reuse_their_program():
-    seen = []
-
-    @ScalarFunction
-    def program(x, f):
-        seen.append(f())
-        return x * f()
-
-    space = {"g": 2.0}
-    exec("def f():\n    return g", space)
-    f, x = jax.tree_util.Partial(space["f"]), jnp.array(3.0)
-    for g, expected in [(2.0, 6.0), (5.0, 15.0), (2.0, 6.0), (2, 6.0)]:
-        space["g"] = g
-        assert float(program(x, f)) == expected
-    assert seen == [2.0, 5.0, 2]
 
 
 def test_nan_signed_zeros_and_arrays_of_other_types_are_distinguished():

@@ -10,13 +10,10 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-import equinox._errors as checks
-import jax
 import pytest
 
 from jaxkane._scalarjit.backends import native
 from jaxkane._scalarjit.backends.native import switched_on
-from jaxkane._scalarjit.compat import storable_checks
 from jaxkane._scalarjit.configure import _made_folder, _split_cpu, configure
 
 KERNELS = f"no native kernels ({native.why_not()})" if native.why_not() else "native kernels"
@@ -253,8 +250,6 @@ def test_equinox_checks_of_the_user_raise_with_a_cache(cache, python):
         "print(jax.config.jax_compilation_cache_dir, raises())"
     )
     assert python(code).stdout.splitlines() == ["True True True False", "None True"]
-
-
 
 
 @pytest.mark.parametrize("devices", ["2", True, 2.5, 0])

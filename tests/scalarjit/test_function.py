@@ -123,20 +123,6 @@ def test_operations_with_exchanged_operands_are_different():
     np.testing.assert_allclose(f(jnp.array(a), jnp.array(b)), expected, rtol=1e-14)
 
 
-def test_a_function_is_traced_once():
-    calls = []
-
-    @ScalarFunction
-    def counted(x):
-        calls.append(1)
-        return jnp.sin(x)
-
-    for _ in range(3):
-        counted(jnp.array(1.0))
-    jax.jit(lambda x: counted(x) + counted(2 * x))(jnp.array(1.0))
-    assert len(calls) <= 2  # one for a strong type, one for what the tracer makes of it
-
-
 # Each of these once ended the process: XLA checks, and aborts, where a parameter is never read.
 CRASHES = """
 import jax, jax.numpy as jnp
