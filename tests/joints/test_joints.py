@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from benchmarks.chain import Chain
+from programs import operations
 
 import jaxkane as jk
 from jaxkane.fit.problem.from_declarations import parameters_of
@@ -579,3 +581,28 @@ def test_dry_friction_is_a_contact_of_a_mechanism():
 def test_a_mechanism_has_at_most_four_stops():
     with pytest.raises(ValueError, match=r"6 contacts, which are the limits of q0, q1, q2. At most 4 .* fewer joints"):
         mechanism(pendulums(3, stops=(-1.0, 1.0)))
+
+
+# Chains of many links: columns of M and f by transposition
+
+
+@pytest.mark.weekly
+def test_the_energy_of_a_long_chain_is_conserved():
+    chain, rng = Chain(n=14), np.random.default_rng(0)
+    state = jk.State(0.3 * rng.uniform(-2, 2, 14), 0.5 * rng.normal(size=14))
+    ride = jk.simulate(chain, state, jnp.linspace(0.0, 0.5, 6), rtol=1e-9, atol=1e-9)
+
+    def energies(q, u):
+        motion = chain.motion(0.0, q, u)
+        height = sum(body.mass * body.center.position.to(motion.N)[2] for body in motion.bodies)
+        return jk.kinetic_energy(chain, 0.0, q, u), 9.81 * height
+
+    T, V = jax.jit(jax.vmap(energies))(ride.q, ride.u)
+    np.testing.assert_allclose(T + V, T[0] + V[0], rtol=0, atol=1e-7 * T[-1])
+    assert float(jnp.abs(ride.q[-1] - ride.q[0]).max()) > 0.3
+
+
+@pytest.mark.slow
+def test_the_operation_count_is_proportional_to_the_number_of_links():
+    of_10, of_40 = (operations("column of M", Chain(n=n), jnp.ones(n), jnp.ones(n), jnp.ones(n)) for n in (10, 40))
+    assert of_40 < 4.6 * of_10 < 4.6 * 700
