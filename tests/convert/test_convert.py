@@ -5,7 +5,6 @@ import json
 import sys
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -162,38 +161,6 @@ def test_omitted_elements_are_reported():
     assert system.inputs == ("T",)
     with pytest.raises(ValueError, match=r"not supported: .*contacts"):
         jk.convert.from_mjcf(text, strict=True)
-
-
-LIMITED = BODY.format(' range="20 90"').replace(
-    'size=".1"', 'type="capsule" fromto="0 0 0 0 0 -0.6" size=".02" contype="0"'
-)
-
-
-@pytest.mark.weekly
-@needs_mujoco
-def test_a_limit_of_a_joint_is_a_contact():
-    """A pendulum falls from 1 rad to its limit at 20 degrees: J w^2 / 2 = m g l (cos(limit) - cos(1)).
-
-    The time is the integral of 1/w, with sin(angle / 2) = sin(1/2) sin(s): a Gauss-Legendre quadrature of a smooth
-    function. The limit takes the energy. Then its torque balances the weight.
-    """
-    system = jk.convert.from_mjcf(mjcf(LIMITED), stops=["j"], strict=True)
-    assert system.left_out == ()
-    lower = float(system.lower["j"])
-    np.testing.assert_allclose([lower, float(system.upper["j"])], np.deg2rad([20.0, 90.0]), rtol=1e-12)
-    start, g = jk.State([1.0], [0.0]), 9.81
-    ride = jk.simulate(system, start, jnp.linspace(0.0, 1.0, 5), rtol=1e-11, atol=1e-11)
-    assert (int(ride.jumps.count), ride.jumps.name(0)) == (1, "j lower")
-    J, ml = float(jk.mass_matrix(system, 0.0, [0.0], [0.0])[0, 0]), float(system.mass["a"]) * 0.3
-    np.testing.assert_allclose(ride.jumps.before.u[0, 0], -np.sqrt(2 * ml * g / J * (np.cos(lower) - np.cos(1.0))))
-    k = np.sin(0.5)
-    last = np.arcsin(np.sin(0.5 * lower) / k)
-    nodes, weights = np.polynomial.legendre.leggauss(30)
-    s = last + 0.5 * (0.5 * np.pi - last) * (nodes + 1.0)
-    time = 0.5 * (0.5 * np.pi - last) * np.sqrt(J / (ml * g)) * weights @ (1.0 / np.sqrt(1.0 - (k * np.sin(s)) ** 2))
-    np.testing.assert_allclose(ride.jumps.t[0], time, rtol=1e-9)
-    np.testing.assert_allclose([ride["j"][-1], ride["j_rate"][-1]], [lower, 0.0], atol=1e-14)
-    np.testing.assert_allclose(ride["j lower.normal"][-1], ml * g * np.sin(lower), rtol=1e-9)
 
 
 @needs_mujoco

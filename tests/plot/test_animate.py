@@ -1,15 +1,12 @@
 """Animations: everything is where the description says, and the page shows it, in a browser and without one."""
 
 import base64
-import gc
 import json
 import re
 import tempfile
 import time
-import weakref
 
 import browser
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -139,8 +136,6 @@ def test_the_bicycle_is_drawn_on_the_ground_and_followed_by_the_camera(weaving):
     assert np.ptp(center_of_mass[:, 0]) == pytest.approx(50.0, rel=1e-3)
 
 
-
-
 def test_custom_figure_has_the_correct_positions(swing):
     """Lines keep their places whatever they are fixed in: a body, the ground, or nothing (1e-9 m)."""
     system, trajectory, _ = swing
@@ -177,22 +172,6 @@ def test_the_page_is_small_and_has_no_external_resources(weaving):
     frame = weaving._repr_html_()
     assert frame.startswith("<iframe srcdoc=")
     assert '"' not in frame.split('srcdoc="')[1].split('" title=')[0]
-
-
-@pytest.mark.slow
-def test_a_custom_figure_is_garbage_collected(swing):
-    system, trajectory, _ = swing
-    size = np.ones(1000)
-
-    def figure(system, motion, sketch):
-        body = motion.bodies[0]
-        sketch.line("gold", body, body.center.position + float(size[0]) * motion.N.x)
-
-    jk.animate(system, trajectory, figure)
-    alive = weakref.ref(figure)
-    del figure
-    gc.collect()
-    assert alive() is None
 
 
 def test_invalid_arguments_of_animate_are_rejected(ride, swing, tmp_path):

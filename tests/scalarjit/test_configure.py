@@ -51,23 +51,6 @@ rides = jk.sweep.sweep(P, start, np.linspace(0.0, 1.0, 6), table={"length": [1.0
 assert rides.reason == ["completed", "completed", "invalid"]
 print(len(hits), len(misses), ride.q.dtype, np.asarray(ride.q).tobytes().hex(), rides.q.tobytes().hex())
 """
-REFUSALS = """
-import pytest
-def refused(message, f, *args):
-    with pytest.raises(ValueError, match=message):
-        f(*args)
-ts = np.linspace(0.0, 1.0, 6)
-top = jk.catalog.CATALOG["SpinningTop"].example()
-refused("violate the configuration constraints", jk.simulate, top, jk.State(np.full(4, 0.1), np.zeros(3)), ts)
-class Light(jk.System):
-    mass: jk.Scalar = jk.parameter(0.0)
-    coordinates = ("x",)
-    speeds = ("v",)
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
-refused("Light", jk.simulate, Light(), jk.State(np.zeros(1), np.zeros(1)), ts)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -109,11 +92,6 @@ def test_compiled_simulations_are_reused_by_the_next_process(first, cache, pytho
     assert int(hits) >= int(compiled)
     assert bytes_of_second == bytes_of_first
     assert len(second) == 1  # and nothing else was printed
-
-
-@pytest.mark.weekly
-def test_exceptions_are_raised_with_a_cache(cache, python):
-    python(f"jk.configure(cache={str(cache)!r}, verbose=False)\n" + REFUSALS)
 
 
 def test_child_processes_inherit_the_configuration_without_repeated_output(cache, python):
