@@ -192,52 +192,32 @@ def test_a_class_that_was_copied_by_cloudpickle_is_simulated():
     assert last(copy(), step=0.1) == pytest.approx(expected(4.0), rel=1e-5)
 
 
-class Mapped:
-    """A process in which each result of some caches is `each` memory mappings, and other code has `others`."""
-
-    def __init__(self, monkeypatch, each, others=0, most=65530):
-        self.caches = [Cache(programs=True), Cache(programs=True)]
-        self.each, self.others, self.most = each, others, most
-        monkeypatch.setattr(cache, "memory_mappings", self.count)
-        monkeypatch.setattr(Cache, "all", lambda: self.caches)
-        self.limit = cache._Limit()
-        monkeypatch.setattr(cache, "LIMIT", self.limit)
-
-    def count(self):
-        return self.others + self.each * sum(map(len, self.caches)), self.most
-
-
-def test_the_least_recently_used_programs_are_dropped(monkeypatch):
-    process = Mapped(monkeypatch, each=100, others=1000)
-    a, b = process.caches
-    for i in range(100):
-        (a if i % 2 else b).keep(i, [i])
-        a.known(1, None)
-        assert process.count()[0] <= 4100
-    assert a.known(1) == [1]
-    assert a.known(99) == [99]
-    assert a.known(3, None) is b.known(0, None) is None
-    assert process.limit.mappings == 4000
+def process_with(monkeypatch, each, others=0):
+    """A cache each of whose results is `each` memory mappings, in a process whose other code has `others`."""
+    programs, limit = Cache(programs=True), cache._Limit()
+    monkeypatch.setattr(cache, "memory_mappings", lambda: (others + each * len(programs), 65530))
+    monkeypatch.setattr(Cache, "all", lambda: [programs])
+    monkeypatch.setattr(cache, "LIMIT", limit)
+    return programs, limit
 
 
 def test_the_limit_increases_if_dropped_programs_are_used_again(monkeypatch):
-    process, made = Mapped(monkeypatch, each=100), []
+    (programs, limit), made = process_with(monkeypatch, each=100), []
     for _ in range(5):
         made.append(0)
         for i in range(60):
-            process.caches[0].get(i, lambda: made.__setitem__(-1, made[-1] + 1))
-    assert made[0] == 60
-    assert made[2:] == [0, 0, 0]
-    assert process.limit.mappings == 8000
+            programs.get(i, lambda: made.__setitem__(-1, made[-1] + 1))
+    assert (made[0], made[2:]) == (60, [0, 0, 0])
+    assert limit.mappings == 8000
 
 
 def test_a_warning_is_issued_before_the_limit_of_memory_mappings(monkeypatch):
-    process = Mapped(monkeypatch, each=10, others=50_000)
-    with pytest.warns(UserWarning, match=r"50\d\d\d memory mappings, and Linux terminates it at 65530.*jaxkane.forget"):
-        process.caches[0].keep(0, 0)
+    programs, _ = process_with(monkeypatch, each=10, others=50_000)
+    with pytest.warns(UserWarning, match=r"50\d\d\d memory mappings, .* at 65530.*jaxkane.forget"):
+        programs.keep(0, 0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        process.caches[0].keep(1, 1)
+        programs.keep(1, 1)
 
 
 def test_caches_are_thread_safe_while_owners_are_deleted():
