@@ -1,4 +1,4 @@
-"""MJCF and URDF files brought over, held to MuJoCo's own accelerations. Without MuJoCo most are skipped."""
+"""MJCF and URDF files brought over, held to MuJoCo's own accelerations. Without MuJoCo they are skipped."""
 
 import importlib.util
 import json
@@ -12,7 +12,7 @@ import jaxkane as jk
 
 RTOL = 1e-10
 FIGURES = json.loads((Path(__file__).parents[1] / "data" / "mujoco_tree.json").read_text())
-needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="needs MuJoCo: pip install mujoco")
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="needs MuJoCo: pip install mujoco")
 
 LOOP = """<mujoco model="fourbar"><option><flag contact="disable"/></option><worldbody>
  <body name="a"><joint name="j1" axis="0 1 0" damping="0.1"/><geom type="capsule" fromto="0 0 0 0 0 0.3" size=".02"/>
@@ -36,7 +36,6 @@ def mjcf(body, rest=""):
 
 
 @pytest.mark.slow
-@needs_mujoco
 def test_an_imported_kinematic_tree_agrees_with_mujoco():
     system = jk.convert.from_mjcf(FIGURES["model"], strict=True)  # nothing is left out
     assert type(system).__name__ == "tree"
@@ -48,7 +47,6 @@ def test_an_imported_kinematic_tree_agrees_with_mujoco():
         np.testing.assert_allclose(u_dot, state["u_dot"], rtol=RTOL, atol=RTOL * np.abs(state["u_dot"]).max())
 
 
-@needs_mujoco
 def test_a_file_is_read_from_its_path_and_sites_become_points(tmp_path):
     path = tmp_path / "tree.xml"
     path.write_text(FIGURES["model"])
@@ -67,7 +65,6 @@ def test_a_file_is_read_from_its_path_and_sites_become_points(tmp_path):
     np.testing.assert_allclose(tip.to(tip.frame.root), data.site("tip").xpos, rtol=1e-12)
 
 
-@needs_mujoco
 def test_accelerations_of_a_closed_loop_agree_with_mujoco():
     import mujoco
 
@@ -97,7 +94,6 @@ def test_accelerations_of_a_closed_loop_agree_with_mujoco():
 
 
 @pytest.mark.slow_cases(all_but=["<weld site1=*", '<connect body1="a" anchor=*'])
-@needs_mujoco
 @pytest.mark.parametrize(
     "equality",
     [
@@ -129,7 +125,6 @@ def test_a_loop_is_closed_at_the_poses_of_the_file(equality):
 
 
 @pytest.mark.slow
-@needs_mujoco
 def test_joint_equalities_become_dependent_coordinates():
     degree = '<equality><joint joint1="k" joint2="j" polycoef="0 2 0.5 0 0"/></equality>'
     two = BODY.format("") + BODY.replace('"a"', '"b"').replace('"j"', '"k"').format("")
@@ -144,7 +139,6 @@ def test_joint_equalities_become_dependent_coordinates():
     assert follows == pytest.approx(2 * turned + 0.5 * turned**2, rel=1e-12)
 
 
-@needs_mujoco
 def test_omitted_elements_are_reported():
     text = mjcf(
         '<geom type="plane" size="1 1 1"/>' + BODY.format(' range="-90 90" frictionloss="0.1"'),
@@ -163,7 +157,6 @@ def test_omitted_elements_are_reported():
         jk.convert.from_mjcf(text, strict=True)
 
 
-@needs_mujoco
 def test_only_the_limits_in_stops_become_contacts():
     limited = BODY.format(' range="-9 9"').replace("<geom ", '<geom contype="0" ')
     three = "".join(limited.replace('"a"', f'"{name}"').replace('"j"', f'"{name}"') for name in "klm")
@@ -183,7 +176,6 @@ def test_only_the_limits_in_stops_become_contacts():
     assert not jk.convert.from_mjcf(mjcf(three, off), stops=True, strict=True).lower
 
 
-@needs_mujoco
 def test_limits_of_actuator_forces_on_a_joint_are_reported():
     limited = BODY.format(' actuatorfrcrange="-0.1 0.1"').replace("<geom ", '<geom contype="0" ')
     with pytest.warns(UserWarning, match="limits of controls and forces"):
@@ -191,7 +183,6 @@ def test_limits_of_actuator_forces_on_a_joint_are_reported():
     jk.convert.from_mjcf(mjcf(limited), strict=True)  # nothing is driven
 
 
-@needs_mujoco
 @pytest.mark.parametrize(("first", "second"), [("j_1", "j.1"), ("j.1", "j_1")])
 def test_names_that_become_identical_are_rejected(first, second):
     links = f"""<body name="a"><joint name="{first}" axis="0 1 0"/><geom size=".1"/>
@@ -203,7 +194,6 @@ def test_names_that_become_identical_are_rejected(first, second):
         jk.convert.from_mjcf(mjcf(BODY.format(""), motors))
 
 
-@needs_mujoco
 def test_friction_of_joints_becomes_dry_friction():
     rough = BODY.format(' frictionloss="0.1"').replace("<geom ", '<geom contype="0" ')
     with pytest.warns(UserWarning, match="friction of joints"):
@@ -215,7 +205,6 @@ def test_friction_of_joints_becomes_dry_friction():
     assert not jk.convert.from_mjcf(mjcf(rough, off), friction=True, strict=True).friction
 
 
-@needs_mujoco
 def test_conflicting_and_missing_names_are_replaced():
     off = "<option><flag contact='disable'/></option>"
     text = mjcf(
@@ -233,7 +222,6 @@ def test_conflicting_and_missing_names_are_replaced():
     assert float(system.mass["body2"]) == pytest.approx(1000 * 4 / 3 * np.pi * 0.1**3)
 
 
-@needs_mujoco
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -248,7 +236,6 @@ def test_a_file_that_is_not_a_mechanism_is_rejected(text, words):
         jk.convert.from_mjcf(text)
 
 
-@needs_mujoco
 def test_elements_disabled_by_flags_are_omitted():
     two = BODY.format(' stiffness="2" damping="1"') + BODY.replace('"a"', '"b"').replace('"j"', '"k"').format("")
     rest = '<equality><joint joint1="k" joint2="j"/></equality><actuator><motor joint="j" group="3"/></actuator>'
@@ -263,7 +250,6 @@ def test_elements_disabled_by_flags_are_omitted():
     assert not jk.convert.from_mjcf(mjcf(two, off + rest), strict=True).inputs
 
 
-@needs_mujoco
 def test_a_missing_file_is_reported():
     with pytest.raises(FileNotFoundError, match=r"'nowhere.xml' does not exist"):
         jk.convert.from_mjcf("nowhere.xml")
@@ -286,7 +272,6 @@ TRUSS = """<mujoco model="truss"><option><flag contact="disable"/></option><worl
 <keyframe><key name="bent" qpos=".1 .1 -.1 .5 .5 .5 .5"/></keyframe></mujoco>"""
 
 
-@needs_mujoco
 def test_poses_of_a_file_and_nearly_redundant_loop_constraints():
     """An axis of five digits: the residual normal to the plane would lock the loop."""
     with pytest.warns(UserWarning, match=r"Loop\('pin_1', 'pin_2'\) \(.*\).*") as told:

@@ -15,19 +15,14 @@ import pytest
 
 import jaxkane as jk
 
+sm = pytest.importorskip("sympy")
+import sympy.physics.mechanics as me  # noqa: E402
+
 RTOL = 1e-12
 FIGURES = json.loads((Path(__file__).parents[1] / "data" / "sympy_kane_systems.json").read_text())["systems"]
 
 
-@pytest.fixture(scope="module")
-def me():
-    pytest.importorskip("sympy")
-    import sympy.physics.mechanics
-
-    return sympy.physics.mechanics
-
-
-def spring_mass_damper(me, sm):
+def spring_mass_damper():
     (q, u), (m, c, k) = me.dynamicsymbols("q u"), sm.symbols("m c k")
     N, P = me.ReferenceFrame("N"), me.Point("P")
     P.set_vel(N, u * N.x)
@@ -35,7 +30,7 @@ def spring_mass_damper(me, sm):
     return me.KanesMethod(N, [q], [u], [q.diff() - u], bodies=[mass], forcelist=[(P, (-k * q - c * u) * N.x)])
 
 
-def rolling_disc_dependent(me, sm):
+def rolling_disc_dependent():
     q, u, ua = me.dynamicsymbols("q:4"), me.dynamicsymbols("u:6"), me.dynamicsymbols("ua:3")
     r, m, g, I, J = sm.symbols("r m g I J")
     N = me.ReferenceFrame("N")
@@ -67,7 +62,7 @@ def rolling_disc_dependent(me, sm):
     )
 
 
-def four_bar_linkage(me, sm):
+def four_bar_linkage():
     """A System of joints, whose loop is closed by constraints."""
     l1, l2, l3, l4, rho = sm.symbols("l1:5 rho")
     q, u = me.dynamicsymbols("q1:4"), me.dynamicsymbols("u1:4")
@@ -86,7 +81,7 @@ def four_bar_linkage(me, sm):
     return system
 
 
-def pendulum_on_cart(me, sm):
+def pendulum_on_cart():
     from sympy.physics.mechanics.models import n_link_pendulum_on_cart
 
     return n_link_pendulum_on_cart(3, True, True)  # its equations are formed already
@@ -100,16 +95,14 @@ MODELS = {
 }
 
 
-def brought(me, model, **more):
-    import sympy
-
-    return jk.convert.from_sympy(MODELS[model](me, sympy), FIGURES[model]["params"], **more)
+def brought(model, **more):
+    return jk.convert.from_sympy(MODELS[model](), FIGURES[model]["params"], **more)
 
 
 @pytest.mark.slow_cases(all_but=["one_dof_spring_mass_damper"])
 @pytest.mark.parametrize("name", MODELS)
-def test_accelerations_of_an_imported_model_agree_with_sympy(me, name):
-    system = brought(me, name)
+def test_accelerations_of_an_imported_model_agree_with_sympy(name):
+    system = brought(name)
     speeds = (*system.speeds, *system.dependent_speeds)
     for state in FIGURES[name]["states"]:
         at = [
@@ -122,9 +115,9 @@ def test_accelerations_of_an_imported_model_agree_with_sympy(me, name):
 
 
 @pytest.mark.slow
-def test_an_imported_model_supports_the_functions_of_a_system(me):
-    system = brought(me, "n_link_pendulum_on_cart_n3", name="Cart")
-    again = brought(me, "n_link_pendulum_on_cart_n3", name="Cart")
+def test_an_imported_model_supports_the_functions_of_a_system():
+    system = brought("n_link_pendulum_on_cart_n3", name="Cart")
+    again = brought("n_link_pendulum_on_cart_n3", name="Cart")
     assert type(system) is type(again)  # one model, one class
     assert type(system).__name__ == "Cart"
     assert system.inputs == ("F", "T1", "T2", "T3")
@@ -135,7 +128,7 @@ def test_an_imported_model_supports_the_functions_of_a_system(me):
     np.testing.assert_allclose(slope, (alpha(m + 1e-5) - alpha(m - 1e-5)) / 2e-5, rtol=1e-6)
 
 
-def double_pendulum(me, sm):
+def double_pendulum():
     q1, q2, F = me.dynamicsymbols("q1 q2 F")
     m, l, g, k = sm.symbols("m l g k", positive=True)
     N, O = me.ReferenceFrame("N"), me.Point("O")
@@ -153,10 +146,8 @@ def double_pendulum(me, sm):
 
 
 @pytest.mark.slow
-def test_accelerations_of_a_lagrangian_with_bodies_agree_with_sympy(me):
-    import sympy as sm
-
-    lagrange, O = double_pendulum(me, sm)
+def test_accelerations_of_a_lagrangian_with_bodies_agree_with_sympy():
+    lagrange, O = double_pendulum()
     values = {"m": 1.2, "l": 0.7, "g": 9.81, "k": 2.0}
     system = jk.convert.from_sympy(lagrange, values, origin=O)
     assert system.speeds == ("q1_dot", "q2_dot")
@@ -175,9 +166,7 @@ def test_accelerations_of_a_lagrangian_with_bodies_agree_with_sympy(me):
     np.testing.assert_allclose(place, [0.7 * (np.cos(0.3) + np.cos(0.4)), 0.7 * (np.sin(0.3) + np.sin(0.4)), 0.0])
 
 
-def test_a_model_with_explicit_time_dependence(me):
-    import sympy as sm
-
+def test_a_model_with_explicit_time_dependence():
     q, u, t = *me.dynamicsymbols("q u"), me.dynamicsymbols._t
     a, w = sm.symbols("a w")
     N, O = me.ReferenceFrame("N"), me.Point("O")
@@ -189,7 +178,7 @@ def test_a_model_with_explicit_time_dependence(me):
     np.testing.assert_allclose(jk.accelerations(system, 0.4, [0.1], [0.2]), [0.3 * 4 * np.sin(0.8)], rtol=1e-13)
 
 
-def pendulum_on_a_shaker(me, sm):
+def pendulum_on_a_shaker():
     """A bar with J about its mass centre, whose pivot moves along N.x by z(t)."""
     q, u, z = me.dynamicsymbols("q u z")
     m, l, g, I, J = sm.symbols("m l g I J")
@@ -207,11 +196,9 @@ def pendulum_on_a_shaker(me, sm):
 
 
 @pytest.mark.slow
-def test_a_prescribed_motion_is_an_expression_or_a_function(me):
+def test_a_prescribed_motion_is_an_expression_or_a_function():
     """(J + m l^2) u_dot = -m g l sin(q) + m l sin(q) z_dot_dot. The moments I are not read and need no value."""
-    import sympy as sm
-
-    kane, z, O = pendulum_on_a_shaker(me, sm)
+    kane, z, O = pendulum_on_a_shaker()
     values, t = {"m": 1.2, "l": 0.5, "g": 9.81, "J": 0.02}, me.dynamicsymbols._t
     w = sm.symbols("w")
     systems = [
@@ -238,9 +225,7 @@ def test_a_prescribed_motion_is_an_expression_or_a_function(me):
 
 
 @pytest.mark.slow
-def test_a_lagrangian_with_a_prescribed_motion(me):
-    import sympy as sm
-
+def test_a_lagrangian_with_a_prescribed_motion():
     q, z = me.dynamicsymbols("q z")
     m, l, g = sm.symbols("m l g")
     velocity = z.diff() - l * sm.sin(q) * q.diff(), l * sm.cos(q) * q.diff()
@@ -251,11 +236,9 @@ def test_a_lagrangian_with_a_prescribed_motion(me):
     np.testing.assert_allclose(jk.accelerations(system, 0.4, [0.3], [0.2]), [expected], rtol=RTOL)
 
 
-def test_missing_values_and_unknown_symbols_are_rejected(me):
-    import sympy as sm
-
+def test_missing_values_and_unknown_symbols_are_rejected():
     params = FIGURES["one_dof_spring_mass_damper"]["params"]
-    kane = spring_mass_damper(me, sm)
+    kane = spring_mass_damper()
     for given, words in (({}, "no value for c, k, m"), (params | {"mass": 1.0}, "no symbol mass")):
         with pytest.raises(ValueError, match=words):
             jk.convert.from_sympy(kane, given)
@@ -282,9 +265,7 @@ def test_missing_values_and_unknown_symbols_are_rejected(me):
 
 
 @pytest.mark.slow
-def test_unsupported_sympy_functions_are_rejected(me):
-    import sympy as sm
-
+def test_unsupported_sympy_functions_are_rejected():
     q, u, m = *me.dynamicsymbols("q u"), sm.symbols("m")
     N, P = me.ReferenceFrame("N"), me.Point("P")
     P.set_vel(N, u * N.x)

@@ -20,9 +20,9 @@ fmpy = pytest.importorskip("fmpy")
 validate_fmu = pytest.importorskip("fmpy.validation").validate_fmu
 CallFailed = pytest.importorskip("fmpy.fmi1").FMICallException
 CC = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler")
 VERSIONS, KINDS = ("2.0", "3.0"), ("ModelExchange", "CoSimulation")
 pytestmark = [
+    pytest.mark.skipif(CC is None, reason="no C compiler"),
     pytest.mark.filterwarnings("ignore:.*its description uses"),
     pytest.mark.filterwarnings("error:jaxkane.export.fmu"),  # of a failure of the compiler
 ]
@@ -204,7 +204,6 @@ class Unit:
 
 
 @pytest.mark.slow_cases(all_but=["Bob-2.0", "Driven-3.0"])
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 @pytest.mark.parametrize(
     "name", ["Driven", "Bob", "Ball", "Odd", *(pytest.param(n, marks=pytest.mark.weekly) for n in CATALOG)]
@@ -223,7 +222,6 @@ def test_fmpy_validates_the_fmu(name, fmi, fmu_of):
 
 
 @pytest.mark.slow
-@needs_compiler
 @pytest.mark.parametrize(
     ("fmi", "kind"), [("2.0", "co-simulation"), ("3.0", "co-simulation"), ("3.0", "model exchange")]
 )
@@ -239,7 +237,6 @@ def test_an_fmu_for_co_simulation_or_model_exchange_only(fmi, kind, tmp_path):
 
 
 @pytest.mark.slow
-@needs_compiler
 def test_the_source_compiles_without_warnings(fmu_of, tmp_path):
     for name, system in {"Driven": Driven(), "Bob": Bob(), "Ball": Ball()}.items():
         for fmi in VERSIONS:
@@ -250,7 +247,6 @@ def test_the_source_compiles_without_warnings(fmu_of, tmp_path):
             subprocess.run([CC, *flags, "-c", file, "-o", tmp_path / "o"], check=True)
 
 
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_variables_have_units_bounds_and_dependencies(fmi, fmu_of):
     description = fmpy.read_model_description(fmu_of(Driven(), fmi))
@@ -281,7 +277,6 @@ def test_variables_have_units_bounds_and_dependencies(fmi, fmu_of):
     assert {"angle", "parameters.angle", "moments[2]", "part.mass", "θ0"} < set(names)
 
 
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_simulation_agrees_with_the_analytical_solution(fmi, kind, fmu_of):
@@ -308,7 +303,6 @@ def test_the_simulation_agrees_with_the_analytical_solution(fmi, kind, fmu_of):
     np.testing.assert_allclose([[*row][1:] for row in found], expected, rtol=0, atol=atol)
 
 
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_parameters_inputs_and_states_can_be_set_between_steps(fmi, fmu_of):
     """A changed parameter and input, a restored state, a serialized one, and a new start, by the matrix exponential."""
@@ -343,7 +337,6 @@ def test_parameters_inputs_and_states_can_be_set_between_steps(fmi, fmu_of):
         assert unit.get("time", "x", "mass", "command") == pytest.approx((0.0, 0.1, 2.0, 0.0), rel=0)
 
 
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_directional_derivatives(fmi, fmu_of):
     """Of a linear system its matrices; by a parameter, and of a pendulum, those of JAX."""
@@ -372,7 +365,6 @@ def test_directional_derivatives(fmi, fmu_of):
         np.testing.assert_allclose(np.transpose(found), expected, rtol=rtol, atol=1e-14)
 
 
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_events_reset_states_and_end_the_simulation(fmi, kind, fmu_of):
@@ -396,7 +388,6 @@ def test_events_reset_states_and_end_the_simulation(fmi, kind, fmu_of):
     assert early["time"][-1] == pytest.approx(0.33, abs=0.03)
 
 
-@needs_compiler
 @pytest.mark.parametrize("kind", KINDS)
 def test_time_events_occur_once(kind, fmu_of):
     """Also at the start, and at a communication point. The sine rises through zero at 0, 0.314, 0.628 and 0.942 s."""
@@ -405,7 +396,6 @@ def test_time_events_occur_once(kind, fmu_of):
 
 
 @pytest.mark.slow_cases(all_but=["3.0"])
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_events_occur_as_in_simulate(fmi, tmp_path):
     """A kick that does not reverse, events of place and time at one instant, a function that touches zero, an impact
@@ -430,7 +420,6 @@ def test_events_occur_as_in_simulate(fmi, tmp_path):
         assert unit.get("log")[0] == 2.0
 
 
-@needs_compiler
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("restitution", [0.0, 0.5])
 def test_a_ball_does_not_fall_through_the_floor(kind, restitution, fmu_of):
@@ -443,7 +432,6 @@ def test_a_ball_does_not_fall_through_the_floor(kind, restitution, fmu_of):
 
 
 @pytest.mark.slow
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_singular_dependent_speeds_end_the_simulation(fmi, fmu_of):
     """A bead on a circle, x = sin t: at pi/2 its vertical speed no longer follows from the horizontal one. Steps of
@@ -464,7 +452,6 @@ def test_singular_dependent_speeds_end_the_simulation(fmi, fmu_of):
 
 
 @pytest.mark.slow
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_start_values_satisfy_the_constraints(fmi, fmu_of):
     atol = 1e-12
@@ -481,7 +468,6 @@ def test_start_values_satisfy_the_constraints(fmi, fmu_of):
         assert unit.get("rod", "x") == pytest.approx((rod, 0.15 * np.cos(1.0) + 0.4 * np.cos(rod)), abs=atol)
 
 
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_wrong_values_and_calls_are_refused(fmi, fmu_of):
     with Unit(fmu_of(Driven(), fmi)) as unit:
@@ -567,7 +553,6 @@ def test_a_traced_system_is_refused(tmp_path):
         jax.eval_shape(lambda mass: jk.export.fmu(Driven(mass), tmp_path / "driven.fmu") and mass, jnp.ones(()))
 
 
-@needs_compiler
 def test_without_a_compiler_the_fmu_contains_sources(tmp_path, monkeypatch):
     path = tmp_path / "driven.fmu"
     monkeypatch.setenv("CC", "no-such-compiler")

@@ -121,7 +121,6 @@ def test_a_line_has_a_gap_at_each_jump():
             np.testing.assert_allclose(y[gaps + 1], sides[1] * times)
             assert np.all(np.diff(t) >= 0)
             assert len(t) == 41 + 3 * count[k]
-    plt.close("all")
 
 
 ODD = ("a$_{b$", "$c")
@@ -148,7 +147,6 @@ def test_names_are_not_interpreted_as_mathematics():
     for axes in drawn:
         np.ravel(axes)[0].figure.savefig(io.BytesIO(), format="svg")
     assert drawn[0][0].get_ylabel() == r"a\$ {b\$" + "\n" + r"[m\$^{\$]"
-    plt.close("all")
 
 
 def test_units_passed_as_an_argument():
