@@ -3,7 +3,6 @@
 import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -159,15 +158,6 @@ def test_limits_friction_and_damping():
     wheels = [part for x in "abc" for part in (link(x, 1.0), joint(f"j{x}", "base", x, more=more))]
     with pytest.raises(ValueError, match=r"9 contacts.* the limits of ja, jb, jc and the dry friction of ja, jb, jc"):
         jk.convert.from_urdf(robot(link("base"), *wheels), stops=True, friction=True)
-
-
-@pytest.mark.weekly
-def test_friction_of_a_file_stops_a_flywheel():
-    """J = 0.04 kg m^2 and the friction 0.02 N m: from 1 rad/s it stops after 2 s, at 1 rad."""
-    text = robot(link("base"), link("wheel", 2.0), joint("j", "base", "wheel", more='<dynamics friction="0.02"/>'))
-    system = jk.convert.from_urdf(text, friction=["j"])
-    ride = jk.simulate(system, jk.State([0.0], [1.0]), jnp.linspace(0.0, 3.0, 4), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(ride["j"], [0.0, 0.75, 1.0, 1.0], rtol=1e-8, atol=1e-12)
 
 
 TWO = (link("base"), link("a", 1.0), joint("ja", "base", "a", axis="1 0 0"))

@@ -17,7 +17,7 @@ from jaxkane.estimate import Filter, begin, predict, update
 
 CC = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 CXX = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
-needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler")
+pytestmark = pytest.mark.skipif(CC is None, reason="no C compiler")
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror", "-O2")
 METHODS = pytest.mark.parametrize("method", ["extended", "unscented"])
 
@@ -151,26 +151,14 @@ def assert_same_steps(filter, belief, in_c, rtol, n=5, dt=0.02):
 
 
 @pytest.mark.weekly
-@needs_compiler
-@pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.weekly)])
-def test_filter_steps_in_c_agree_with_the_library(method, tmp_path):
-    """Inputs, states of the first order, outputs, parameters that drift, gaps and late measurements."""
-    filter, belief = of_servo(method=method)
-    assert_same_steps(filter, belief, compiled(filter, belief, tmp_path), 1e-12)
-
-
-@pytest.mark.weekly
-@needs_compiler
-@pytest.mark.parametrize(
-    "of", [of_circle, *(pytest.param(of, marks=pytest.mark.weekly) for of in (of_crank, of_bicycle))]
-)
-@pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.weekly)])
-def test_filter_steps_in_c_satisfy_the_constraints(of, method, tmp_path):
+@pytest.mark.parametrize("of", [of_servo, of_circle, of_crank, of_bicycle])
+@METHODS
+def test_filter_steps_in_c_agree_with_the_library(of, method, tmp_path):
+    """Inputs, states of the first order, outputs, constraints, parameters that drift, gaps and late measurements."""
     filter, belief = of(method=method)
     assert_same_steps(filter, belief, compiled(filter, belief, tmp_path), 1e-12)
 
 
-@needs_compiler
 @pytest.mark.weekly
 def test_single_precision_smoothed_states_and_invalid_times_in_c(tmp_path):
     filter, belief = of_servo(lag=0)
@@ -187,7 +175,6 @@ def test_single_precision_smoothed_states_and_invalid_times_in_c(tmp_path):
 
 
 @pytest.mark.weekly
-@needs_compiler
 @METHODS
 def test_the_exported_test_program_passes(method, tmp_path):
     files = jk.export.c_filter(*(lambda f, b: (f, tmp_path / "servo.h", b))(*of_servo(method=method)))
@@ -205,7 +192,6 @@ def test_the_exported_test_program_passes(method, tmp_path):
     assert "malloc" not in text
 
 
-@needs_compiler
 def test_two_filters_compile_into_one_program(tmp_path):
     """Names of their own, from names that C does not allow."""
     filter, belief = of_circle()

@@ -20,9 +20,9 @@ fmpy = pytest.importorskip("fmpy")
 validate_fmu = pytest.importorskip("fmpy.validation").validate_fmu
 CallFailed = pytest.importorskip("fmpy.fmi1").FMICallException
 CC = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler")
 VERSIONS, KINDS = ("2.0", "3.0"), ("ModelExchange", "CoSimulation")
 pytestmark = [
+    pytest.mark.skipif(CC is None, reason="no C compiler"),
     pytest.mark.filterwarnings("ignore:.*its description uses"),
     pytest.mark.filterwarnings("error:jaxkane.export.fmu"),  # of a failure of the compiler
 ]
@@ -204,7 +204,6 @@ class Unit:
 
 
 @pytest.mark.slow_cases(all_but=["Bob-2.0", "Driven-3.0"])
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 @pytest.mark.parametrize(
     "name", ["Driven", "Bob", "Ball", "Odd", *(pytest.param(n, marks=pytest.mark.weekly) for n in CATALOG)]
@@ -223,7 +222,6 @@ def test_fmpy_validates_the_fmu(name, fmi, fmu_of):
 
 
 @pytest.mark.slow
-@needs_compiler
 @pytest.mark.parametrize(
     ("fmi", "kind"), [("2.0", "co-simulation"), ("3.0", "co-simulation"), ("3.0", "model exchange")]
 )
@@ -239,30 +237,16 @@ def test_an_fmu_for_co_simulation_or_model_exchange_only(fmi, kind, tmp_path):
 
 
 @pytest.mark.slow
-@needs_compiler
 def test_the_source_compiles_without_warnings(fmu_of, tmp_path):
     for name, system in {"Driven": Driven(), "Bob": Bob(), "Ball": Ball()}.items():
         for fmi in VERSIONS:
             with zipfile.ZipFile(fmu_of(system, fmi)) as archive:
                 file = tmp_path / f"{name}{fmi[0]}.c"
                 file.write_bytes(archive.read(f"sources/{file.name}"))
-            command = [
-                CC,
-                "-std=c99",
-                "-Wall",
-                "-Wextra",
-                "-pedantic",
-                "-Werror",
-                "-O1",
-                "-c",
-                file,
-                "-o",
-                tmp_path / "o",
-            ]
-            subprocess.run(command, check=True)
+            flags = ("-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror", "-O1")
+            subprocess.run([CC, *flags, "-c", file, "-o", tmp_path / "o"], check=True)
 
 
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_variables_have_units_bounds_and_dependencies(fmi, fmu_of):
     description = fmpy.read_model_description(fmu_of(Driven(), fmi))
@@ -293,7 +277,6 @@ def test_variables_have_units_bounds_and_dependencies(fmi, fmu_of):
     assert {"angle", "parameters.angle", "moments[2]", "part.mass", "θ0"} < set(names)
 
 
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_simulation_agrees_with_the_analytical_solution(fmi, kind, fmu_of):
@@ -320,7 +303,6 @@ def test_the_simulation_agrees_with_the_analytical_solution(fmi, kind, fmu_of):
     np.testing.assert_allclose([[*row][1:] for row in found], expected, rtol=0, atol=atol)
 
 
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_parameters_inputs_and_states_can_be_set_between_steps(fmi, fmu_of):
     """A changed parameter and input, a restored state, a serialized one, and a new start, by the matrix exponential."""
@@ -332,11 +314,7 @@ def test_parameters_inputs_and_states_can_be_set_between_steps(fmi, fmu_of):
         unit.step(3.0, 0.25)
         expected = after(0.25, start, 1.0, mass=4.0)
         np.testing.assert_allclose(unit.get(*names), expected, rtol=0, atol=atol)
-        save, restore = (
-            (unit.unit.getFMUstate, unit.unit.setFMUstate)
-            if unit.is_2
-            else (unit.unit.getFMUState, unit.unit.setFMUState)
-        )
+        save, restore = (getattr(unit.unit, f"{way}FMU{'state' if unit.is_2 else 'State'}") for way in ("get", "set"))
         state = save()
         unit.set({"command": -2.0, "stiffness": 50.0, "lag": 0.3})
         for t in (3.25, 3.35):
@@ -359,7 +337,6 @@ def test_parameters_inputs_and_states_can_be_set_between_steps(fmi, fmu_of):
         assert unit.get("time", "x", "mass", "command") == pytest.approx((0.0, 0.1, 2.0, 0.0), rel=0)
 
 
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_directional_derivatives(fmi, fmu_of):
     """Of a linear system its matrices; by a parameter, and of a pendulum, those of JAX."""
@@ -388,7 +365,6 @@ def test_directional_derivatives(fmi, fmu_of):
         np.testing.assert_allclose(np.transpose(found), expected, rtol=rtol, atol=1e-14)
 
 
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_events_reset_states_and_end_the_simulation(fmi, kind, fmu_of):
@@ -401,23 +377,17 @@ def test_events_reset_states_and_end_the_simulation(fmi, kind, fmu_of):
     assert len(rows) == 51
     g, fall = 9.81, np.sqrt(2 / 9.81)
     for t, h, v, bounces in rows:
-        at, speed, n = 0.0, 0.0, 0
-        length = fall
+        at, n, speed, length = -fall, 0, g * fall, 2 * fall  # a bounce before the start has its top at the start
         while t - at > length:
             at, n = at + length, n + 1
             speed = 0.8**n * g * fall
             length = 2 * speed / g
-        expected = (
-            (1.0 - g * t * t / 2, -g * t)
-            if n == 0
-            else (speed * (t - at) - g * (t - at) ** 2 / 2, speed - g * (t - at))
-        )
+        expected = speed * (t - at) - g * (t - at) ** 2 / 2, speed - g * (t - at)
         np.testing.assert_allclose((h, v, bounces), (*expected, n), rtol=0, atol=50 * atol)
     early = fmpy.simulate_fmu(path, stop_time=2.5, **options, start_values={"duration": 0.33})
     assert early["time"][-1] == pytest.approx(0.33, abs=0.03)
 
 
-@needs_compiler
 @pytest.mark.parametrize("kind", KINDS)
 def test_time_events_occur_once(kind, fmu_of):
     """Also at the start, and at a communication point. The sine rises through zero at 0, 0.314, 0.628 and 0.942 s."""
@@ -426,7 +396,6 @@ def test_time_events_occur_once(kind, fmu_of):
 
 
 @pytest.mark.slow_cases(all_but=["3.0"])
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_events_occur_as_in_simulate(fmi, tmp_path):
     """A kick that does not reverse, events of place and time at one instant, a function that touches zero, an impact
@@ -451,7 +420,6 @@ def test_events_occur_as_in_simulate(fmi, tmp_path):
         assert unit.get("log")[0] == 2.0
 
 
-@needs_compiler
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("restitution", [0.0, 0.5])
 def test_a_ball_does_not_fall_through_the_floor(kind, restitution, fmu_of):
@@ -464,7 +432,6 @@ def test_a_ball_does_not_fall_through_the_floor(kind, restitution, fmu_of):
 
 
 @pytest.mark.slow
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_singular_dependent_speeds_end_the_simulation(fmi, fmu_of):
     """A bead on a circle, x = sin t: at pi/2 its vertical speed no longer follows from the horizontal one. Steps of
@@ -485,7 +452,6 @@ def test_singular_dependent_speeds_end_the_simulation(fmi, fmu_of):
 
 
 @pytest.mark.slow
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_start_values_satisfy_the_constraints(fmi, fmu_of):
     atol = 1e-12
@@ -502,7 +468,6 @@ def test_start_values_satisfy_the_constraints(fmi, fmu_of):
         assert unit.get("rod", "x") == pytest.approx((rod, 0.15 * np.cos(1.0) + 0.4 * np.cos(rod)), abs=atol)
 
 
-@needs_compiler
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_wrong_values_and_calls_are_refused(fmi, fmu_of):
     with Unit(fmu_of(Driven(), fmi)) as unit:
@@ -566,20 +531,14 @@ def many(n):
         (Driven, {"fmi": "1.0"}, ValueError, r"`fmi` must be '2.0' or '3.0', got '1.0'"),
         (Driven, {"kind": "cosimulation"}, ValueError, r"no kind cosimulation; did you mean 'co-simulation'"),
         (Driven, {"step": 0.0}, ValueError, r"`step` \[s\] must be positive and finite, got 0.0"),
+        (lambda: many(0), {}, ValueError, r"Many has no coordinates\. Name them"),
         (Driven, {"state": jk.State([1.0, 2.0], [0.0])}, ValueError, r"no start values. Driven: q must have the shape"),
-        (lambda: Driven, {}, TypeError, r"must be an instance of a System"),
         (lambda: Driven(jnp.ones(3)), {}, ValueError, r"Driven is a batch: mass has"),
         (BouncingBall, {}, ValueError, r"BouncingBall: an FMU cannot represent contacts: floor. Replace them"),
         (lambda: jk.with_multipliers(Bob()), {}, ValueError, r"Bob: an FMU cannot represent multipliers"),
         (lambda: many(13), {}, ValueError, r"at most 12 independent speeds, and this system has 13"),
-        (lambda: many(0), {}, ValueError, r"Many has no coordinates\. Name them"),
         (lambda: with_members(events=jumps_by_a_loop), {}, ValueError, r"`then` of the event e.*contains scan"),
-        (
-            lambda: with_members(inputs=("command", "a\nb")),
-            {},
-            ValueError,
-            r"an FMU cannot contain the name or unit 'a\\n",
-        ),
+        (lambda: with_members(inputs=("command", "a\nb")), {}, ValueError, r"cannot contain the name or unit 'a\\n"),
     ],
 )
 def test_systems_not_supported_by_fmi_are_rejected(system, options, error, match, tmp_path):
@@ -594,7 +553,6 @@ def test_a_traced_system_is_refused(tmp_path):
         jax.eval_shape(lambda mass: jk.export.fmu(Driven(mass), tmp_path / "driven.fmu") and mass, jnp.ones(()))
 
 
-@needs_compiler
 def test_without_a_compiler_the_fmu_contains_sources(tmp_path, monkeypatch):
     path = tmp_path / "driven.fmu"
     monkeypatch.setenv("CC", "no-such-compiler")

@@ -1,4 +1,4 @@
-"""Mechanisms of joints, held to MuJoCo's and SymPy's accelerations, to the catalogue and to closed forms."""
+"""Mechanisms of joints, compared with SymPy's accelerations, closed forms and each other. MuJoCo: `test_convert.py`."""
 
 import json
 import pickle
@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from benchmarks.chain import Chain
+from programs import operations
 
 import jaxkane as jk
 from jaxkane.fit.problem.specification import parameters_of
@@ -19,7 +21,6 @@ from jaxkane.joints import (
     Loop,
     Site,
     ball,
-    fixed,
     free,
     hinge,
     mechanism,
@@ -30,101 +31,15 @@ from jaxkane.joints import (
 
 RTOL = 1e-11
 DATA = Path(__file__).parents[1] / "data"
-FIGURES = json.loads((DATA / "mujoco_tree.json").read_text())
 FOUR_BAR = json.loads((DATA / "sympy_kane_systems.json").read_text())["systems"]["four_bar_linkage"]
 BAR = {"mass": 2.0, "center": (0.0, 0.0, -0.2), "inertia": (0.03, 0.03, 0.002)}
 
 
 def pendulums(n=2, **more):
     """Bars that hang in a chain, on hinges along y and x in turn."""
-    return [
-        Link(
-            f"link{i}",
-            f"link{i - 1}" if i else None,
-            hinge(f"q{i}", ((0, 1, 0), (1, 0, 0))[i % 2], **more),
-            position=(0, 0, -0.4 if i else 0),
-            **BAR,
-        )
-        for i in range(n)
-    ]
-
-
-def tree_of_all_joints():
-    """The model of tests/data/mujoco_tree.py, by hand."""
-    degree = np.pi / 180
-    inertia = [[0.21, 0.01, -0.02], [0.01, 0.16, 0.015], [-0.02, 0.015, 0.09]]
-    shoulder = hinge(
-        "shoulder",
-        (1, 2, 0.5),
-        anchor=(0.02, -0.01, 0.04),
-        damping=0.3,
-        stiffness=2.0,
-        rest=20 * degree,
-        armature=0.05,
-        reference=10 * degree,
-    )
-    extend = slide("extend", (0, 1, 0.3), damping=0.7, stiffness=30.0, rest=0.1, armature=0.2, reference=0.05)
-    wrist = ball("wrist", anchor=(0.01, 0.02, 0.03), damping=0.2, stiffness=1.5, armature=0.03)
-    hips = [hinge("hip1", (1, 0, 0)), hinge("hip2", (0, 1, 0), anchor=(0, 0, 0.1)), hinge("hip3", (0, 0, -1))]
-    third = ("3-2-1", (np.pi / 2, 0.0, np.pi / 2))  # z to x, x to y, y to z
-    return mechanism(
-        [
-            Link("plate", "hand", fixed(), position=(0.1, 0.1, 0), mass=0.2, inertia=(1e-4, 2e-4, 2.5e-4)),
-            Link("base", None, free("root"), mass=4.8, center=(0.02, 0.01, 0.03), inertia=inertia),
-            Link("arm", "base", [shoulder, extend], (0.2, 0, 0.1), third, 3.6, (0, 0, 0.2), (0.08, 0.07, 0.02)),
-            Link("hand", "arm", wrist, (0, 0.1, 0.4), None, 1.4, (0.1, 0, 0), (0.004, 0.006, 0.005)),
-            Link("leg", "base", hips, (0, 0, -0.3), None, 1.7, (0, 0, -0.1), (0.02, 0.02, 0.002)),
-        ],
-        gravity=(0.3, -0.5, -9.7),
-        actuators=[
-            Actuator("turn", "shoulder", gear=3),
-            Actuator("servo", "extend", gear=2, gain=20, position_gain=20, velocity_gain=1.5),
-            Actuator("hip", "hip1", gear=0.5, gain=2.5, offset=0.3, position_gain=1, velocity_gain=2),
-            Actuator("twist", "wrist", gear=(1, 2, 3)),
-        ],
-        sites=[Site("tip", "arm", (0.1, 0.2, 0.3))],
-    )
-
-
-@pytest.mark.slow
-def test_accelerations_of_a_tree_of_all_joints_agree_with_mujoco():
-    system = tree_of_all_joints()
-    for state in FIGURES["states"]:
-        inputs = dict(zip(system.inputs, state["inputs"], strict=True))
-        u_dot = jk.accelerations(system, 0.0, np.array(state["q"]), np.array(state["u"]), inputs)
-        np.testing.assert_allclose(u_dot, state["u_dot"], rtol=RTOL, atol=RTOL * np.abs(state["u_dot"]).max())
-
-
-@pytest.mark.slow
-def test_two_hinges_equal_the_double_pendulum_of_the_catalogue():
-    m, l = 1.3, 0.7
-    bar = {"mass": m, "center": (0, -l / 2, 0), "inertia": (m * l**2 / 12, 0, m * l**2 / 12)}
-    links = [Link("1", None, hinge("a"), **bar), Link("2", "1", hinge("b"), (0, -l, 0), **bar)]
-    motors = [Actuator("shoulder", "a"), Actuator("elbow", "b")]
-    system = mechanism(links, gravity=(0, -9.81, 0), actuators=motors)
-    book = jk.catalog.DoublePendulum(m, l)
-    torques = {"shoulder": 0.3, "elbow": -0.7}
-    angles = jk.accelerations(system, 0.0, [0.7, -1.1], [1.1, -1.9], torques)
-    rates = jk.accelerations(book, 0.0, [0.7, -0.4], [1.1, -0.8], {f"{x}_torque": T for x, T in torques.items()})
-    np.testing.assert_allclose([angles[0], angles[0] + angles[1]], rates, rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_armature_affects_only_the_diagonal_of_the_mass_matrix():
-    chain = [
-        Link("a", None, free("r", armature=0.3), **BAR),
-        Link("b", "a", ball("s", armature=0.2), (0, 0, -0.4), **BAR),
-        Link("c", "b", [slide("x", (1, 1, 0), armature=0.1), hinge("h", (0, 1, 2), armature=0.05)], **BAR),
-    ]
-    bare = [link.__class__(**(vars(link) | {"joints": joint})) for link, joint in zip(chain, (free("r"), ball("s"), 0))]
-    bare[2] = Link("c", "b", [slide("x", (1, 1, 0)), hinge("h", (0, 1, 2))], **BAR)
-    with_rotors, without = mechanism(chain), mechanism(bare)
-    rng = np.random.default_rng(0)
-    e, f = (x / np.linalg.norm(x) for x in rng.normal(size=(2, 4)))
-    at = (0.0, np.array([0.1, 0.2, 0.3, *e, *f, 0.4, 0.5]), rng.normal(size=11))
-    (M, f), (M0, f0) = (jk.equations_of_motion(system, *at) for system in (with_rotors, without))
-    np.testing.assert_allclose(M - M0, np.diag([0.3] * 6 + [0.2] * 3 + [0.1, 0.05]), atol=1e-13)
-    np.testing.assert_allclose(f, f0, atol=1e-12)
+    joints = [hinge(f"q{i}", ((0, 1, 0), (1, 0, 0))[i % 2], **more) for i in range(n)]
+    places = [{"parent": f"link{i - 1}", "position": (0, 0, -0.4)} if i else {} for i in range(n)]
+    return [Link(f"link{i}", joints=joints[i], **places[i], **BAR) for i in range(n)]
 
 
 @pytest.mark.slow
@@ -183,11 +98,7 @@ def with_class(system, kind):
 
 def test_a_class_that_inherits_from_a_mechanism_is_checked():
     base = mechanism(pendulums(1))
-
-    class Wrong(type(base)):
-        def q_dot(self, t, q, u):
-            return [2.0 * u["q0_rate"]]
-
+    Wrong = type("Wrong", (type(base),), {"q_dot": lambda self, t, q, u: [2.0 * u["q0_rate"]]})
     with pytest.raises(ValueError, match="by the rates of its coordinates"):
         jk.accelerations(with_class(base, Wrong), 0.0, [0.3], [0.2])
 
@@ -467,15 +378,6 @@ def test_parameters_have_names_units_and_a_sign():
     assert set(mechanism([beside]).center["a"]) == {"x", "z"}  # a JAX zero is a parameter
 
 
-@pytest.mark.weekly
-def test_a_mechanism_is_swept_by_the_names_of_its_parameters():
-    arm, ts = mechanism(pendulums()), jnp.linspace(0.0, 0.2, 5)
-    start = jk.State({"q0": 0.3}, {})
-    sweep = jk.sweep.sweep(arm, start, ts, table={"mass.link1": [1.0, 2.5]})
-    one = jk.simulate(arm.replace({"mass.link1": 2.5}), start, ts)
-    np.testing.assert_allclose(sweep.trajectory.q[1], one.q, rtol=1e-9)
-
-
 @pytest.mark.slow
 def test_a_mechanism_may_be_made_of_traced_numbers():
     def alpha(mass):
@@ -500,57 +402,46 @@ def test_a_loop_may_be_made_of_traced_numbers():
     np.testing.assert_allclose(jax.vmap(alpha)(jnp.zeros(2)), [expected, expected], rtol=1e-12)
 
 
+A = Link("a", None, hinge("h"), **BAR)
+ENDS = [Site("s", "a"), Site("t", "a", (0, 0, 0.5))]
+
+
 @pytest.mark.parametrize(
     ("links", "more", "words"),
     [
+        ([hinge("h")], {}, "needs a Link"),
         ([Link("a.b")], {}, "without a dot.*'a.b'"),
-        ([Link("")], {}, "without a dot"),
-        ([Link("a"), Link("a")], {}, "Two links have the name 'a'"),
+        ([A, A], {}, "Two links have the name 'a'"),
         ([Link("a", "c")], {}, "parent of the link 'a'.*c"),
         ([Link("a", "b"), Link("b", "a")], {}, "form a cycle: a, b"),
-        ([Link("a", None, hinge("h"), **BAR), Link("b", "a", hinge("h"), **BAR)], {}, "Two joints have the name h"),
+        ([A, Link("b", "a", hinge("h"), **BAR)], {}, "Two joints have the name h"),
         ([Link("a", None, hinge("h.1"), **BAR)], {}, "joint.*'h.1'"),
-        ([Link("a", None, hinge("h"), **BAR)], {"actuators": [Actuator("T", "k")]}, "actuator 'T'.*k"),
-        ([Link("a", None, hinge("h"), **BAR)], {"actuators": [Actuator("T", "h", (1, 2))]}, "gear of the actuator 'T'"),
-        ([Link("a", None, hinge("h"), **BAR)], {"sites": [Site("s", "z")]}, "site 's'.*z"),
-        ([Link("a", None, hinge("h"), **BAR)], {"sites": [Site("a", "a")]}, "sites or links have the name a"),
-        ([Link("a", None, hinge("h"), **BAR)], {"loops": [Loop("s", "t")]}, "A loop .*: s;"),
+        ([A], {"actuators": [Actuator("T", "k")]}, "actuator 'T'.*k"),
+        ([A], {"actuators": [Actuator("T", "h", (1, 2))]}, "gear of the actuator 'T'"),
+        ([A], {"actuators": [Actuator("h", "h")]}, "'h' appears in `coordinates` and"),
+        ([A], {"sites": [Site("s", "z")]}, "site 's'.*z"),
+        ([A], {"sites": [Site("a", "a")]}, "sites or links have the name a"),
+        ([A], {"loops": [Loop("s", "t")]}, "A loop .*: s;"),
+        ([A], {"loops": [Loop("s", "s")], "sites": ENDS}, r"Loop\('s', 's'\).*Name two"),
+        ([A], {"loops": [Loop("s", "t")], "sites": ENDS}, r"Loop\('s', 't'\) is not satisfied: its residual is 0.5"),
+        ([A], {"loops": [Coupling(None, "h")]}, "Coupling: None is not a hinge or a slider"),
         ([Link("a", None, ball("h"), **BAR)], {"loops": [Coupling("h")]}, "Coupling: 'h' is not a hinge or a slider"),
         ([Link("a", None, hinge("h"), (1, 2), **BAR)], {}, "position.a must have three components"),
-        ([Link("a", None, hinge("h"), orientation=(1, 2), **BAR)], {}, "'a': the orientation must be"),
         ([Link("a", None, hinge("h"), orientation=np.diag([1, 1, -1]), **BAR)], {}, "'a': the orientation must be"),
         ([Link("a", None, hinge("h"), mass=1, inertia=2.0)], {}, "inertia of 'a'"),
-        ([Link("a", None, hinge("h"), **BAR), Link("b", "a", free("f"), **BAR)], {}, "'b' has a free joint"),
-        ([Link("a", None, hinge("h"), **BAR)], {"actuators": [Actuator("h", "h")]}, "'h' appears in `coordinates` and"),
+        ([Link("a", None, hinge("h"), mass=1, inertia=jnp.eye(3) + jnp.eye(3, k=1))], {}, "not symmetric: 1.0 and 0.0"),
+        ([A, Link("b", "a", free("f"), **BAR)], {}, "'b' has a free joint"),
         ([Link("a", None, hinge("h"))], {}, "no movable link has a mass"),
         ([Link("a", mass=1.0)], {}, "no link has a joint"),
-        ([Link("a", None, hinge("h"), mass=1, inertia=((1, 0), (0, 1), (0, 0)))], {}, "inertia of 'a'"),
-        ([Link("a", None, hinge("h"), mass=1, inertia=jnp.eye(3) + jnp.eye(3, k=1))], {}, "not symmetric: 1.0 and 0.0"),
-        ([Link("a", None, hinge("h"), mass=1, inertia=np.eye(3, dtype=int) + np.eye(3, k=1))], {}, "not symmetric"),
         (
-            [Link("a", None, hinge("h"), **BAR)],
-            {"loops": [Coupling(None, "h")]},
-            "Coupling: None is not a hinge or a slider",
-        ),
-        (
-            [Link("a", None, hinge("h"), **BAR)],
-            {"sites": [Site("s", "a")], "loops": [Loop("s", "s")]},
-            r"Loop\('s', 's'\).*Name two",
-        ),
-        (
-            [Link("a", None, hinge("h"), **BAR)],
-            {"sites": [Site("s", "a"), Site("t", "a", (0, 0, 0.5))], "loops": [Loop("s", "t")]},
-            r"Loop\('s', 't'\) is not satisfied: its residual is 0.5",
-        ),
-        (
-            [Link("a", None, hinge("h"), **BAR), Link("b", None, hinge("k"), **BAR)],
+            [A, Link("b", None, hinge("k"), **BAR)],
             {"loops": [Coupling("k", "h", (0.0, -3.0)), Coupling("k", "h", (0.2, -3.0))]},
             r"Coupling\('k', 'h'\) is not satisfied: its residual is 0.2",
         ),
     ],
 )
 def test_invalid_mechanisms_raise_by_name(links, more, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises((TypeError, ValueError), match=words):
         mechanism(links, **more)
 
 
@@ -562,40 +453,28 @@ def test_an_inertia_matrix_may_be_asymmetric_by_rounding_errors():
 
 
 @pytest.mark.parametrize(
-    ("what", "links", "more"),
-    [
-        ("axis of 'h'", lambda x: [Link("a", None, hinge("h", (0, 1, x)), **BAR)], {}),
-        ("reference of 'h'", lambda x: [Link("a", None, slide("h", reference=x), **BAR)], {}),
-        ("orientation of 'a'", lambda x: [Link("a", None, hinge("h"), orientation=("2", (x,)), **BAR)], {}),
-        (
-            "gear of 'T'",
-            lambda x: [Link("a", None, hinge("h"), **BAR)],
-            {"actuators": lambda x: [Actuator("T", "h", x)]},
-        ),
-    ],
+    ("what", "made"),
+    {
+        "axis of 'h'": lambda x: mechanism([Link("a", None, hinge("h", (0, 1, x)), **BAR)]),
+        "reference of 'h'": lambda x: mechanism([Link("a", None, slide("h", reference=x), **BAR)]),
+        "orientation of 'a'": lambda x: mechanism([Link("a", None, hinge("h"), orientation=("2", (x,)), **BAR)]),
+        "gear of 'T'": lambda x: mechanism([A], actuators=[Actuator("T", "h", x)]),
+    }.items(),
 )
-def test_structural_values_must_not_be_traced(what, links, more):
-    def made(x):
-        return mechanism(links(x), **{name: part(x) for name, part in more.items()})
-
+def test_structural_values_must_not_be_traced(what, made):
     made(0.1)
     with pytest.raises(TypeError, match=rf"The {what} is part of the structure.*is traced"):
         jax.jit(lambda x: made(x).mass["a"])(0.1)
 
 
-def test_a_universal_joint_has_two_axes():
+def test_invalid_axes_raise():
     with pytest.raises(ValueError, match="two axes, but 'h' has 3"):
         universal("h", np.eye(3))
-
-
-def test_a_zero_axis_raises():
     with pytest.raises(ValueError, match="axis of 'h'"):
         hinge("h", (0, 0, 0))
-    with pytest.raises(TypeError, match="needs a Link"):
-        mechanism([hinge("h")])
 
 
-def crank_with_slider(L, across=0.0, rigid=False):
+def crank_with_slider(L, across=0.0):
     """A crank, a rod and a slider along x on the ground, of lengths around L."""
     bar = {"mass": 1.0, "center": (0.5 * L, 0, 0), "inertia": (0.01 * L**2, 0.1 * L**2, 0.1 * L**2)}
     links = [
@@ -607,11 +486,10 @@ def crank_with_slider(L, across=0.0, rigid=False):
     return mechanism(links, sites=sites, loops=[Loop("end", "pin")])
 
 
-@pytest.mark.parametrize("L", [1e-9, 1e-6, 1e6, 1e9])
+@pytest.mark.parametrize("L", [1e-9, 1e9])
 def test_loop_closure_does_not_depend_on_the_unit_of_length(L):
     right, system = crank_with_slider(1.0), crank_with_slider(L)
     assert system.dependent_coordinates == right.dependent_coordinates
-    assert system.structure.loops[0].independent == right.structure.loops[0].independent
     held = next(c for c in right.coordinates if c not in right.dependent_coordinates)
     value = {"a": 0.4, "b": -0.2, "x": 2.0}[held]
     units = np.where(np.array(right.coordinates) == "x", L, 1.0)
@@ -703,3 +581,28 @@ def test_dry_friction_is_a_contact_of_a_mechanism():
 def test_a_mechanism_has_at_most_four_stops():
     with pytest.raises(ValueError, match=r"6 contacts, which are the limits of q0, q1, q2. At most 4 .* fewer joints"):
         mechanism(pendulums(3, stops=(-1.0, 1.0)))
+
+
+# Chains of many links: columns of M and f by transposition
+
+
+@pytest.mark.weekly
+def test_the_energy_of_a_long_chain_is_conserved():
+    chain, rng = Chain(n=14), np.random.default_rng(0)
+    state = jk.State(0.3 * rng.uniform(-2, 2, 14), 0.5 * rng.normal(size=14))
+    ride = jk.simulate(chain, state, jnp.linspace(0.0, 0.5, 6), rtol=1e-9, atol=1e-9)
+
+    def energies(q, u):
+        motion = chain.motion(0.0, q, u)
+        height = sum(body.mass * body.center.position.to(motion.N)[2] for body in motion.bodies)
+        return jk.kinetic_energy(chain, 0.0, q, u), 9.81 * height
+
+    T, V = jax.jit(jax.vmap(energies))(ride.q, ride.u)
+    np.testing.assert_allclose(T + V, T[0] + V[0], rtol=0, atol=1e-7 * T[-1])
+    assert float(jnp.abs(ride.q[-1] - ride.q[0]).max()) > 0.3
+
+
+@pytest.mark.slow
+def test_the_operation_count_is_proportional_to_the_number_of_links():
+    of_10, of_40 = (operations("column of M", Chain(n=n), jnp.ones(n), jnp.ones(n), jnp.ones(n)) for n in (10, 40))
+    assert of_40 < 4.6 * of_10 < 4.6 * 700

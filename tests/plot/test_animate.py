@@ -1,18 +1,12 @@
 """Animations: everything is where the description says, and the page shows it, in a browser and without one."""
 
 import base64
-import gc
 import json
 import re
-import shutil
-import subprocess
 import tempfile
 import time
-import weakref
-from pathlib import Path
 
 import browser
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +18,6 @@ from scipy.spatial.transform import Rotation
 import jaxkane as jk
 
 needs_a_browser = pytest.mark.skipif(browser.PROGRAM is None, reason=browser.WHY_NOT)
-NODE = shutil.which("node")
 SPEED = 5.0  # of the bicycle [m/s]
 
 
@@ -65,12 +58,8 @@ def test_bodies_and_points_have_the_positions_of_the_system(swing):
     x, _ = animation.scene.at(trajectory.t[40])
     motion = system.motion(trajectory.t[40], trajectory.q[40], jnp.zeros(2))
     for shape in [*shapes(animation, "center"), *shapes(animation, "dot")]:
-        part = motion["A"].fixed(0.0 * motion.N.x) if shape.label == "O" else motion[shape.label]
-        place = (
-            np.zeros(3)
-            if shape.label == "O"
-            else (part.center if hasattr(part, "center") else part).position.to(motion.N)
-        )
+        part = motion["A" if shape.label == "O" else shape.label]
+        place = np.zeros(3) if shape.label == "O" else getattr(part, "center", part).position.to(motion.N)
         right, up, towards = np.asarray(place)
         np.testing.assert_allclose(x[0, shape.first], [right, -towards, up], atol=1e-12)
     assert {shape.label for shape in shapes(animation, "center")} == {"link1", "link2"}
@@ -147,28 +136,6 @@ def test_the_bicycle_is_drawn_on_the_ground_and_followed_by_the_camera(weaving):
     assert np.ptp(center_of_mass[:, 0]) == pytest.approx(50.0, rel=1e-3)
 
 
-def test_size_and_time_of_an_animation_of_ten_seconds(ride, weaving):
-    """At most 300 kB, and 2 s once the program of the poses is compiled."""
-    assert len(weaving.html().encode()) < 300e3
-    started = time.perf_counter()
-    again = jk.animate(*ride).html()
-    assert time.perf_counter() - started < 2.0
-    assert again == weaving.html()
-
-
-@pytest.mark.weekly
-def test_single_precision_far_from_the_origin(ride):
-    """Places that are known to 0.03 mm only, a kilometre away, are still those of rigid bodies: within 3 mm."""
-    system, trajectory = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == float else x, ride)
-    far = trajectory.q.at[:, 6].add(jnp.float32(1000.0))
-    animation = jk.animate(system, eqx.tree_at(lambda r: r.q, trajectory, far))
-    scene, near = animation.scene, jk.animate(*ride).scene
-    assert scene.position.shape[1] <= near.position.shape[1]
-    assert len(animation.html()) < 150e3
-    x, expected = (s.at(3.0)[0] for s in (scene, near))
-    np.testing.assert_allclose(x - [1000.0, 0.0, 0.0], expected, atol=3e-3)
-
-
 def test_custom_figure_has_the_correct_positions(swing):
     """Lines keep their places whatever they are fixed in: a body, the ground, or nothing (1e-9 m)."""
     system, trajectory, _ = swing
@@ -194,8 +161,10 @@ def test_custom_figure_has_the_correct_positions(swing):
     assert [s.color for s in scene.shapes[4:7]] == ["red", "green", "blue"]
 
 
-def test_the_page_has_no_external_resources(weaving):
+def test_the_page_is_small_and_has_no_external_resources(weaving):
+    """At most 300 kB for ten seconds."""
     page = weaving.html()
+    assert len(page.encode()) < 300e3
     assert not re.search(r"https?:|\bsrc=|@import|<link", page)
     scene = json.loads(re.search(r'application/json">(.*?)</script>', page, re.DOTALL).group(1))
     position = np.frombuffer(base64.b64decode(scene["position"]), "<f4").reshape(-1, scene["parts"], 3)
@@ -205,22 +174,6 @@ def test_the_page_has_no_external_resources(weaving):
     assert '"' not in frame.split('srcdoc="')[1].split('" title=')[0]
 
 
-@pytest.mark.slow
-def test_a_custom_figure_is_garbage_collected(swing):
-    system, trajectory, _ = swing
-    size = np.ones(1000)
-
-    def figure(system, motion, sketch):
-        body = motion.bodies[0]
-        sketch.line("gold", body, body.center.position + float(size[0]) * motion.N.x)
-
-    jk.animate(system, trajectory, figure)
-    alive = weakref.ref(figure)
-    del figure
-    gc.collect()
-    assert alive() is None
-
-
 def test_invalid_arguments_of_animate_are_rejected(ride, swing, tmp_path):
     system, trajectory, animation = swing
     two = jax.tree.map(lambda x: jnp.stack([x, x]), trajectory)
@@ -228,14 +181,10 @@ def test_invalid_arguments_of_animate_are_rejected(ride, swing, tmp_path):
         jk.animate(system, two)
     with pytest.raises(ValueError, match="belongs to another system"):
         jk.animate(ride[0], trajectory)
-    for wrong in ({"speed": 0.0}, {"speed": np.inf}, {"height": -4}):
-        with pytest.raises(ValueError, match="must be positive"):
-            jk.animate(system, trajectory, **wrong)
-    with pytest.raises(ValueError, match="`elevation` must be a real number, got '18'"):
-        jk.animate(system, trajectory, elevation="18")
-    for name in ("seconds", "fps"):
-        with pytest.raises(ValueError, match=f"`{name}` must be positive and finite, got -1"):
-            animation.save(tmp_path / "swing.gif", **{name: -1.0})
+    with pytest.raises(ValueError, match="must be positive"):
+        jk.animate(system, trajectory, speed=0.0)
+    with pytest.raises(ValueError, match="`fps` must be positive and finite, got -1"):
+        animation.save(tmp_path / "swing.gif", fps=-1.0)
     with pytest.raises(ValueError, match=r"\.html .* or \.gif"):
         animation.save(tmp_path / "swing.mp4")
     with pytest.raises(ValueError, match="reached only 0"):
@@ -294,31 +243,6 @@ def test_springs_dampers_and_bodies_without_inertia_are_drawn(tmp_path):
     animation.save(tmp_path / "spring.gif", size=(200, 160), seconds=0.2)
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(NODE is None, reason="no node on the PATH")
-def test_the_script_of_the_page_runs_in_node(weaving, tmp_path):
-    """In node, on a canvas that only notes what is asked of it: all finite, and keys do what they say."""
-    (tmp_path / "page.html").write_text(weaving.html())
-    run = subprocess.run(
-        [NODE, Path(__file__).parents[1] / "data" / "viewer_in_node.mjs", tmp_path / "page.html"],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert run.returncode == 0, run.stderr
-    told = json.loads(run.stdout)
-    assert told["drawn_unseen"] == 0
-    assert told["strokes"] > 100
-    assert told["wild"] == 0
-    assert sorted(told["names"]) == ["fork", "rear frame"]
-    assert told["time_after_a_second"] == pytest.approx(1.0, abs=0.1)
-    assert told["paused"] == [True, False]
-    assert told["speeds"] == [2, 1]
-    assert told["at_the_end"] == pytest.approx(10.0, abs=1e-5)
-    assert told["followed"] == [True, False]
-
-
 @pytest.fixture(scope="module")
 def page():
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, browser.Page(folder) as page:
@@ -352,10 +276,8 @@ def test_all_controls_are_visible_on_a_phone(weaving, page, tmp_path):
     page.show(weaving.save(tmp_path / "ride.html"))
     page.wait(LOOKED)
     assert page.value("document.documentElement.scrollWidth") <= 390
-    assert (
-        page.value("Math.max(...[...document.querySelectorAll('#bar > *')].map(x => x.getBoundingClientRect().right))")
-        < 390
-    )
+    right = "Math.max(...[...document.querySelectorAll('#bar > *')].map(x => x.getBoundingClientRect().right))"
+    assert page.value(right) < 390
     page("Emulation.setDeviceMetricsOverride", width=900, height=560, deviceScaleFactor=1, mobile=False)
 
 

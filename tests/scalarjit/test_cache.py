@@ -20,7 +20,6 @@ from jaxkane._scalarjit.cache import LIMIT, Cache, memory_mappings
 
 TS = np.linspace(0.0, 0.2, 3)
 START = jk.State(np.array([0.5]), np.zeros(1))
-RTOL = 1e-9
 CELL = """
 import jaxkane as jk
 class Spring(jk.System):
@@ -70,87 +69,89 @@ def limit(monkeypatch):
     return set_to
 
 
-def rerun(system):
-    del system
-    assert last(class_of_cell()()) == pytest.approx(expected(4.0), rel=1e-5)
-
-
-def differentiate(system):
-    del system
-    kind = class_of_cell()
-    assert np.isfinite(jax.grad(lambda mass: last(kind(mass)))(1.0))
-
-
-def fit(system):
-    del system
-    trial = jk.fit.Trial(TS, {"x": 0.5 * np.cos(TS)}, sigma=1.0)
-    jk.fit.fit(class_of_cell()(), trial, ["mass"])
-
-
-def sweep(system):
-    del system
-    jk.sweep.sweep(class_of_cell()(), START, TS, table={"mass": np.array([1.0, 2.0])})
+CELLS = {
+    "simulate": lambda kind: last(kind()),
+    "differentiate": lambda kind: jax.grad(lambda mass: last(kind(mass)))(1.0),
+    "fit": lambda kind: jk.fit.fit(kind(), jk.fit.Trial(TS, {"x": 0.5 * np.cos(TS)}, sigma=1.0), ["mass"]),
+    "sweep": lambda kind: jk.sweep.sweep(kind(), START, TS, table={"mass": [1.0, 2.0]}),
+}
 
 
 @pytest.mark.weekly
 @on_linux
 @pytest.mark.parametrize(
-    ("cell", "times", "each"),
-    [
-        (rerun, 5, 100),
-        pytest.param(rerun, 40, 100, marks=pytest.mark.weekly),
-        pytest.param(differentiate, 6, 500, marks=pytest.mark.weekly),
-        pytest.param(fit, 8, 250, marks=pytest.mark.weekly),
-        pytest.param(sweep, 8, 200, marks=pytest.mark.weekly),
-    ],
+    ("cell", "times", "each"), [("simulate", 40, 100), ("differentiate", 6, 500), ("fit", 8, 250), ("sweep", 8, 200)]
 )
-def test_rerunning_a_notebook_cell_frees_the_programs_of_the_old_class(cell, times, each, limit, system):
-    """`each`: the mappings of one run, for which it was refused after some 150 to 700 runs."""
+def test_rerunning_a_notebook_cell_frees_the_programs_of_the_old_class(cell, times, each, limit):
+    """`each`: the mappings of one run. The process was ended after some 150 to 700 runs."""
     jk.forget()  # programs of other tests that are dropped and requested again would raise the bound
-    cell(system)
+    CELLS[cell](class_of_cell())
     bound = limit(2 * each)
     for _ in range(times):
-        cell(system)
+        CELLS[cell](class_of_cell())
     assert LIMIT.mappings == bound  # no program was requested again
     assert memory_mappings()[0] < bound + each
 
 
 class Controller:
-    """With an attribute that has no weak references, and one that changes."""
+    """With an attribute that has no weak references."""
 
     def __init__(self, push):
-        self.rng, self.push, self.traced = np.random.default_rng(1), push, 0
+        self.rng, self.push = np.random.default_rng(1), push
 
     def method(self, t, state):
-        counts[id(self)] = counts.get(id(self), 0) + 1
         return self.push + 0.0 * self.rng.random()
 
     def __call__(self, t, state):
         return {"push": self.push}
 
 
-counts: dict[int, int] = {}
+@dataclasses.dataclass
+class Constant:
+    """Without a hash."""
+
+    push: float
+
+    def __call__(self, t, state):
+        return {"push": self.push}
 
 
-def closure(push):
-    return {"push": lambda t, state: push}
+@dataclasses.dataclass(slots=True)
+class ConstantWithSlots:
+    """Without weak references."""
+
+    push: float
+    __call__ = Constant.__call__
+
+
+class EqualToAll(Constant):
+    __eq__ = lambda self, other: True  # noqa: E731
+    __hash__ = lambda self: 1  # noqa: E731
 
 
 KINDS = {
-    "closure": closure,
+    "closure": lambda push: {"push": lambda t, state: push},
+    "default": lambda push: {"push": lambda t, state, push=push: push},
     "partial": lambda push: {"push": functools.partial(lambda push, t, state: push, push)},
     "method": lambda push: {"push": Controller(push).method},
-    "object": lambda push: Controller(push),
+    **{kind.__name__: kind for kind in (Controller, Constant, ConstantWithSlots, EqualToAll)},
 }
 
 
-@pytest.mark.weekly
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
+def test_input_functions_with_the_same_code_have_separate_programs(kind, system):
+    for push in (1.0, 2.0):
+        assert last(system, KINDS[kind](push), step=0.1) == pytest.approx(expected(4.0, push), rel=1e-5)
+
+
+@pytest.mark.weekly
+@pytest.mark.xfail(strict=True, reason="the rule for derivatives in a program of `simulate` refers to input functions")
+@pytest.mark.parametrize("kind", ["closure", "method"])
 def test_programs_are_freed_with_the_functions_that_they_were_traced_with(kind, system):
     def simulated(push):
-        inputs = KINDS[kind](push)
-        assert last(system, inputs, step=0.1) == pytest.approx(expected(4.0, push), rel=1e-5)
-        f = inputs["push"] if isinstance(inputs, dict) else inputs
+        f = KINDS[kind](push)["push"]
+        last(system, {"push": f}, step=0.1)
         return weakref.ref(getattr(f, "__self__", f))
 
     gone = [simulated(1.0)]
@@ -176,35 +177,9 @@ def test_reduce_functions_are_freed_with_their_programs(system):
 
 
 @pytest.mark.slow
-def test_methods_of_objects_without_weak_references_are_compiled_once(system):
-    controller, other = Controller(1.0), Controller(1.0)
-    pushed = [last(system, {"push": controller.method}, step=0.1)]
-    n = counts[id(controller)]
-    pushed.append(last(system, {"push": controller.method}, step=0.1))
-    assert counts[id(controller)] == n
-    assert pushed == pytest.approx([expected(4.0, 1.0)] * 2, rel=1e-5)
-    controller.rng = np.random.default_rng(1)  # another object
-    last(system, {"push": controller.method}, step=0.1)
-    assert counts[id(controller)] > n
-    last(system, {"push": other.method}, step=0.1)
-    assert counts[id(other)] > 0
-
-
-@pytest.mark.slow
-def test_functions_with_the_same_code_have_separate_programs(system):
-    functions = [{"push": lambda t, state, push=push: push} for push in (1.0, 2.0, 3.0)]
-    for _ in range(2):
-        values = [last(system, f, step=0.1) for f in functions]
-        assert values == pytest.approx([expected(4.0, push) for push in (1.0, 2.0, 3.0)], rel=1e-5)
-
-
-@pytest.mark.weekly
 def test_classes_of_the_same_name_have_separate_programs():
     systems = [class_of_cell(k)() for k in (4.0, 9.0)]
-    for forget in (False, True):
-        if forget:
-            jk.forget()
-        assert [last(s) for s in systems] == pytest.approx([expected(4.0), expected(9.0)], rel=1e-5)
+    assert [last(s) for s in systems] == pytest.approx([expected(4.0), expected(9.0)], rel=1e-5)
 
 
 @pytest.mark.slow
@@ -217,113 +192,32 @@ def test_a_class_that_was_copied_by_cloudpickle_is_simulated():
     assert last(copy(), step=0.1) == pytest.approx(expected(4.0), rel=1e-5)
 
 
-@dataclasses.dataclass
-class Constant:
-    push: float
-
-    def __call__(self, t, state):
-        return {"push": self.push}
-
-
-@dataclasses.dataclass(slots=True)
-class ConstantWithSlots:
-    push: float
-
-    def __call__(self, t, state):
-        return {"push": self.push}
-
-
-class EqualToAll(Constant):
-    __eq__ = lambda self, other: True  # noqa: E731
-    __hash__ = lambda self: 1  # noqa: E731
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", [Constant, ConstantWithSlots, EqualToAll])
-def test_controllers_compared_by_value_have_separate_programs(kind, system):
-    """The first two have no hash, the second no weak references."""
-    for push in (1.0, 2.0):
-        assert last(system, kind(push), step=0.1) == pytest.approx(expected(4.0, push), rel=1e-5)
-
-
-@pytest.mark.weekly
-@on_linux
-def test_models_used_alternately_are_not_recompiled_in_every_round(limit):
-    systems = [class_of_cell(k)() for k in (4.0, 5.0, 6.0)]
-    last(systems[0])
-    limit(0)
-    for _ in range(4):
-        assert [last(s) for s in systems] == pytest.approx([expected(k) for k in (4.0, 5.0, 6.0)], rel=1e-5)
-    before = solve.programs.uses()
-    [last(s) for s in systems]
-    assert len(solve.programs.uses()) == len(before)
-
-
-class Mapped:
-    """A process in which each result of some caches is `each` memory mappings, and other code has `others`."""
-
-    def __init__(self, monkeypatch, each, others=0, most=65530):
-        self.caches = [Cache(programs=True), Cache(programs=True)]
-        self.each, self.others, self.most = each, others, most
-        monkeypatch.setattr(cache, "memory_mappings", self.count)
-        monkeypatch.setattr(Cache, "all", lambda: self.caches)
-        self.limit = cache._Limit()
-        monkeypatch.setattr(cache, "LIMIT", self.limit)
-
-    def count(self):
-        return self.others + self.each * sum(map(len, self.caches)), self.most
-
-
-def test_the_least_recently_used_programs_are_dropped(monkeypatch):
-    process = Mapped(monkeypatch, each=100, others=1000)
-    a, b = process.caches
-    for i in range(100):
-        (a if i % 2 else b).keep(i, [i])
-        a.known(1, None)
-        assert process.count()[0] <= 4100
-    assert a.known(1) == [1]
-    assert a.known(99) == [99]
-    assert a.known(3, None) is b.known(0, None) is None
-    assert process.limit.mappings == 4000
+def process_with(monkeypatch, each, others=0):
+    """A cache each of whose results is `each` memory mappings, in a process whose other code has `others`."""
+    programs, limit = Cache(programs=True), cache._Limit()
+    monkeypatch.setattr(cache, "memory_mappings", lambda: (others + each * len(programs), 65530))
+    monkeypatch.setattr(Cache, "all", lambda: [programs])
+    monkeypatch.setattr(cache, "LIMIT", limit)
+    return programs, limit
 
 
 def test_the_limit_increases_if_dropped_programs_are_used_again(monkeypatch):
-    process, made = Mapped(monkeypatch, each=100), []
+    (programs, limit), made = process_with(monkeypatch, each=100), []
     for _ in range(5):
         made.append(0)
         for i in range(60):
-            process.caches[0].get(i, lambda: made.__setitem__(-1, made[-1] + 1))
-    assert made[0] == 60
-    assert made[2:] == [0, 0, 0]
-    assert process.limit.mappings == 8000
-
-
-@pytest.mark.slow
-def test_memory_mappings_of_other_code_do_not_cause_repeated_dropping(monkeypatch):
-    process = Mapped(monkeypatch, each=10, others=5000)
-    for i in range(20):
-        process.caches[0].keep(i, i)
-    assert len(process.caches[0]) == 20
+            programs.get(i, lambda: made.__setitem__(-1, made[-1] + 1))
+    assert (made[0], made[2:]) == (60, [0, 0, 0])
+    assert limit.mappings == 8000
 
 
 def test_a_warning_is_issued_before_the_limit_of_memory_mappings(monkeypatch):
-    process = Mapped(monkeypatch, each=10, others=50_000)
-    with pytest.warns(UserWarning, match=r"50\d\d\d memory mappings, and Linux terminates it at 65530.*jaxkane.forget"):
-        process.caches[0].keep(0, 0)
+    programs, _ = process_with(monkeypatch, each=10, others=50_000)
+    with pytest.warns(UserWarning, match=r"50\d\d\d memory mappings, .* at 65530.*jaxkane.forget"):
+        programs.keep(0, 0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        process.caches[0].keep(1, 1)
-
-
-def test_a_cached_result_is_dropped_when_any_owner_is_deleted():
-    class Owner:
-        pass
-
-    results, a, b = Cache(), Owner(), Owner()
-    results.keep("both", 1, [a, b])
-    results.keep("b", 2, [b])
-    del a
-    assert (results.known("both", None), results.known("b", None), len(results)) == (None, 2, 1)
+        programs.keep(1, 1)
 
 
 def test_caches_are_thread_safe_while_owners_are_deleted():

@@ -7,7 +7,6 @@ import sys
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 from jaxkane._scalarjit import compat as internals
@@ -32,28 +31,6 @@ def test_the_used_interfaces_of_jax_exist(module):
     found = importlib.import_module(module)
     missing = [name for name in USED[module].split() if not hasattr(found, name)]
     assert not missing, f"{module} lacks {', '.join(missing)}"
-
-
-def test_jaxprs_have_the_expected_structure():
-    """A program by its equations, in `interpret`; and what follows from which input."""
-    program = jax.make_jaxpr(lambda x, y: (jnp.sin(x) * 2.0 + np.arange(3.0), y))(1.0, 2.0)
-    names: list[str] = []
-
-    def rule(equation, xs):
-        operation = internals.operation_of(equation)
-        names.append(operation.name)
-        assert (operation.is_pure, operation.results) == (True, 1)
-        return internals.evaluated(equation, xs)
-
-    sums, y = internals.interpret(program, [0.5, 2.0], rule)
-    np.testing.assert_allclose(sums, 2.0 * np.sin(0.5) + np.arange(3.0), rtol=1e-15)
-    assert (names[:2], y) == (["sin", "mul"], 2.0)
-    assert internals.dependencies(program) == [{0}, {1}]
-    assert internals.depends_on(program, [0]) == [True, False]
-    assert internals.depends_on(program, [1]) == [False, True]
-    inner = jax.make_jaxpr(jax.jit(jnp.sin))(1.0).jaxpr.eqns[0]
-    assert internals.operation_of(inner).function == "sin"
-    assert [len(internals.types_of(p)[0]) for p in internals.programs_in(inner)] == [1]
 
 
 def test_the_used_interfaces_of_jax_behave_as_expected(by_xla):

@@ -10,12 +10,9 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-import equinox._errors as checks
-import jax
 import pytest
 
 from jaxkane._scalarjit import native
-from jaxkane._scalarjit.compat import storable_checks
 from jaxkane._scalarjit.configure import _made_folder, _split_cpu, configure
 from jaxkane._scalarjit.native import switched_on
 
@@ -54,35 +51,6 @@ rides = jk.sweep.sweep(P, start, np.linspace(0.0, 1.0, 6), table={"length": [1.0
 assert rides.reason == ["completed", "completed", "invalid"]
 print(len(hits), len(misses), ride.q.dtype, np.asarray(ride.q).tobytes().hex(), rides.q.tobytes().hex())
 """
-REFUSALS = """
-import pytest
-def refused(message, f, *args):
-    with pytest.raises(ValueError, match=message):
-        f(*args)
-ts = np.linspace(0.0, 1.0, 6)
-class Ring(jk.System):
-    coordinates = ("x", "y")
-    speeds = ("v",)
-    dependent_coordinates = ("y",)
-    def q_dot(self, t, q, u):
-        return -q[1] * u[0], q[0] * u[0]
-    def configuration_constraints(self, t, q):
-        return [q[0] ** 2 + q[1] ** 2 - 1.0]
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        P = O.moving(q[0] * N.x + q[1] * N.y, -q[1] * u[0] * N.x + q[0] * u[0] * N.y)
-        return jk.Motion([jk.Body(1.0, 0.0, P)])
-refused("violate the configuration constraints", jk.simulate, Ring(), jk.State(np.array([0.3, 0.3]), np.zeros(1)), ts)
-refused("no y that satisfies", jk.assemble, Ring(), {"x": 1.5}, {})
-class Light(jk.System):
-    mass: jk.Scalar = jk.parameter(0.0)
-    coordinates = ("x",)
-    speeds = ("v",)
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
-refused("Light", jk.simulate, Light(), jk.State(np.zeros(1), np.zeros(1)), ts)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -112,14 +80,9 @@ def first(cache, python):
     return python(f"jk.configure(cache={str(cache)!r})\n" + RIDE).stdout.splitlines()
 
 
-@pytest.mark.weekly
-def test_configure_prints_a_summary(first, cache):
+def test_compiled_simulations_are_reused_by_the_next_process(first, cache, python):
     assert first[0] == f"jaxkane: float64, {KERNELS}"
     assert first[1].startswith(f"  Compiled programs are stored in {cache} (none yet)")
-    assert first[2].startswith("  Stored programs return NaN instead of raising an exception. The `status`")
-
-
-def test_compiled_simulations_are_reused_by_the_next_process(first, cache, python):
     assert {"jit_solve", "jit__solve"} <= {path.name.rsplit("-", 2)[0] for path in cache.iterdir()}
     _, compiled, dtype, *bytes_of_first = first[-1].split()
     assert int(compiled) > 3
@@ -129,11 +92,6 @@ def test_compiled_simulations_are_reused_by_the_next_process(first, cache, pytho
     assert int(hits) >= int(compiled)
     assert bytes_of_second == bytes_of_first
     assert len(second) == 1  # and nothing else was printed
-
-
-@pytest.mark.weekly
-def test_exceptions_are_raised_with_a_cache(cache, python):
-    python(f"jk.configure(cache={str(cache)!r}, verbose=False)\n" + REFUSALS)
 
 
 def test_child_processes_inherit_the_configuration_without_repeated_output(cache, python):
@@ -211,16 +169,7 @@ def test_the_environment_may_switch_native_kernels_off():
 
 @pytest.mark.parametrize(
     ("word", "is_on"),
-    [
-        ("0", False),
-        ("false", False),
-        ("No", False),
-        ("OFF", False),
-        ("", True),
-        ("1", True),
-        ("True", True),
-        ("on", True),
-    ],
+    [("0", False), ("false", False), ("No", False), ("OFF", False), ("", True), ("1", True), ("True", True)],
 )
 def test_environment_values_for_on_and_off(word, is_on):
     assert switched_on(word) is is_on
@@ -279,23 +228,6 @@ def test_equinox_checks_of_the_user_raise_with_a_cache(cache, python):
         "print(jax.config.jax_compilation_cache_dir, raises())"
     )
     assert python(code).stdout.splitlines() == ["True True True False", "None True"]
-
-
-def test_concurrent_traces_restore_the_setting_of_equinox_checks(monkeypatch, tmp_path):
-    """The first sets it, and the last restores it, in whatever order they end."""
-    monkeypatch.setattr(checks, "EQX_ON_ERROR", "raise")
-    before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    try:
-        first, second = storable_checks(), storable_checks()
-        first.__enter__()
-        second.__enter__()
-        first.__exit__(None, None, None)
-        assert checks.EQX_ON_ERROR == "nan"
-        second.__exit__(None, None, None)
-        assert checks.EQX_ON_ERROR == "raise"
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)
 
 
 @pytest.mark.parametrize("devices", ["2", True, 2.5, 0])

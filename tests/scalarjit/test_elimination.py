@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from jaxkane._scalarjit import elimination
-from jaxkane._scalarjit.elimination import ScalarSolve, graph_of_solution
-from jaxkane._scalarjit.scalar_function import ScalarFunction
+from jaxkane._scalarjit.elimination import ScalarSolve
 
 N = 9
 
@@ -92,19 +91,3 @@ def test_dense_systems_are_solved_by_lapack(monkeypatch):
 @pytest.mark.parametrize("solve", [singular, rounded])
 def test_a_singular_matrix_gives_nan(solve):
     assert np.isnan(solve(*numbers())).any()
-
-
-def test_the_operation_count_is_proportional_to_the_number_of_unknowns():
-    def operations(n):
-        def form(x):
-            z = [x[0]]
-            for i in range(1, n):
-                z.append(0.5 * z[-1] + x[i])
-            return jnp.stack(z)[:, None], jnp.ones((n, 1, 1), x.dtype)
-
-        _, program = ScalarFunction(form).program(jnp.zeros(n))
-        graph, (x,) = graph_of_solution(program.program)
-        assert x.shape == (n,)
-        return len(graph.nodes)
-
-    assert operations(40) < 4.5 * operations(10)

@@ -23,36 +23,24 @@ THREADS = """
 import threading, numpy as np, jax, jaxkane as jk
 from jaxkane._scalarjit import native
 jax.config.update("jax_enable_x64", True)
-def system(k):
-    class Arm(jk.System):
-        mass: jk.Scalar = jk.parameter(1.0)
-        coordinates, speeds = ("a", "b"), ("x", "y")
-        def motion(self, t, q, u):
-            N, O = jk.inertial()
-            A = N.rotate(1 + k % 3, q["a"], u["x"])
-            B = A.rotate(1 + (k + 1) % 3, q["b"], u["y"])
-            P = O.fixed((1.0 + k) * A.x + A.y)
-            return jk.Motion([jk.Body(self.mass, (2.0, 2.0, 1.0 + 0.5 * k), P, A),
-                              jk.Body(self.mass, (1.0, 1.0, 1.0), P.fixed(B.x + 2 * B.y), B)])
-        def loads(self, t, q, u, motion, inputs):
-            return jk.weight(motion, -9.81 * motion.N.y)
-    return Arm()
-systems, found = [system(k // 2) for k in range(8)], {}
-q, u = np.array([0.3, 0.4]), np.array([0.1, -0.2])
+names = ("DoublePendulum", "SpinningTop", "RotatingFrameAndBar", "SliderWithPinnedBar")
+entries, found = [jk.catalog.CATALOG[name] for name in names for _ in "ab"], {}
+systems, states = [entry.example() for entry in entries], [(entry.q, entry.u) for entry in entries]
+rates = lambda k: np.asarray(jk.accelerations(systems[k], 0.0, *states[k]))
 gate = threading.Barrier(len(systems))
 def work(k):
     gate.wait()
-    found[k] = np.asarray(jk.accelerations(systems[k], 0.0, q, u))
+    found[k] = rates(k)
 threads = [threading.Thread(target=work, args=(k,)) for k in range(len(systems))]
 [t.start() for t in threads]
 [t.join() for t in threads]
 assert native.is_on()
-again = [np.asarray(jk.accelerations(s, 0.0, q, u)) for s in systems]
+again = [rates(k) for k in range(len(systems))]
 native.use(False)
 for k in range(0, len(systems), 2):
-    by_xla = np.asarray(jk.accelerations(systems[k], 0.0, q, u))
+    by_xla = rates(k)
     for numbers in (found[k], found[k + 1], again[k], again[k + 1]):
-        np.testing.assert_allclose(numbers, by_xla, rtol=1e-11)
+        np.testing.assert_allclose(numbers, by_xla, rtol=1e-11, atol=1e-11)
 print("right")
 """
 
@@ -154,22 +142,7 @@ CHANGES = {
         "void* data;\n  XLA_FFI_DataType dtype;",
         "struct XLA_FFI_Buffer has changed",
     ),
-    "another field": (
-        "  const XLA_FFI_Api* api;\n",
-        "  const XLA_FFI_Api* api;\n  void* more;\n",
-        "struct XLA_FFI_CallFrame has changed",
-    ),
     "another version": ("XLA_FFI_API_MAJOR 0", "XLA_FFI_API_MAJOR 1", "XLA_FFI_API_MAJOR has changed"),
-    "another name": (
-        "XLA_FFI_Metadata_Extension",
-        "XLA_FFI_MetadataExtension",
-        "struct XLA_FFI_Metadata_Extension has changed",
-    ),
-    "arguments otherwise than results": (
-        "  void** rets;",
-        "  int64_t more;\n  void** rets;",
-        "struct XLA_FFI_Rets has changed",
-    ),
     "nothing in it": (None, "", "XLA_FFI_API_MAJOR has changed"),
 }
 

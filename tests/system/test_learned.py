@@ -73,20 +73,6 @@ def test_a_system_with_a_learned_law_is_one_program_of_scalars(pendulum):
 
 
 @pytest.mark.weekly
-def test_derivatives_by_the_weights_of_a_learned_law(pendulum):
-    def last(weight):
-        law = eqx.tree_at(lambda law: law.layers[0].weight, pendulum.law.function, weight)
-        return jk.simulate(Pendulum(law), START, ts[:11])["angle"][-1]
-
-    weight = pendulum.law.function.layers[0].weight
-    value_and_grad = jax.jit(jax.value_and_grad(last))
-    slope = value_and_grad(weight)[1]
-    h = 1e-4
-    up, down = (value_and_grad(weight.at[2, 0].add(d))[0] for d in (h, -h))
-    assert float(slope[2, 0]) == pytest.approx(float(up - down) / (2 * h), rel=1e-4)
-
-
-@pytest.mark.weekly
 def test_a_learned_law_and_the_mass_are_identified_together(pendulum):
     true = jk.simulate(Rough(network(), mass=0.4), START, ts)
     noise = np.random.default_rng(0).normal(0.0, 1e-3, ts.size)

@@ -103,18 +103,6 @@ def test_steady_motions_and_linear_models_print_values_and_eigenvalues():
 
 
 @pytest.mark.weekly
-def test_families_print_the_range_of_each_quantity():
-    class Stiffening(Cart):
-        def loads(self, t, q, u, motion, inputs):
-            return jk.Force((inputs["pull"] - 8.0 * q["x"] - q["x"] ** 3) * motion.N.x, motion["box"])
-
-    start = stability.equilibrium(Stiffening(), {"x": 0.1}, {"pull": 1.0}, hold=("x",), find=("pull",))
-    turns = stability.family(Stiffening(), start, towards={"x": 1.0}, until={"x": 0.5}, hold=("x_dot",), find=("pull",))
-    assert repr(turns).splitlines()[1:] == ["x 0.1 to 0.5 m", "pull 0.801 to 4.125 N"]
-    assert repr(turns.motion(-1)).startswith("SteadyMotion(x=0.5 m, x_dot=0 m/s, pull=4.125 N;")
-
-
-@pytest.mark.weekly
 def test_eigenvalues_of_a_bicycle_print_the_first_and_the_last():
     bicycle = bicycles.Bicycle.benchmark()
     lines = repr(stability.eigenvalues(bicycle, np.linspace(0.0, 10.0, 41))).splitlines()

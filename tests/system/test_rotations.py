@@ -73,7 +73,7 @@ def test_euler_parameters_are_scalar_last_and_map_to_the_body():
     assert abs(float(rates @ e)) < 1e-16  # the norm is kept
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-3, 0.0099, 0.0101, 2.0])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 0.0099, 0.0101, 2.0])
 def test_rotation_vectors_are_smooth_at_the_limit_of_the_series(angle):
     vector = angle * np.array([2.0, -1.0, 2.0]) / 3.0
     e = jnp.stack(rotations.of_rotation_vector(jnp.asarray(vector)))
