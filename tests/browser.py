@@ -54,7 +54,7 @@ class Page:
                 assert "error" not in answer, f"{method}: {answer['error']}"
                 return answer["result"]
 
-    def _next(self, method, timeout=60.0):
+    def _next(self, method, timeout=300.0):
         while b"\0" not in self._rest:
             ready, _, _ = select.select([self._from], [], [], timeout)
             part = os.read(self._from, 1 << 20) if ready else b""
@@ -76,7 +76,7 @@ class Page:
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
-    def wait(self, expression, seconds=20.0):
+    def wait(self, expression, seconds=120.0):
         """Until an expression is true."""
         end = time.monotonic() + seconds
         while not self.value(expression):
