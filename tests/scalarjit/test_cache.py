@@ -146,7 +146,6 @@ def test_input_functions_with_the_same_code_have_separate_programs(kind, system)
 
 
 @pytest.mark.weekly
-@pytest.mark.xfail(strict=True, reason="the rule for derivatives in a program of `simulate` refers to input functions")
 @pytest.mark.parametrize("kind", ["closure", "method"])
 def test_programs_are_freed_with_the_functions_that_they_were_traced_with(kind, system):
     def simulated(push):

@@ -117,7 +117,9 @@ def solve(
     # The errors of tangents are not controlled with fixed steps, nor in the loop of diffrax.
     by_error = settings.controller is None and settings.solver.term_structure is diffrax.AbstractTerm
     how = "fixed steps" if settings.step is not None else "controlled" if by_error else "steps of the motion"
-    return dataclasses.replace(with_own_tangents(run, arguments, (settings, closures)), adjoint=how)
+    both = arguments, (settings, closures)
+    ride = with_own_tangents(run, *both) if settings.differentiable else run(both, None, False)
+    return dataclasses.replace(ride, adjoint=how)
 
 
 def _with_captured_numbers(system: System, state: State, t: Array, signals: Signals | SharedTimes) -> Any:

@@ -36,6 +36,7 @@ class Settings(eqx.Module):
     - `max_steps`: None for an unlimited number.
     - `rising`: whether the times were already checked to increase.
     - `check_bodies`: whether a simulation of bodies with an impossible inertia is invalid.
+    - `differentiable`: False if no number of the simulation is traced. Its program then has no rule for derivatives.
     - All others: see `simulate`.
     """
 
@@ -53,6 +54,7 @@ class Settings(eqx.Module):
     stabilize: float = eqx.field(static=True)
     rising: bool = eqx.field(static=True, default=False)
     check_bodies: bool = eqx.field(static=True, default=False)
+    differentiable: bool = eqx.field(static=True, default=True)
 
     @property
     def is_forward(self) -> bool:

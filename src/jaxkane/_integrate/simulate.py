@@ -138,6 +138,9 @@ def simulate(
     given = checked_discontinuities(discontinuities, first_of(ts), dtype)
     settings, relative = with_array_tolerances(settings, dtype), share_times(since(first_of(ts), signals, dtype))
     closures = captured_tracers(signals)
+    # A rule for derivatives would keep the input functions alive as long as the program, which is freed with them.
+    traced = not is_concrete(system, state, ts, relative, settings, given, closures)
+    settings = dataclasses.replace(settings, differentiable=traced)
     trajectory = solve(system, state, origin, taus, relative, settings, given, closures=closures)
     trajectory = dataclasses.replace(trajectory, **on_clock(ts, trajectory))
     if is_concrete(trajectory.status) and int(trajectory.status) == Status.NO_SOLUTION:
