@@ -39,26 +39,10 @@ from ._system.kinematics import Frame, Point, Vector, check_vector
 from ._system.motion import Body, Force, Torque, point_of
 
 __all__ = [
-    "Law",
-    "actuator",
-    "bouc_wen",
-    "coulomb",
-    "damper",
-    "dc_motor",
-    "dead_zone",
-    "drag",
-    "friction",
-    "lugre",
-    "quadratic",
-    "rotor",
-    "smooth_abs",
-    "smooth_sign",
-    "spring",
-    "stribeck",
-    "torsional_damper",
-    "torsional_friction",
+    "actuator", "bouc_wen", "coulomb", "damper", "dc_motor", "dead_zone", "drag", "friction", "lugre", "quadratic",
+    "rotor", "smooth_abs", "smooth_sign", "spring", "stribeck", "torsional_damper", "torsional_friction",
     "torsional_spring",
-]
+]  # fmt: skip
 
 
 def check_numbers(law: str, **values: Any) -> None:

@@ -16,6 +16,12 @@ import jax.numpy as jnp
 from ._common.lookup import refuse_if
 from ._scalarjit.components import Component, Triple, add, cross, dot, is_exact, matvec, mul, several, sub
 
+__all__ = [
+    "IDENTITY", "Matrix", "angle_rates", "angular_velocity", "axes_of", "cosine_and_sine", "euler_parameter_norm",
+    "euler_parameter_rates", "euler_parameters_matrix", "matmul", "normalized", "of_rotation_vector",
+    "rodrigues_matrix", "sequence_matrix", "simple_rotation", "transpose",
+]  # fmt: skip
+
 Matrix = tuple[Triple, Triple, Triple]
 
 _FOUR = "Euler parameters are four numbers, the scalar last"

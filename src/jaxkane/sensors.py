@@ -26,6 +26,11 @@ from ._system.motion import Body, point_of
 from ._system.system import Measurements
 from .loads import check_numbers
 
+__all__ = [
+    "accelerometer", "camera", "delayed", "encoder", "gyroscope", "imu", "load_cell", "low_pass",
+    "low_pass_second_order", "marker",
+]  # fmt: skip
+
 Named = dict[str, Component]
 
 
