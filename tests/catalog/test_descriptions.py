@@ -11,7 +11,11 @@ from jaxkane import catalog
 FILES = sorted(pathlib.Path(catalog.__file__).parent.glob("*.py"))
 LAYERS_BELOW = {"_common", "_scalarjit", "rotations", "_system", "loads", ""}
 OF_JUMPS = {("_integrate.events", "falling"), ("_integrate.events", "rising"), ("_kane.contact.impulses", "Impact")}
-OF_JUMPS |= {("_kane.contact.declarations", "Contact"), ("_kane.contact.declarations", "DryFriction")}
+OF_JUMPS |= {
+    ("_integrate.events", "Crossing"),
+    ("_kane.contact.declarations", "Contact"),
+    ("_kane.contact.declarations", "DryFriction"),
+}
 METHOD = {"jvp", "vjp", "grad", "jacfwd", "jacrev", "linearize", "solve", "inv"}
 
 

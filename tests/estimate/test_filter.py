@@ -335,7 +335,7 @@ def test_a_parameter_is_estimated_by_the_filter(method):
     [
         ({"sensors": {"rat": 0.1}}, "`sensors` contains unknown names: rat; did you mean 'rate'"),
         ({"sensors": {"rate": 0.0}}, "`sensors` of rate must be positive and finite, got 0.0"),
-        ({"noise": {"angle": 0.1}}, "`noise` contains angle. Noise in the rate of a coordinate would break"),
+        ({"noise": {"angle": 0.1}}, "`noise` contains angle. .* Name independent speeds"),
         ({"noise": {"rate": float("nan")}}, "`noise` of rate must be finite and not negative, got nan"),
         ({"drift": {"dampin": 0.1}}, "`drift` contains unknown names: dampin; did you mean 'damping'"),
         ({"lag": -1}, "`lag` must be an integer of at least 0"),

@@ -244,7 +244,7 @@ def least_change(G: Array, h: Array, weights: Array) -> Array:
     A coordinate of weight zero does not change. A residual is omitted if its gradient is zero or linearly dependent on
     the previous ones.
     """
-    return (RowBasis.of(G * weights[None]).least_norm(h).T * weights).T
+    return weights.reshape(-1, *[1] * (h.ndim - 1)) * RowBasis.of(G * weights[None]).least_norm(h)
 
 
 def projected(system: System, t: Component, q: Array, steps: int = 3) -> Float[Array, " n_q"]:
