@@ -334,7 +334,7 @@ def test_a_large_input_is_reached_from_a_guess_of_zero():
 
 
 def test_closed_contacts_are_refused_by_name():
-    # The equations of steady motions have no contact forces: a block below the floor is no equilibrium.
+    # The equations of steady motions have no contact forces: a block below the floor is not at rest there.
     with pytest.raises(ValueError, match=r"Lifted has closed contacts here: floor.*no contact forces"):
         equilibrium(Lifted(), inputs={"command": -1.0})
     with pytest.raises(ValueError, match="Belt has closed contacts here: belt"):

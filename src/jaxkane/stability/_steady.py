@@ -408,7 +408,7 @@ def levenberg_marquardt(equations: SteadyEquations, guess: Array, args: SteadyAr
         sizes = row_sizes(jacobian(F, z), equations.sizes(z, largest, args))
         costs = cost(r, sizes), cost(F(rounded), sizes)
         z = jnp.where(costs[1] <= costs[0], rounded, z)
-        return z, jnp.where(damping > 0, 0.0, -1.0), jnp.minimum(*costs) > rank_tolerance(z.dtype) ** 2
+        return z, jnp.where(damping > 0, 0.0, -1.0), jnp.minimum(*costs) > len(sizes) * rank_tolerance(z.dtype) ** 2
 
     # The size of an equation whose terms are all zero at the guess is a guess too. If it is too small by powers of ten,
     # no damped step is better. The search is then repeated with a first step of Newton's method.

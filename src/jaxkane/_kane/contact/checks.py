@@ -17,7 +17,7 @@ from ..constraint_residuals import configuration_residual
 from ..description import at_random_point
 from ..kanes_method import KaneEquations
 from ..scaling import nearest_root
-from .forces import ContactLayout, ContactRows, gap_sizes, has_contacts, layout_of
+from .forces import ContactLayout, ContactRows, gap_sizes, gap_tolerances, has_contacts, layout_of
 
 
 @ScalarFunction
@@ -56,9 +56,9 @@ def check_contacts(system: System, t: Component, q: Numbers, *, may_penetrate: b
         if may_penetrate or given[2] is None or not is_concrete(given):
             return
         gaps, sizes = gap_sizes.numpy(system, t, q, np.zeros(len(system.speeds), q.dtype))
-    for name, gap, size in zip(layout.names, gaps, sizes, strict=True):
+    for name, gap, tolerance in zip(layout.names, gaps, gap_tolerances(sizes), strict=True):
         refuse_if(
-            gap < -(float(np.finfo(q.dtype).eps) ** 0.6) * size,
+            gap < -tolerance,
             f"{type(system).__name__}.contacts: the gap of {name!r} is {gap:.6g} at the start. It must not be "
             f"negative. Find touching coordinates with jaxkane.assemble(system, q, touching=({name!r},)).",
         )

@@ -576,12 +576,17 @@ def gap_sizes(system: System, t: Component, q: Array, u: Array) -> tuple[Array, 
     return gaps(system, t, q, u), term_sizes(gaps, system, t, q, u)
 
 
+def gap_tolerances(sizes: Array) -> Array:
+    """The largest gaps (c,) that are rounding errors, for gaps whose terms have these sizes (c,)."""
+    return float(jnp.finfo(sizes.dtype).eps) ** 0.6 * sizes
+
+
 def closed_contacts(system: System, t: Component, q: Numbers) -> Array:
     """Whether each contact (c,) touches or penetrates. True for each `DryFriction`, which always acts."""
     if not has_contacts(system):
         return jnp.zeros(0, bool)
     gaps, sizes = gap_sizes(system, t, q, jnp.zeros(len(system.speeds), q.dtype))
-    return jnp.asarray(layout_of(system).is_bearing) | ~(gaps > float(jnp.finfo(q.dtype).eps) ** 0.6 * sizes)
+    return jnp.asarray(layout_of(system).is_bearing) | ~(gaps > gap_tolerances(sizes))
 
 
 def refuse_closed_contacts(system: System, closed: Array) -> None:

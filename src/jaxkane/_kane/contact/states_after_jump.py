@@ -31,6 +31,7 @@ from .forces import (
     event_sizes,
     forces_in_contact,
     gap_sizes,
+    gap_tolerances,
     layout_of,
     projected_speeds,
     solve_forces,
@@ -70,7 +71,7 @@ def gaps_at_start(system: System, t: Array, state: State) -> tuple[Array, Array]
     """Which contacts touch (c,), and whether none penetrates by more than a rounding error and their laws are valid."""
     arguments = constant((system, t, state.q, state.u))
     gaps, sizes = gap_sizes(*arguments)
-    tolerance = float(jnp.finfo(gaps.dtype).eps) ** 0.6 * sizes
+    tolerance = gap_tolerances(sizes)
     laws = terms_at(*arguments, dict.fromkeys(system.inputs, jnp.zeros((), gaps.dtype))).laws
     return jnp.abs(gaps) <= tolerance, jnp.all(gaps >= -tolerance) & laws.are_valid()
 
