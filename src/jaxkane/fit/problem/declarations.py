@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._common.lookup import as_names, hint, positive_number, real_number, refuse, refuse_unknown
+from ..._common.lookup import as_names, hint, positive_number, real_number, refuse, refuse_if, refuse_unknown
 from ..._kane.right_hand_side import output_names
 from ..._system.parameters import ANY, ParameterInfo, declared, leaf_name, learned_part, names_of_leaf
 from ..._system.system import System, unit_of, units_of
@@ -331,6 +331,10 @@ class NoiseTerm(Named):
         label = f"{kind} of {self.what}"
         start = positive_number(noise[self.what] if self.start is None else self.start, f"{label}: `start`")
         lower, upper = _checked_bounds(label, self.bounds)
+        refuse_if(
+            -math.inf < lower < 0,
+            f"{label}: the lower bound must not be negative, got bounds={self.bounds}. Pass 0 or None.",
+        )
         stated = self if self.bounds is None else dataclasses.replace(self, bounds=(max(lower, 0.0), upper))
         if is_density and (own := unit_of(self.what, units_of(system))):
             own = f"({own})" if set(own) & set(" /^") else own
