@@ -200,7 +200,9 @@ def _contact_forces(system: System, t: Time, y: PackedState, values: InputArrays
     state, layout = unpacked(system, y), layout_of(system)
     _, u, (forces, u_dot), _ = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
     named = {}
-    for i, (name, has_friction, is_bearing) in enumerate(zip(*layout[:3], strict=True)):
+    for i, (name, has_friction, is_bearing) in enumerate(
+        zip(layout.names, layout.has_friction, layout.is_bearing, strict=True)
+    ):
         if not is_bearing:
             named[f"{name}.normal"] = forces[i, 0]
         if has_friction and (not layout.in_space or is_bearing or layout.planes[i] is not None):

@@ -181,8 +181,13 @@ def unsupported_primitives(program: Jaxpr, is_ours: bool = False) -> Iterator[tu
         elif name not in _PLAIN:
             called = getattr(equation.params.get("call_jaxpr"), "jaxpr", None)  # hypot, not custom_jvp_call
             yield getattr(getattr(called, "debug_info", None), "func_name", name).strip("_"), not is_ours
-        elif name.startswith("reduce_") and getattr(equation.invars[0].aval, "size", 0) > LARGEST_SUM:
+        elif name.startswith("reduce_") and _summands(equation) > LARGEST_SUM:
             yield f"{name} of more than {LARGEST_SUM}", not is_ours
+
+
+def _summands(equation: Equation) -> int:
+    """Of each result of a sum."""
+    return equation.invars[0].aval.size // max(equation.outvars[0].aval.size, 1)
 
 
 def replaced(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -> list[Any]:

@@ -21,10 +21,12 @@ Otherwise the slip of a sticking contact would drift by the error of the solver,
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -59,8 +61,8 @@ from .impulses import Permanent, inverse_root
 from .laws import MOST_CONTACTS, SLIDES, STICKS, force_scales, with_friction
 
 
-class ContactLayout(NamedTuple):
-    """The contacts of a system, without numbers.
+class ContactLayout(eqx.Module):
+    """The contacts of a system, without numbers. All fields are static.
 
     - `names` (c,): in alphabetical order.
     - `has_friction` (c,): whether each contact has tangential rows.
@@ -72,14 +74,14 @@ class ContactLayout(NamedTuple):
     - `n_residuals`: the number of velocity residuals with multipliers (see `with_multipliers`).
     """
 
-    names: tuple[str, ...]
-    has_friction: tuple[bool, ...]
-    is_bearing: tuple[bool, ...]
-    in_space: bool
-    planes: tuple[int | None, ...]
-    has_point: tuple[bool, ...]
-    reads_time: bool = False
-    n_residuals: int = 0
+    names: tuple[str, ...] = eqx.field(static=True)
+    has_friction: tuple[bool, ...] = eqx.field(static=True)
+    is_bearing: tuple[bool, ...] = eqx.field(static=True)
+    in_space: bool = eqx.field(static=True)
+    planes: tuple[int | None, ...] = eqx.field(static=True)
+    has_point: tuple[bool, ...] = eqx.field(static=True)
+    reads_time: bool = eqx.field(static=True, default=False)
+    n_residuals: int = eqx.field(static=True, default=0)
 
     @property
     def d(self) -> int:
@@ -142,7 +144,7 @@ def layout_of(system: System) -> ContactLayout:
     dtype = dtype_of(system)
     q, u = (jnp.zeros(len(names), dtype) for names in (system.coordinates, system.speeds))
     program = jax.make_jaxpr(trace)(jnp.zeros((), dtype), q, u)
-    return found[0]._replace(reads_time=bool(any(depends_on(program, [0]))))
+    return dataclasses.replace(found[0], reads_time=bool(any(depends_on(program, [0]))))
 
 
 def _contacts(kane: KaneEquations, t: Component, q: Row, u: Row) -> tuple[Motion, dict[str, Any]]:

@@ -7,9 +7,13 @@ is v_T. L_N and L_T are the impulses of the whole impact:
     |L_T| <= mu L_N;  L_T = -mu L_N v_T+ / |v_T+| while sliding     Coulomb's law
     v+ = v- + G L,  G = C M^-1 C^T                             the Delassus matrix of all rows
 
-Every contact is open, slides or sticks after the impact. For at most four contacts, all combinations of these states
-are linear systems, which are solved at once. The first admissible combination is taken. Its system is then solved
-again and differentiated, so derivatives do not contain the other combinations.
+Every contact is open, slides or sticks after the impact. For given states and directions of the slip, these are linear
+equations. In a plane, all combinations of states are tried, and the one with the most sticking contacts is taken. In
+space, where directions are unknown, an iteration for all laws together finds the states: first Gauss and Seidel's
+method, which projects each contact onto its friction cone in turn, then Newton's method for these projections (Alart
+and Curnier 1991, "A mixed formulation for frictional contact problems prone to Newton like solution methods"). Both are
+accepted by the same test. The equations of the accepted states are then solved again and differentiated, so derivatives
+do not contain the search.
 
 References: Moreau (1988), "Unilateral contact and dry friction in finite freedom dynamics"; Glocker (2001), "Set-Valued
 Force Laws", for impacts with several contacts.
@@ -19,99 +23,37 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from ..._common.lookup import refuse_if
+from ..._scalarjit.nan import constant
+from ..._scalarjit.scalar_function import ScalarFunction
+from ..scaling import RowBasis
 
 MOST_CONTACTS = 4
-"""More contacts have too many combinations of states: four contacts in a plane have 256."""
+"""The contact forces of a motion are part of a program of scalars, which would be too long for more contacts."""
 
 OPEN, SLIDES, STICKS = 0, 1, 2
 
-_NEWTON_STEPS, _ANGLES = 20, 32
-
 
 class ContactImpact(NamedTuple):
-    """The result of `contact_impact`, for c contacts with one normal row and d tangential rows each.
+    """The solution of a `ContactProblem`, for c contacts with one normal row and d tangential rows each.
 
-    - `impulses` (c, 1 + d): NaN if no combination of states is admissible [N s].
+    - `impulses` (c, 1 + d): NaN if no states are admissible [N s].
     - `velocities` (c, 1 + d): after the impact [m/s].
     - `states` (c,): 0 open, 1 slides, 2 sticks.
-    - `determined` (): whether a combination is admissible.
-    - `unique` (): whether the velocities and impulses are unique. If a sticking row depends linearly on others, the
-        impulses have the smallest norm.
+    - `determined` (): whether the states are admissible.
     """
 
     impulses: Float[Array, "c rows"]
     velocities: Float[Array, "c rows"]
-    states: Int[Array, " c"]
+    states: Float[Array, " c"]
     determined: Bool[Array, ""]
-    unique: Bool[Array, ""]
-
-
-def contact_impact(
-    G: Float[Array, "c rows c rows"],
-    v: Float[Array, "c rows"],
-    restitution: Float[Array, " c"],
-    friction: Float[Array, " c"],
-    closed: Bool[Array, " c"],
-    has_friction: Sequence[bool] | None = None,
-    slip: Slip | None = None,
-) -> ContactImpact:
-    """The impulses of an impact with up to four unilateral contacts.
-
-    With accelerations instead of velocities and forces instead of impulses, these are the contact forces of a motion
-    without an impact. Then the direction of the friction of contacts that already slip is known: `slip`.
-
-    **Arguments:**
-
-    - `G` (c, 1 + d, c, 1 + d): the Delassus matrix. A contact has a normal row and d tangential rows: 0 without
-        friction, 1 in a plane, 2 in space.
-    - `v` (c, 1 + d): velocities before the impact [m/s]. Normal velocities are positive if the bodies separate.
-    - `restitution` (c,): coefficients of restitution.
-    - `friction` (c,): coefficients of friction.
-    - `closed` (c,): whether a contact takes part. The others transmit no impulse.
-    - `has_friction`: for each contact, whether its tangential rows exist. By default, all exist. Other rows are zero.
-    - `slip`: what is known about the slip. By default nothing.
-
-    **Raises:** `ValueError` for more than four contacts.
-    """
-    c, d = v.shape[0], v.shape[1] - 1
-    refuse_if(
-        c > MOST_CONTACTS,
-        f"An impact has at most {MOST_CONTACTS} contacts, got {c}. Use MuJoCo for systems with many contacts.",
-    )
-    rows = tuple(d if each else 0 for each in has_friction or (True,) * c)
-    states, signs = _combinations(rows)
-    each = _Combination(jnp.asarray(states), jnp.asarray(signs, G.dtype))
-    is_impact = slip is None
-    if slip is None:
-        no = jnp.zeros(friction.shape, bool)
-        slip = Slip(no, jnp.zeros((c, d), friction.dtype), friction, ~no)
-    problem = _Problem(G, v, restitution, friction, slip, is_impact)
-    fixed = jax.tree.map(jax.lax.stop_gradient, problem)
-    found = jax.vmap(fixed.solved)(each)
-    takes_part = jnp.all(closed[None] | (each.states == OPEN), axis=1)
-    takes_part &= jnp.all(slip.may_stick[None] | (each.states != STICKS), axis=1)
-    if d:
-        # A contact that already slips has one sliding combination.
-        is_repeated = (each.signs < 0) if d == 1 else jnp.zeros_like(each.states, bool)
-        takes_part &= ~jnp.any(slip.is_known[None] & (is_repeated | (each.states == STICKS)), axis=1)
-    is_admissible = takes_part & jax.vmap(fixed.is_admissible, (0, 0, None))(each, found, closed)
-    k = jnp.argmax(is_admissible)  # the first one
-    chosen, first = jax.tree.map(lambda x: x[k], (each, found))
-    solution = problem.differentiable(chosen, first)
-    differs = jnp.abs(found.velocities - first.velocities[None]) > 1e-6 * first.size[None]
-    is_only = ~jnp.any(is_admissible & jnp.any(differs, axis=(1, 2)))
-    impulses, velocities = (jnp.where(is_admissible[k], x, jnp.nan) for x in (solution.impulses, solution.velocities))
-    return ContactImpact(impulses, velocities, chosen.states, is_admissible[k], first.is_regular & is_only)
 
 
 class Slip(NamedTuple):
@@ -128,30 +70,27 @@ class Slip(NamedTuple):
     static: Array
     may_stick: Array
 
+    @classmethod
+    def unknown(cls, friction: Array, d: int) -> Slip:
+        no = jnp.zeros(friction.shape, bool)
+        return cls(no, jnp.zeros((len(friction), d), friction.dtype), friction, ~no)
 
-class _Combination(NamedTuple):
-    """The states of all contacts after an impact.
+
+class Choice(NamedTuple):
+    """The states of all contacts after an impact, and what the solution of their equations needs. Not differentiated.
 
     - `states` (c,): open, slides or sticks.
-    - `signs` (c,): of the slip of sliding contacts with one tangential row. 0 for other contacts.
+    - `ways` (c,): of sliding contacts. In a plane the sign of the slip, in space the angle of its direction [rad].
+    - `start` (c r,): impulses. The solution is the nearest one, if the equations have several.
+    - `inverse` (c r, c r): the pseudo-inverse of the equations.
+    - `is_admissible` (): whether the solution satisfies all laws.
     """
 
     states: Array
-    signs: Array
-
-
-@functools.cache
-def _combinations(n_tangential: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """States and signs of all combinations. Those with the most sticking and closed contacts are the first."""
-    choices = {
-        0: [(SLIDES, 0), (OPEN, 0)],
-        1: [(STICKS, 0), (SLIDES, 1), (SLIDES, -1), (OPEN, 0)],
-        2: [(STICKS, 0), (SLIDES, 0), (OPEN, 0)],
-    }
-    table = [*itertools.product(*(choices[d] for d in n_tangential))]
-    table.sort(key=lambda contacts: -sum(state for state, _ in contacts))
-    numbers = np.array(table).reshape(len(table), len(n_tangential), 2)
-    return numbers[..., 0], numbers[..., 1]
+    ways: Array
+    start: Array
+    inverse: Array
+    is_admissible: Array
 
 
 class _Solution(NamedTuple):
@@ -159,153 +98,250 @@ class _Solution(NamedTuple):
 
     - `impulses`, `velocities` (c, 1 + d): impulses, and velocities after the impact.
     - `size` (c, 1 + d): the size of the terms of each velocity.
-    - `angles` (c,): directions of the slip in space [rad].
     - `inverse` (K, K): the pseudo-inverse of the linear system.
-    - `is_regular`: whether the active rows are linearly independent.
     """
 
     impulses: Array
     velocities: Array
     size: Array
-    angles: Array
     inverse: Array
-    is_regular: Array
 
 
-class _Problem(eqx.Module):
-    G: Array
-    v: Array
-    restitution: Array
-    friction: Array
+class ContactProblem(eqx.Module):
+    """An impact with unilateral contacts.
+
+    With accelerations instead of velocities and forces instead of impulses, these are the contact forces of a motion
+    without an impact. Then the direction of the friction of contacts that already slip is known: `slip`.
+
+    - `G` (c, 1 + d, c, 1 + d): the Delassus matrix. A contact has a normal row and d tangential rows: 0 without
+        friction, 1 in a plane, 2 in space.
+    - `v` (c, 1 + d): velocities before the impact [m/s]. Normal velocities are positive if the bodies separate.
+    - `restitution` (c,), `friction` (c,): coefficients.
+    - `closed` (c,): whether a contact takes part. The others transmit no impulse.
+    - `slip`: what is known about the slip.
+    - `has_friction`: for each contact, whether its tangential rows exist. Other rows are zero.
+    - `is_impact`: False for accelerations and forces.
+    """
+
+    G: Float[Array, "c rows c rows"]
+    v: Float[Array, "c rows"]
+    restitution: Float[Array, " c"]
+    friction: Float[Array, " c"]
+    closed: Bool[Array, " c"]
     slip: Slip
+    has_friction: tuple[bool, ...] = eqx.field(static=True)
     is_impact: bool = eqx.field(static=True)
 
     @property
     def in_space(self) -> bool:
         return self.v.shape[1] == 3
 
-    def solved(self, combination: _Combination) -> _Solution:
-        angles = jnp.zeros_like(self.friction)
+    def choice(self) -> Choice:
+        """The states that satisfy all laws. Not differentiated."""
+        problem = constant(self)
         if self.in_space:
-            start = self._solution(combination, angles, friction=jnp.zeros_like(self.friction)).velocities
-            angles = _angle(start[:, 1], start[:, 2])
-            known = _angle(self.slip.directions[:, 0], self.slip.directions[:, 1])
-            angles = jnp.where(self.slip.is_known, known, angles)
-            for _ in range(1 if len(angles) == 1 else 2):
-                angles = jax.lax.fori_loop(0, len(angles), lambda i, x: self._best_angle(combination, x, i), angles)
-            angles = jax.lax.fori_loop(0, _NEWTON_STEPS, lambda _, x: self._newton_step(combination, x), angles)
-        return self._solution(combination, angles)
+            return _searched(problem)
+        d = self.v.shape[1] - 1
+        states, signs = _combinations(tuple(d if each else 0 for each in self.has_friction))
+        found = jax.vmap(functools.partial(_tried, problem))(*(jnp.asarray(x, self.v.dtype) for x in (states, signs)))
+        k = jnp.argmax(found.is_admissible)  # the first one
+        return jax.tree.map(lambda x: x[k], found)
 
-    def _best_angle(self, combination: _Combination, angles: Array, i: Array) -> Array:
-        """The angles, with the one of contact i for which the slip is nearest to its assumed direction.
-
-        Without this search, Newton's method finds no solution for 5 of 100 random impacts in space.
-        """
-        grid = jnp.asarray(np.arange(_ANGLES) * (2 * np.pi / _ANGLES), angles.dtype)
-        each = jax.vmap(angles.at[i].set)(grid)
-        found = jax.vmap(self._solution, (None, 0))(combination, each)
-        v, L = found.velocities[:, i], found.impulses[:, i]
-        slip = jnp.sqrt(v[:, 1] ** 2 + v[:, 2] ** 2)
-        slip = jnp.where(slip > 0, slip, 1.0)
-        sine = (jnp.cos(grid) * v[:, 2] - jnp.sin(grid) * v[:, 1]) / slip
-        cosine = (jnp.cos(grid) * v[:, 1] + jnp.sin(grid) * v[:, 2]) / slip
-        # The deviation changes its sign between this angle and the next one, which both have admissible impulses.
-        is_before = (L[:, 0] >= 0) & (cosine >= 0)
-        is_before = is_before & jnp.roll(is_before, -1) & (sine * jnp.roll(sine, -1) <= 0)
-        best = each[jnp.argmax(cosine + jnp.where(L[:, 0] >= 0, 2.0, 0.0) + jnp.where(is_before, 4.0, 0.0))]
-        return jnp.where(self.slip.is_known[i], angles, best)
-
-    def differentiable(self, combination: _Combination, known: _Solution) -> _Solution:
-        """The same with derivatives up to the third order, from two Newton steps at the known solution."""
-        angles = known.angles
+    def solution(self, choice: Choice) -> ContactImpact:
+        """The solution for these states, with derivatives up to the third order: two Newton steps at the solution."""
+        ways = choice.ways
         if self.in_space:
-            own = _angle(self.slip.directions[:, 0], self.slip.directions[:, 1])
-            angles = jnp.where(self.slip.is_known, own, angles)
-        for _ in range(2 if self.in_space else 0):
-            angles = self._newton_step(combination, angles)
-        return self._solution(combination, angles, inverse=known.inverse)
+            ways = jnp.where(self.slip.is_known, _angles(self.slip.directions), ways)
+            for _ in range(2):
+                ways = self._newton_step(choice, ways)
+        found = self.solved(choice.states, ways, choice.start, choice.inverse)
+        impulses, velocities = (jnp.where(choice.is_admissible, x, jnp.nan) for x in (found.impulses, found.velocities))
+        return ContactImpact(impulses, velocities, choice.states, choice.is_admissible)
 
-    def _newton_step(self, combination: _Combination, angles: Array) -> Array:
+    def _newton_step(self, choice: Choice, ways: Array) -> Array:
         """One step towards angles at which the slip has the assumed direction, n x v_T+ = 0."""
-        slides = (combination.states == SLIDES) & ~self.slip.is_known
+        slides = (choice.states == SLIDES) & ~self.slip.is_known
 
-        def deviation(angles: Array) -> Array:
-            v = self._solution(combination, angles).velocities
-            return jnp.where(slides, jnp.cos(angles) * v[:, 2] - jnp.sin(angles) * v[:, 1], 0.0)
+        def deviation(ways: Array) -> Array:
+            v = self.solved(choice.states, ways, choice.start, choice.inverse).velocities
+            return jnp.where(slides, jnp.cos(ways) * v[:, 2] - jnp.sin(ways) * v[:, 1], 0.0)
 
-        slope = jax.jacfwd(deviation)(angles) + jnp.diag(jnp.where(slides, 0.0, 1.0).astype(angles.dtype))
-        step = _pseudo_inverse(jax.lax.stop_gradient(slope))[0] @ deviation(angles)
-        return angles - jnp.clip(step, -0.5, 0.5)
+        # NumPy's unit matrix: the program of a `ScalarFunction` has constants only.
+        unit = np.eye(len(ways), dtype=ways.dtype)
+        columns = [jax.jvp(deviation, (ways,), (jnp.asarray(e),))[1] for e in unit]
+        slope = jnp.stack(columns, axis=1) + jnp.where(slides, 0.0, 1.0).astype(ways.dtype)[:, None] * unit
+        step = _written_out(jax.lax.stop_gradient(slope)) @ deviation(ways)
+        return ways - jnp.clip(step, -0.5, 0.5)
 
-    def _solution(
-        self,
-        combination: _Combination,
-        angles: Array,
-        friction: Array | None = None,
-        inverse: Array | None = None,
-    ) -> _Solution:
-        """The solution for given directions of the slip.
+    def solved(self, states: Array, ways: Array, start: Array, inverse: Array | None = None) -> _Solution:
+        """The solution for given states and directions of the slip.
 
         L = W z with independent impulses z: all impulses of sticking contacts, the normal ones of sliding contacts.
         """
         c, rows = self.v.shape
-        friction = self.friction if friction is None else friction
-        slides, sticks = (combination.states == x for x in (SLIDES, STICKS))
+        slides, sticks = (states == x for x in (SLIDES, STICKS))
+        invert = _by_svd if self.in_space else _written_out
         if self.in_space:
-            slips = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
+            slips = jnp.stack([jnp.cos(ways), jnp.sin(ways)], axis=1)
         elif rows == 2:
-            slips = jnp.where(self.slip.is_known[:, None], self.slip.directions, combination.signs[:, None])
+            slips = jnp.where(self.slip.is_known[:, None], self.slip.directions, ways[:, None])
         else:
             slips = jnp.zeros((c, 0), self.v.dtype)
         active = jnp.concatenate([(slides | sticks)[:, None], jnp.repeat(sticks[:, None], rows - 1, axis=1)], axis=1)
         target = jnp.concatenate([-(1.0 + self.restitution)[:, None] * self.v[:, :1], -self.v[:, 1:]], axis=1)
         # W = 1, and L_T = -mu n L_N while sliding
-        ratios = jnp.where(slides, -friction, 0.0)[:, None] * slips[:, : rows - 1]
-        ratios = jnp.concatenate([jnp.zeros_like(friction)[:, None], ratios], axis=1)
+        ratios = jnp.where(slides, -self.friction, 0.0)[:, None] * slips[:, : rows - 1]
+        ratios = jnp.concatenate([jnp.zeros_like(self.friction)[:, None], ratios], axis=1)
         W = with_friction(ratios)
         G, mask = self.G.reshape(c * rows, c * rows), active.reshape(-1)
         # For the active rows:  G W z = v+ - v-
         A = jnp.where(mask[:, None] & mask[None], G @ W, 0.0)
-        b, is_regular = jnp.where(mask, target.reshape(-1), 0.0), jnp.ones((), bool)
+        b = jnp.where(mask, target.reshape(-1), 0.0)
         if inverse is None:
             fixed = jax.lax.stop_gradient(A)
-            inverse, is_new = _pseudo_inverse(fixed)
-            is_regular = jnp.all(is_new | ~mask)
+            inverse = invert(fixed)
             if c > 1 and rows > 1 and not self.is_impact:
                 limits = self.slip.static * (W @ (inverse @ jax.lax.stop_gradient(b))).reshape(c, rows)[:, 0]
                 scales = force_scales(limits, sticks, rows)
-                inverse = scales[:, None] * _pseudo_inverse(fixed * scales[None])[0]
-        z = inverse @ b
-        for _ in range(2):  # the derivative of A z = b; the inverse is not differentiated
+                inverse = scales[:, None] * invert(fixed * scales[None])
+        z = jnp.where(mask, start, 0.0)
+        for _ in range(3):  # the last two are the derivative of A z = b; the inverse is not differentiated
             z = z + inverse @ (b - A @ z)
         L = W @ z
         v, size = self.v.reshape(-1) + G @ L, jnp.abs(self.v.reshape(-1)) + jnp.abs(G) @ jnp.abs(L)
         L, v, size = (x.reshape(c, rows) for x in (L, v, size))
-        return _Solution(L, v, size, angles, inverse, is_regular)
+        return _Solution(L, v, size, inverse)
 
-    def is_admissible(self, combination: _Combination, solution: _Solution, closed: Array) -> Array:
+    def is_admissible(self, states: Array, ways: Array, solution: _Solution) -> Array:
         eps = float(jnp.finfo(self.v.dtype).eps)
         L, v, d = solution.impulses, solution.velocities, self.v.shape[1] - 1
         rounding, inconsistent = 1e3 * eps * solution.size, eps**0.5 * solution.size
-        is_open, slides, sticks = (combination.states == x for x in (OPEN, SLIDES, STICKS))
+        is_open, slides, sticks = (states == x for x in (OPEN, SLIDES, STICKS))
         rebound = v[:, 0] + self.restitution * self.v[:, 0]
         inertia = jnp.stack([self.G[i, 0, i, 0] for i in range(len(v))])
         # Impulses are compared as the changes of velocity that they cause.
-        conditions = [L[:, 0] * inertia >= -rounding[:, 0]]
+        conditions = [L[:, 0] * inertia >= -rounding[:, 0], self.closed | is_open]
         conditions += [
-            jnp.where(is_open, ~closed | (rebound >= -rounding[:, 0]), jnp.abs(rebound) <= inconsistent[:, 0])
+            jnp.where(is_open, ~self.closed | (rebound >= -rounding[:, 0]), jnp.abs(rebound) <= inconsistent[:, 0])
         ]
         if d:
             force, slip = (jnp.sqrt(jnp.sum(x[:, 1:] ** 2, axis=1)) for x in (L, v))
             slack, limit = (jnp.max(x, axis=1) for x in (rounding, inconsistent))
             is_held = (slip <= limit) & ((force - self.slip.static * L[:, 0]) * inertia <= slack)
             if d == 1:
-                is_opposite = combination.signs * v[:, 1] >= -rounding[:, 1]
+                is_opposite = ways * v[:, 1] >= -rounding[:, 1]
             else:
                 # L_T . v_T = -|L_T| |v_T|
                 is_opposite = jnp.sum(L[:, 1:] * v[:, 1:], axis=1) + force * slip <= force * limit
-            conditions += [~sticks | is_held, ~slides | is_opposite | self.slip.is_known]
+            conditions += [~sticks | (is_held & self.slip.may_stick & ~self.slip.is_known)]
+            conditions += [~slides | is_opposite | self.slip.is_known]
         return jnp.all(jnp.stack(conditions)) & jnp.all(jnp.isfinite(v))
+
+
+@functools.cache
+def _combinations(n_tangential: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """States and signs of all combinations. Those with the most sticking and closed contacts are the first."""
+    choices = {0: [(SLIDES, 0), (OPEN, 0)], 1: [(STICKS, 0), (SLIDES, 1), (SLIDES, -1), (OPEN, 0)]}
+    table = [*itertools.product(*(choices[d] for d in n_tangential))]
+    table.sort(key=lambda contacts: -sum(state for state, _ in contacts))
+    numbers = np.array(table).reshape(len(table), len(n_tangential), 2)
+    return numbers[..., 0], numbers[..., 1]
+
+
+@ScalarFunction.compile_cheaply
+def _tried(problem: ContactProblem, states: Array, signs: Array) -> Choice:
+    start = jnp.zeros(problem.v.size, problem.v.dtype)
+    found = problem.solved(states, signs, start)
+    return Choice(states, signs, start, found.inverse, problem.is_admissible(states, signs, found))
+
+
+_SWEEPS, _ATTEMPTS, _NEWTON_STEPS = 15, 4, 30
+
+
+def _searched(problem: ContactProblem) -> Choice:
+    """The states by an iteration for all laws together; with more sweeps if they are not admissible.
+
+    It begins where all contacts stick, and remains there if that is a solution. Rows are divided by the square root of
+    the mobility of their contact: then one is a good step of the projections, whatever the units are.
+    """
+    (c, r), dtype = problem.v.shape, problem.v.dtype
+    eps, is_known = float(jnp.finfo(dtype).eps), problem.slip.is_known
+    mobility = jnp.einsum("iaia->i", problem.G)
+    moves = problem.closed & (mobility > 0)
+    scales = jnp.where(moves, 1.0 / jnp.sqrt(jnp.where(moves, mobility, 1.0)), 0.0)
+    v = scales[:, None] * problem.v.at[:, 0].multiply(1.0 + problem.restitution)
+    unit = jnp.max(jnp.abs(v))
+    unit, scales = jnp.where(unit > 0, unit, 1.0), jnp.repeat(scales, r)
+    v, G = v.reshape(-1) / unit, scales[:, None] * problem.G.reshape(c * r, c * r) * scales
+
+    def before_projection(L: Array) -> Array:
+        return (L - (v + G @ L)).reshape(c, r)
+
+    def projected(L: Array, friction: Array) -> Array:
+        """Each impulse, changed against its velocity, on its friction cone. A solution does not change."""
+        z = before_projection(L)
+        normal = jnp.where(moves, jnp.maximum(z[:, 0], 0.0), 0.0)
+        limit, squares = friction * normal, jnp.sum(z[:, 1:] ** 2, axis=1)
+        exceeds = squares > limit**2
+        share = jnp.where(exceeds, limit / jnp.sqrt(jnp.where(exceeds, squares, 1.0)), 1.0)[:, None]
+        tangential = jnp.where(is_known[:, None], -limit[:, None] * problem.slip.directions, share * z[:, 1:])
+        return jnp.concatenate([normal[:, None], tangential], axis=1).reshape(-1)
+
+    def by_newton(L: Array, friction: Array) -> Array:
+        def residual(L: Array) -> Array:
+            return L - projected(L, friction)
+
+        def step(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            k, L, F = carry
+            change, lengths = -_by_svd(jax.jacfwd(residual)(L)) @ F, jnp.asarray(0.5 ** np.arange(12), dtype)
+            each = jax.vmap(residual)(L + lengths[:, None] * change)
+            norms = jnp.linalg.norm(each, axis=1)
+            falls = norms < (1.0 - 1e-4 * lengths) * jnp.linalg.norm(F)
+            i = jnp.where(jnp.any(falls), jnp.argmax(falls), jnp.argmin(norms))
+            return k + 1, L + lengths[i] * change, each[i]
+
+        def goes_on(carry: tuple[Array, Array, Array]) -> Array:
+            k, L, F = carry
+            return (k < _NEWTON_STEPS) & (jnp.max(jnp.abs(F)) > 16 * eps * jnp.maximum(jnp.max(jnp.abs(L)), 1.0))
+
+        return jax.lax.while_loop(goes_on, step, (0, L, residual(L)))[1]
+
+    def at(L: Array, friction: Array, slack: float, share: float) -> Choice:
+        """The states at a solution: closed rather than open within the `slack`. `share`: of L at the start."""
+        z, can_stick = before_projection(L), np.array(problem.has_friction) & problem.slip.may_stick & ~is_known
+        pushes = moves & (z[:, 0] >= -slack)
+        size = jnp.sqrt(jnp.sum(z[:, 1:] ** 2, axis=1))
+        sticks = pushes & can_stick & (size <= friction * z[:, 0] + slack)
+        states = jnp.where(sticks, STICKS, jnp.where(pushes, SLIDES, OPEN)).astype(dtype)
+        ways = -jnp.sign(z[:, 1]) if r == 2 else jnp.zeros(c, dtype)
+        if problem.in_space:
+            known = _angles(problem.slip.directions)
+            ways = jnp.where(is_known, known, _angles(-z[:, 1:]))
+        start = share * unit * scales * L
+        found = problem.solved(states, ways, start)
+        return Choice(states, ways, start, found.inverse, problem.is_admissible(states, ways, found))
+
+    def attempt(carry: tuple[Array, Array, Array, Choice]) -> tuple[Array, Array, Array, Choice]:
+        k, L, friction, _ = carry
+        L = jnp.where(k == 1, 0.0, L)
+
+        def swept(i: Array, L: Array) -> Array:
+            return jnp.where(jnp.repeat(jnp.arange(c) == (i // 3) % c, r), projected(L, friction), L)
+
+        L = by_newton(jax.lax.fori_loop(0, 3 * c * _SWEEPS * 4**k, swept, L), friction)
+        options = (jnp.asarray(x, dtype) for x in ([eps**0.6, eps**0.6, 0.0, 0.0], [0.0, 1.0, 0.0, 1.0]))
+        found = jax.vmap(functools.partial(at, L, friction))(*options)
+        choice = jax.tree.map(lambda x: x[jnp.argmax(found.is_admissible)], found)
+        return k + 1, L, jnp.where(choice.states == SLIDES, problem.friction, limits), choice
+
+    def goes_on(carry: tuple[Array, Array, Array, Choice]) -> Array:
+        return (carry[0] < _ATTEMPTS) & ~carry[3].is_admissible
+
+    # A contact slips where its static friction is not enough, and slides with the kinetic one.
+    limits = jnp.where(problem.slip.may_stick & ~is_known, problem.slip.static, problem.friction)
+    none = jnp.zeros(c, dtype)
+    empty = Choice(none, none, jnp.zeros(c * r, dtype), jnp.zeros((c * r, c * r), dtype), jnp.array(False))
+    return jax.lax.while_loop(goes_on, attempt, (0, -_by_svd(G) @ v, limits, empty))[3]
 
 
 def with_friction(ratios: Array) -> Array:
@@ -331,30 +367,17 @@ def force_scales(limits: Array, sticks: Array, rows: int) -> Array:
     return jnp.concatenate([jnp.ones_like(scales), jnp.repeat(scales, rows - 1, axis=1)], axis=1).reshape(-1)
 
 
-def _angle(x: Array, y: Array) -> Array:
+def _angles(directions: Array) -> Array:
+    x, y = directions[:, 0], directions[:, 1]
     is_zero = (x == 0) & (y == 0)
     return jnp.arctan2(jnp.where(is_zero, 0.0, y), jnp.where(is_zero, 1.0, x))
 
 
-def _pseudo_inverse(A: Array) -> tuple[Array, Array]:
-    """P (K, K), for which P b is the smallest solution x of A x = b, and which rows of A (K,) are used.
+def _written_out(A: Array) -> Array:
+    """P (K, K), for which P b is the smallest solution x of A x = b. It can be part of a program of scalars."""
+    return RowBasis.of(A).least_norm(jnp.asarray(np.eye(len(A), dtype=A.dtype)))
 
-    As `least_change` for all unit vectors b. A loop, because XLA needs 5 s to compile all combinations of states
-    without one.
-    """
-    threshold = float(jnp.finfo(A.dtype).eps) ** 0.75
 
-    def with_row(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        Q, Y, is_new = carry
-        rest, value = A[i], jnp.eye(len(A), dtype=A.dtype)[i]
-        for _ in range(2):
-            along = Q @ rest
-            rest, value = rest - along @ Q, value - along @ Y
-        is_used = jnp.max(jnp.abs(rest)) > threshold * jnp.max(jnp.abs(A[i]))
-        norm = jnp.sqrt(jnp.sum(jnp.where(is_used, rest, 1.0) ** 2))
-        Q, Y = (x.at[i].set(jnp.where(is_used, row / norm, 0.0)) for x, row in ((Q, rest), (Y, value)))
-        return Q, Y, is_new.at[i].set(is_used)
-
-    start = jnp.zeros_like(A), jnp.zeros_like(A), jnp.zeros(len(A), bool)
-    Q, Y, is_new = jax.lax.fori_loop(0, len(A), with_row, start)
-    return Q.T @ Y, is_new
+def _by_svd(A: Array) -> Array:
+    """The same for any size."""
+    return jnp.linalg.pinv(A, rtol=float(jnp.finfo(A.dtype).eps) ** 0.75)

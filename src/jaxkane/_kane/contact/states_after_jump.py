@@ -12,7 +12,7 @@ infinitely many bounces has a derivative.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ from .forces import (
     terms_at,
     without_gaps,
 )
-from .laws import OPEN, SLIDES, STICKS, Slip, contact_impact
+from .laws import OPEN, SLIDES, STICKS, Choice, ContactProblem, Slip
 
 REST = 1e-9
 """A contact rests if the rest of its bounces, 2 v / (a (1 - e)), takes less than this share of the duration."""
@@ -128,9 +128,53 @@ def changed_contacts(
     """
     state = unpacked(system, y)
     assert state.contacts is not None
-    memory = ContactMemory.unpacked(layout, state.contacts)
-    values, bearing = values_of(system, state.x, inputs), jnp.asarray(layout.is_bearing)
+    values = values_of(system, state.x, inputs)
     before: ContactTerms = terms_at(system, t, state.q, state.u, values)
+    # Events are simultaneous within their rounding errors, which are large for a gap of large coordinates.
+    errors = 256 * float(jnp.finfo(y.dtype).eps) * constant(gap_sizes(system, t, state.q, state.u)[1])
+    first: _Impact = _impact(layout, before, state, event, errors, reach, rest)
+    second: _AfterImpact = _after_impact(layout, first, event, first.problem.choice())
+    after: ContactTerms = terms_at(system, t, state.q, second.u, values)
+    third: _Accelerations = _accelerations(layout, after, state, first, second, errors, rest, tolerances)
+    return _changed(layout, y, after, state, first, second, third, third.problem.choice())
+
+
+# The functions below are separate, because a choice is not part of a program of scalars. A jump is rare.
+
+
+class _Impact(NamedTuple):
+    """The impact if contacts close, and what is known before it. (c,) unless stated otherwise.
+
+    - `u` (n,): speeds before the impact. `before`: the terms at these speeds.
+    - `event`: what happens, where a contact without a force opens.
+    - `closed`: whether a contact is closed before. `near`: whether it closes within `reach` of the event.
+    - `takes_part`, `strikes`: whether it transmits impulses, and whether it is hit.
+    - `rests`, `bounces`: whether its bounces are over, and the time that all of them take [s].
+    """
+
+    problem: ContactProblem
+    u: Array
+    before: ContactTerms
+    event: ContactEvent
+    closed: Array
+    near: Array
+    takes_part: Array
+    strikes: Array
+    rests: Array
+    bounces: Array
+
+
+@ScalarFunction.compile_cheaply
+def _impact(
+    layout: ContactLayout,
+    before: ContactTerms,
+    state: State,
+    event: ContactEvent,
+    errors: Array,
+    reach: Array,
+    rest: Array,
+) -> _Impact:
+    memory, bearing = ContactMemory.unpacked(layout, cast(Array, state.contacts)), jnp.asarray(layout.is_bearing)
     # Closed contacts have no velocity: the error of the solver must not become an impact.
     u = jnp.where(event.is_own, projected_speeds(layout, before, memory, state.u), state.u)
     before = before._replace(v=before.v + (before.C @ (u - state.u)).reshape(before.v.shape))
@@ -141,120 +185,141 @@ def changed_contacts(
     vanishes = ~bearing & (forces[:, 0] * before.mobility[:, 0] <= 1e-8 * before.a_size[:, 0])
     opens, slips = event.opens | (event.slips & vanishes), event.slips & ~vanishes
     event = event._replace(opens=opens, slips=slips)
-    # -- The impact, if contacts close.
-    # Events are simultaneous within their rounding errors, which are large for a gap of large coordinates.
-    errors = 256 * float(jnp.finfo(y.dtype).eps) * constant(gap_sizes(system, t, state.q, state.u)[1])
     near = (memory.states == OPEN) & ~bearing & (jnp.abs(before.gaps) <= jnp.abs(v_N) * reach + errors)
     closes = v_N < -_negligible(before)[:, 0]
     takes_part = (closed | event.touches | near) & ~bearing & ~(event.is_start & closes)
     strikes = takes_part & closes & ~(closed & event.is_own)
     # With all contacts open, a body would not approach the resting body on which it bounces.
-    approach = -(before.a[:, 0] + jnp.where(closed, 0.0, jnp.einsum("iks,ks->i", before.delassus[:, 0], forces)))
+    pushed = jnp.sum(before.delassus[:, 0] * forces[None], axis=(1, 2))
+    approach = -(before.a[:, 0] + jnp.where(closed, 0.0, pushed))
     # The time that all bounces after this impact take, 2 v / (a (1 - e)); infinity if they do not end.
     ends = strikes & (approach > 0) & (before.laws.restitution < 1)
     slowing = jnp.where(ends, approach * (1.0 - before.laws.restitution), 1.0)
     bounces = jnp.where(ends, -2.0 * before.laws.restitution * v_N / slowing, jnp.inf)
     # A bounce that is lower than the rounding error of the gap cannot be simulated.
     is_low = 0.5 * (before.laws.restitution * v_N) ** 2 <= approach * (errors / 16)
-    rests, is_impact = strikes & (bounces < jnp.inf) & ((bounces < rest) | is_low), jnp.any(strikes)
+    rests = strikes & (bounces < jnp.inf) & ((bounces < rest) | is_low)
     e = jnp.where(strikes & ~rests, before.laws.restitution, 0.0)
-    has_friction = [has and not b for has, b in zip(layout.has_friction, layout.is_bearing, strict=True)]
+    has_friction = tuple(has and not b for has, b in zip(layout.has_friction, layout.is_bearing, strict=True))
     friction = jnp.where(bearing, 0.0, before.laws.friction)
-    hit = contact_impact(before.delassus, before.v, e, friction, takes_part, has_friction)
-    is_lawful = before.laws.are_valid(strikes, takes_part | bearing)
+    unknown = Slip.unknown(friction, layout.d)
+    problem = ContactProblem(before.delassus, before.v, e, friction, takes_part, unknown, has_friction, True)
+    return _Impact(problem, u, before, event, closed, near, takes_part, strikes, rests, bounces)
+
+
+class _AfterImpact(NamedTuple):
+    """Speeds `u` (n,), `impulses` (c, r) and `states` (c,) after the impact, if it `is_impact`. `Change` has the
+    others."""
+
+    u: Array
+    impulses: Array
+    states: Array
+    is_impact: Array
+    is_lawful: Array
+    is_determined: Array
+
+
+@ScalarFunction.compile_cheaply
+def _after_impact(layout: ContactLayout, first: _Impact, event: ContactEvent, choice: Choice) -> _AfterImpact:
+    before, hit, is_impact = first.before, first.problem.solution(choice), jnp.any(first.strikes)
+    is_lawful = before.laws.are_valid(first.strikes, first.takes_part | jnp.asarray(layout.is_bearing))
     impulses = jnp.where(is_impact & hit.determined & is_lawful, hit.impulses, 0.0)
-    u = u + before.X @ (before.B.T @ impulses.reshape(-1))
-    # -- The contact states that the accelerations allow.
-    after: ContactTerms = terms_at(system, t, state.q, u, values)
+    u = first.u + before.X @ (before.B.T @ impulses.reshape(-1))
+    return _AfterImpact(u, impulses, hit.states, is_impact, is_lawful, ~is_impact | hit.determined)
+
+
+class _Accelerations(NamedTuple):
+    """The states between jumps that the accelerations allow, and what is known about them. (c,) unless stated
+    otherwise.
+
+    - `delays`: the times that pass before contacts rest [s].
+    - `is_still`, `slip` (c, d): whether the slip vanishes, and its direction otherwise.
+    - `slow`: see `ContactMemory`.
+    """
+
+    problem: ContactProblem
+    delays: Array
+    is_still: Array
+    slip: Array
+    slow: Array
+
+
+@ScalarFunction.compile_cheaply
+def _accelerations(
+    layout: ContactLayout,
+    after: ContactTerms,
+    state: State,
+    first: _Impact,
+    second: _AfterImpact,
+    errors: Array,
+    rest: Array,
+    tolerances: tuple[Array, Array],
+) -> _Accelerations:
+    before, event, is_impact = first.before, first.event, second.is_impact
+    memory, bearing = ContactMemory.unpacked(layout, cast(Array, state.contacts)), jnp.asarray(layout.is_bearing)
     negligible = jnp.maximum(_negligible(before), _negligible(after))
+    v_N, goes_on = before.v[:, 0], first.strikes & ~first.rests & (first.bounces < jnp.inf)
     is_apart = after.v[:, 0] > negligible[:, 0] + jnp.where(is_impact, 1e-10 * jnp.abs(v_N), 0.0)
     is_apart &= is_impact | ~event.is_own | event.touches
     # A block that rocks on its corners in turn: each corner opens for a shorter time than the one before. For a contact
     # that bounces, this rule would omit the rest of the bounces, which is longer than one bounce.
-    fall, rise, goes_on = -after.a[:, 0], after.v[:, 0], strikes & ~rests & (bounces < jnp.inf)
+    fall, rise = -after.a[:, 0], after.v[:, 0]
     is_apart &= goes_on | ~((fall > 0) & ((2.0 * rise < rest * fall) | (0.5 * rise**2 <= fall * (errors / 16))))
-    candidates = takes_part & ~is_apart & ~event.opens & ~(is_impact & (hit.states == OPEN) & strikes & (e > 0))
-    sticks = jnp.where(is_impact & ~bearing, hit.states == STICKS, jnp.zeros_like(closed))
-    delays = jnp.where(rests, bounces, 0.0)
-    new, is_determined = _states_by_accelerations(
-        layout, after, memory, candidates, sticks, event, negligible, tolerances, delays
-    )
-    u = projected_speeds(layout, after, new, u)
-    n_q, n_u = len(system.coordinates), len(system.speeds)
-    # Gaps of closed contacts drift by the error of the solver.
-    q = without_gaps(after, takes_part & (event.touches | near | closed) & ~event.is_start, state.q)
-    y = jnp.concatenate([q, u, y[n_q + n_u : y.size - layout.memory_size], new.packed()])
-    delay = jnp.max(jnp.where(new.states != OPEN, delays, 0.0), initial=0.0)
-    is_smooth = jnp.array(True)
-    if layout.d == 2:
-        # A slip that begins without an acceleration is stiff. The error estimate does not contain the derivatives:
-        # those of a particle were 21 instead of 3.
-        begins = (new.slow[:, 0] > 0) & (memory.states != SLIDES)
-        is_smooth = ~jnp.any(begins & (after.laws.static <= after.laws.friction))
-    is_lawful &= after.laws.are_valid(False, new.states >= SLIDES)
-    return Change(y, delay, impulses, is_lawful, is_determined & (~is_impact | hit.determined), is_smooth)
-
-
-def _negligible(terms: ContactTerms) -> Array:
-    """Velocities (c, r) that are rounding errors. All velocities of a contact have the size of the largest."""
-    size = jnp.max(terms.size, axis=1, keepdims=True)
-    return 1e3 * float(jnp.finfo(terms.v.dtype).eps) * jnp.broadcast_to(size, terms.size.shape)
-
-
-def _states_by_accelerations(
-    layout: ContactLayout,
-    terms: ContactTerms,
-    memory: ContactMemory,
-    candidates: Array,
-    sticks: Array,
-    event: ContactEvent,
-    negligible: Array,
-    tolerances: tuple[Any, Any],
-    delays: Array,
-) -> tuple[ContactMemory, Array]:
-    """The contact states between jumps, and whether the contact laws have a solution.
-
-    **Arguments:**
-
-    - `terms`: after the impact. `memory`: before it.
-    - `candidates` (c,): contacts that neither approach nor separate. `sticks` (c,): those that stick after the impact.
-    - `event`, `tolerances`: see `changed_contacts`. `negligible` (c, r): velocities that are rounding errors.
-    - `delays` (c,): the times that pass before contacts rest [s].
-    """
-    bearing, G, a, kinetic, d = jnp.asarray(layout.is_bearing), terms.delassus, terms.a, terms.laws.friction, layout.d
-    candidates, known, directions = candidates | bearing, None, memory.directions
-    is_still = slip = stops = slow = jnp.zeros(0)
+    bounces_on = is_impact & (second.states == OPEN) & first.strikes & (first.problem.restitution > 0)
+    candidates = (first.takes_part & ~is_apart & ~event.opens & ~bounces_on) | bearing
+    sticks = is_impact & ~bearing & (second.states == STICKS)
+    delays = jnp.where(first.rests, first.bounces, 0.0)
+    G, a, kinetic, d = after.delassus, after.a, after.laws.friction, layout.d
+    is_still, slow = jnp.zeros_like(bearing), jnp.zeros_like(kinetic)
+    slip, known = jnp.zeros((len(kinetic), d), kinetic.dtype), Slip.unknown(kinetic, d)
     if d:
         # A bearing is a contact with a normal force of its own: G_NN = 1 and a_N = -(the largest friction).
-        corner = np.zeros((1 + d, 1 + d))
+        corner, unit = np.zeros((1 + d, 1 + d), kinetic.dtype), np.eye(len(kinetic), dtype=kinetic.dtype)
         corner[0, 0] = 1.0
-        own = jnp.where(bearing, 1.0, 0.0).astype(G.dtype)
-        G = G + (jnp.diag(own)[:, None, :, None] * jnp.asarray(corner, G.dtype)[None, :, None, :])
-        a = a.at[:, 0].set(jnp.where(bearing, -terms.laws.static, a[:, 0]))
-        ratio = kinetic / jnp.where(terms.laws.static > 0, terms.laws.static, 1.0)
-        kinetic, static = (jnp.where(bearing, x, y) for x, y in ((ratio, kinetic), (1.0, terms.laws.static)))
-        v = terms.v[:, 1:]
+        own = jnp.where(bearing, 1.0, 0.0).astype(G.dtype)[:, None] * unit
+        G = G + own[:, None, :, None] * corner[None, :, None, :]
+        a = jnp.concatenate([jnp.where(bearing, -after.laws.static, a[:, 0])[:, None], a[:, 1:]], axis=1)
+        ratio = kinetic / jnp.where(after.laws.static > 0, after.laws.static, 1.0)
+        kinetic, static = (jnp.where(bearing, x, y) for x, y in ((ratio, kinetic), (1.0, after.laws.static)))
+        v = after.v[:, 1:]
         speed = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(v) ** 2, axis=1))
-        stops = event.stops
-        rtol, atol = tolerances
-        errors = atol * jnp.sum(jnp.abs(terms.C), axis=1).reshape(terms.v.shape) + rtol * terms.size
-        is_slow = speed <= 100 * jnp.sum(errors[:, 1:], axis=1)
-        slow = jnp.sum(errors[:, 1:], axis=1) / jnp.sqrt(jnp.maximum(rtol, float(jnp.finfo(v.dtype).eps)))
+        stops, (rtol, atol) = event.stops, tolerances
+        errors_of_steps = atol * jnp.sum(jnp.abs(after.C), axis=1).reshape(after.v.shape) + rtol * after.size
+        is_slow = speed <= 100 * jnp.sum(errors_of_steps[:, 1:], axis=1)
+        slow = jnp.sum(errors_of_steps[:, 1:], axis=1)
+        slow = slow / jnp.sqrt(jnp.maximum(rtol, float(jnp.finfo(v.dtype).eps)))
         if d == 2:
             # In space, the slip need not vanish where its component along its first direction does.
             stops &= is_slow
         # Both corners of a block stop at the same time.
         stops |= jnp.any(stops) & is_slow & (memory.states == SLIDES) & ~bearing
         is_still = stops | sticks | (speed <= jnp.max(negligible[:, 1:], axis=1))
-        is_still |= _stops_within(delays, terms, jax.lax.stop_gradient(v), speed)
+        is_still |= _stops_within(delays, after, jax.lax.stop_gradient(v), speed)
         # If one corner of a block is at its limit, both slip when the other one reaches its limit.
         slips = event.slips | (jnp.any(event.slips) & (memory.states == SLIDES) & is_still & ~stops)
         slip = v / jnp.where(is_still, 1.0, jnp.where(speed > 0, speed, 1.0))[:, None]
         slip = jnp.sign(jax.lax.stop_gradient(slip)) if d == 1 else slip
-        known = Slip(~is_still, slip, static, ~slips & (terms.laws.static > 0))
-    found = contact_impact(G, a, jnp.zeros_like(kinetic), kinetic, candidates, layout.has_friction, known)
-    states = jnp.where(candidates, found.states, OPEN).astype(a.dtype)
-    if d:
+        known = Slip(~is_still, slip, static, ~slips & (after.laws.static > 0))
+    problem = ContactProblem(G, a, jnp.zeros_like(kinetic), kinetic, candidates, known, layout.has_friction, False)
+    return _Accelerations(problem, delays, is_still, slip, slow)
+
+
+@ScalarFunction.compile_cheaply
+def _changed(
+    layout: ContactLayout,
+    y: Array,
+    after: ContactTerms,
+    state: State,
+    first: _Impact,
+    second: _AfterImpact,
+    third: _Accelerations,
+    choice: Choice,
+) -> Change:
+    memory, bearing = ContactMemory.unpacked(layout, cast(Array, state.contacts)), jnp.asarray(layout.is_bearing)
+    found, event, is_still = third.problem.solution(choice), first.event, third.is_still
+    states, directions, kept = jnp.where(third.problem.closed, found.states, OPEN), memory.directions, memory.slow
+    is_smooth = jnp.array(True)
+    if layout.d:
         # A slip that begins is opposite to the friction.
         slides = (states == SLIDES)[:, None]
         push = jnp.where(slides, -found.impulses[:, 1:], 0.0)
@@ -264,18 +329,35 @@ def _states_by_accelerations(
         squares = jnp.sum(onset**2, axis=1)
         onset = onset / jnp.sqrt(jnp.where(squares > 0, squares, 1.0))[:, None]
         onset = jnp.where((strength2 > 0)[:, None], push / strength, onset)
-        start = jnp.where(slides, jnp.where(is_still[:, None], onset, slip), 0.0)
-        if d == 1:
+        start = jnp.where(slides, jnp.where(is_still[:, None], onset, third.slip), 0.0)
+        if layout.d == 1:
             directions = jnp.sign(jax.lax.stop_gradient(start))
         else:
-            signs = jnp.sign(start[:, :1]) * np.array([[1.0, 0.0, 0.0]])
-            directions = jnp.where(bearing[:, None], signs, jnp.sum(start[:, :, None] * terms.tangents, axis=1))
-    kept = memory.slow
-    if d == 2:
-        goes_on = (memory.states == SLIDES) & ~event.stops
-        kept = jnp.where(is_still, slow, jnp.where(goes_on, memory.slow[:, 0], 0.0))
-        kept = jax.lax.stop_gradient(jnp.where((states == SLIDES) & ~bearing, kept, 0.0))[:, None]
-    return ContactMemory(states, directions, kept), found.determined
+            signs = jnp.sign(start[:, :1]) * np.array([[1.0, 0.0, 0.0]], start.dtype)
+            directions = jnp.where(bearing[:, None], signs, jnp.sum(start[:, :, None] * after.tangents, axis=1))
+            goes_on = (memory.states == SLIDES) & ~event.stops
+            kept = jnp.where(is_still, third.slow, jnp.where(goes_on, memory.slow[:, 0], 0.0))
+            kept = jax.lax.stop_gradient(jnp.where((states == SLIDES) & ~bearing, kept, 0.0))[:, None]
+            # A slip that begins without an acceleration is stiff. The error estimate does not contain the derivatives:
+            # those of a particle were 21 instead of 3.
+            begins = (kept[:, 0] > 0) & (memory.states != SLIDES)
+            is_smooth = ~jnp.any(begins & (after.laws.static <= after.laws.friction))
+    new = ContactMemory(states, directions, kept)
+    u = projected_speeds(layout, after, new, second.u)
+    # Gaps of closed contacts drift by the error of the solver.
+    touching = first.takes_part & (event.touches | first.near | first.closed) & ~event.is_start
+    q = without_gaps(after, touching, state.q)
+    rest = y[len(q) + len(u) : y.size - layout.memory_size]
+    y = jnp.concatenate([q, u, rest, new.packed()])
+    delay = jnp.max(jnp.where(states != OPEN, third.delays, 0.0), initial=0.0)
+    is_lawful = second.is_lawful & after.laws.are_valid(False, states >= SLIDES)
+    return Change(y, delay, second.impulses, is_lawful, found.determined & second.is_determined, is_smooth)
+
+
+def _negligible(terms: ContactTerms) -> Array:
+    """Velocities (c, r) that are rounding errors. All velocities of a contact have the size of the largest."""
+    size = jnp.max(terms.size, axis=1, keepdims=True)
+    return 1e3 * float(jnp.finfo(terms.v.dtype).eps) * jnp.broadcast_to(size, terms.size.shape)
 
 
 def _stops_within(delays: Array, terms: ContactTerms, v: Array, speed: Array) -> Array:
