@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._kane.constraint_residuals import configuration_residual, relative_condition
-from .._kane.contact.forces import forces_in_contact, layout_of
+from .._kane.contact.forces import forces_in_contact
 from .._kane.kanes_method import accelerations_and_mass_matrix
 from .._kane.multipliers import Reactions
 from .._kane.right_hand_side import vector_field
@@ -128,7 +128,7 @@ def _contact_power(
     system: System, t: Array, q: Coordinates, u: Speeds, values: dict[str, Array], contacts: Float[Array, " m"]
 ):
     """Accelerations (n,) and the power of the contact forces on the mechanism [W]."""
-    _, u, (forces, u_dot), terms = forces_in_contact(system, layout_of(system), t, q, u, contacts, values)
+    u, (forces, u_dot), terms = forces_in_contact(system, t, q, u, contacts, values)
     # Without the velocity of a surface, which is v - C u
     return u_dot, forces.reshape(-1) @ (terms.C @ u)
 

@@ -198,7 +198,7 @@ def outputs_in_contact(
 @ScalarFunction
 def _contact_forces(system: System, t: Time, y: PackedState, values: InputArrays):
     state, layout = unpacked(system, y), layout_of(system)
-    _, u, (forces, u_dot), _ = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
+    u, (forces, u_dot), _ = forces_in_contact(system, t, state.q, state.u, state.contacts, values)
     named = {}
     for i, (name, has_friction, is_bearing) in enumerate(
         zip(layout.names, layout.has_friction, layout.is_bearing, strict=True)
@@ -329,7 +329,8 @@ def _vector_field(system: System, t: Time, y: PackedState, inputs: InputArrays):
     values = values_of(system, state.x, inputs)
     memory, x_dot, still = state.contacts, None, None
     if memory is not None or has_multipliers(system):
-        kane, _, forces, _ = forces_in_contact(system, layout_of(system), t, state.q, state.u, memory, values)
+        u, forces, _ = forces_in_contact(system, t, state.q, state.u, memory, values)
+        kane = KaneEquations(system, t, state.q, u, values)
         q_dot, u_dot = as_vector(kane.q_dot, y), forces.u_dot
         still = None if memory is None else jnp.zeros_like(memory)  # contact states change at jumps only
     else:

@@ -548,16 +548,18 @@ def without_gaps(terms: ContactTerms, closed: Array, q: Array) -> Array:
     return q + terms.Q @ (terms.X @ RowBasis.of(rows).least_norm(jnp.where(closed, -terms.gaps, 0.0)))
 
 
+@ScalarFunction
 def forces_in_contact(
-    system: System, layout: ContactLayout, t: Component, q: Array, u: Array, memory: Array | None, values: InputValues
-) -> tuple[KaneEquations, Array, ContactForces, ContactTerms]:
-    """Kane's equations at the projected speeds, these speeds, the contact forces and accelerations, and the terms."""
+    system: System, t: Component, q: Array, u: Array, memory: Array | None, values: InputValues
+) -> tuple[Array, ContactForces, ContactTerms]:
+    """The projected speeds (n,), and the contact forces, accelerations and terms at these speeds. The right-hand side,
+    the event functions and the outputs contain this program, so that it is traced once."""
+    layout = layout_of(system)
     states = ContactMemory.unpacked(layout, jnp.zeros(layout.memory_size, q.dtype) if memory is None else memory)
     free = KaneEquations(system, t, q, u, values)
     u = projected_speeds(layout, _terms(free, layout, with_forces=False), states, u)
-    kane = KaneEquations(system, t, q, u, values)
-    terms = _terms(kane, layout)
-    return kane, u, solve_forces(layout, terms, states), terms
+    terms = _terms(KaneEquations(system, t, q, u, values), layout)
+    return u, solve_forces(layout, terms, states), terms
 
 
 @ScalarFunction

@@ -92,6 +92,13 @@ class Choice(NamedTuple):
     inverse: Array
     is_admissible: Array
 
+    @classmethod
+    def none(cls, v: Array) -> Choice:
+        """All contacts (c, r) are open. Not admissible."""
+        c, n = len(v), v.size
+        none = jnp.zeros(c, v.dtype)
+        return cls(none, none, jnp.zeros(n, v.dtype), jnp.zeros((n, n), v.dtype), jnp.array(False))
+
 
 class _Solution(NamedTuple):
     """The solution for one combination of states.
@@ -120,7 +127,7 @@ class ContactProblem(eqx.Module):
     - `closed` (c,): whether a contact takes part. The others transmit no impulse.
     - `slip`: what is known about the slip.
     - `has_friction`: for each contact, whether its tangential rows exist. Other rows are zero.
-    - `is_impact`: False for accelerations and forces.
+    - `is_impact` (): False for accelerations and forces.
     """
 
     G: Float[Array, "c rows c rows"]
@@ -129,8 +136,8 @@ class ContactProblem(eqx.Module):
     friction: Float[Array, " c"]
     closed: Bool[Array, " c"]
     slip: Slip
+    is_impact: Bool[Array, ""]
     has_friction: tuple[bool, ...] = eqx.field(static=True)
-    is_impact: bool = eqx.field(static=True)
 
     @property
     def in_space(self) -> bool:
@@ -200,9 +207,9 @@ class ContactProblem(eqx.Module):
         if inverse is None:
             fixed = jax.lax.stop_gradient(A)
             inverse = invert(fixed)
-            if c > 1 and rows > 1 and not self.is_impact:
+            if c > 1 and rows > 1:
                 limits = self.slip.static * (W @ (inverse @ jax.lax.stop_gradient(b))).reshape(c, rows)[:, 0]
-                scales = force_scales(limits, sticks, rows)
+                scales = jnp.where(self.is_impact, 1.0, force_scales(limits, sticks, rows))
                 inverse = scales[:, None] * invert(fixed * scales[None])
         z = jnp.where(mask, start, 0.0)
         for _ in range(3):  # the last two are the derivative of A z = b; the inverse is not differentiated
@@ -339,9 +346,7 @@ def _searched(problem: ContactProblem) -> Choice:
 
     # A contact slips where its static friction is not enough, and slides with the kinetic one.
     limits = jnp.where(problem.slip.may_stick & ~is_known, problem.slip.static, problem.friction)
-    none = jnp.zeros(c, dtype)
-    empty = Choice(none, none, jnp.zeros(c * r, dtype), jnp.zeros((c * r, c * r), dtype), jnp.array(False))
-    return jax.lax.while_loop(goes_on, attempt, (0, -_by_svd(G) @ v, limits, empty))[3]
+    return jax.lax.while_loop(goes_on, attempt, (0, -_by_svd(G) @ v, limits, Choice.none(problem.v)))[3]
 
 
 def with_friction(ratios: Array) -> Array:

@@ -12,6 +12,7 @@ infinitely many bounces has a derivative.
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -22,6 +23,7 @@ from jaxtyping import Array
 from ..._scalarjit.nan import constant
 from ..._scalarjit.scalar_function import ScalarFunction
 from ..._system.system import State, System, packed, unpacked
+from ..arguments import InputValues
 from ..right_hand_side import values_of, vector_field
 from .forces import (
     ContactLayout,
@@ -133,10 +135,39 @@ def changed_contacts(
     # Events are simultaneous within their rounding errors, which are large for a gap of large coordinates.
     errors = 256 * float(jnp.finfo(y.dtype).eps) * constant(gap_sizes(system, t, state.q, state.u)[1])
     first: _Impact = _impact(layout, before, state, event, errors, reach, rest)
-    second: _AfterImpact = _after_impact(layout, first, event, first.problem.choice())
+    given = _Given(system, t, state, values, first, errors, rest, tolerances)
+    fixed = constant(given)
+
+    def stage(i: Array, choices: tuple[Choice, Choice]) -> tuple[Choice, Choice]:
+        _, last = choices
+        problems = fixed.first.problem, _given_impact(layout, fixed, last)[2].problem
+        return last, jax.tree.map(functools.partial(jnp.where, i == 0), *problems).choice()
+
+    # A loop, because XLA would compile two searches. At the start no contact strikes.
+    none = Choice.none(before.v)
+    hit, found = jax.lax.fori_loop(jnp.where(event.is_start, 1, 0), 2, stage, (none, none))
+    after, second, third = _given_impact(layout, given, hit)
+    return _changed(layout, y, after, state, first, second, third, found)
+
+
+class _Given(NamedTuple):
+    system: System
+    t: Array
+    state: State
+    values: InputValues
+    first: _Impact
+    errors: Array
+    rest: Array
+    tolerances: tuple[Array, Array]
+
+
+def _given_impact(
+    layout: ContactLayout, given: _Given, hit: Choice
+) -> tuple[ContactTerms, _AfterImpact, _Accelerations]:
+    system, t, state, values, first, errors, rest, tolerances = given
+    second: _AfterImpact = _after_impact(layout, first, hit)
     after: ContactTerms = terms_at(system, t, state.q, second.u, values)
-    third: _Accelerations = _accelerations(layout, after, state, first, second, errors, rest, tolerances)
-    return _changed(layout, y, after, state, first, second, third, third.problem.choice())
+    return after, second, _accelerations(layout, after, state, first, second, errors, rest, tolerances)
 
 
 # The functions below are separate, because a choice is not part of a program of scalars. A jump is rare.
@@ -200,10 +231,10 @@ def _impact(
     is_low = 0.5 * (before.laws.restitution * v_N) ** 2 <= approach * (errors / 16)
     rests = strikes & (bounces < jnp.inf) & ((bounces < rest) | is_low)
     e = jnp.where(strikes & ~rests, before.laws.restitution, 0.0)
-    has_friction = tuple(has and not b for has, b in zip(layout.has_friction, layout.is_bearing, strict=True))
     friction = jnp.where(bearing, 0.0, before.laws.friction)
     unknown = Slip.unknown(friction, layout.d)
-    problem = ContactProblem(before.delassus, before.v, e, friction, takes_part, unknown, has_friction, True)
+    args = before.delassus, before.v, e, friction, takes_part, unknown, jnp.array(True)
+    problem = ContactProblem(*args, layout.has_friction)
     return _Impact(problem, u, before, event, closed, near, takes_part, strikes, rests, bounces)
 
 
@@ -220,7 +251,7 @@ class _AfterImpact(NamedTuple):
 
 
 @ScalarFunction.compile_cheaply
-def _after_impact(layout: ContactLayout, first: _Impact, event: ContactEvent, choice: Choice) -> _AfterImpact:
+def _after_impact(layout: ContactLayout, first: _Impact, choice: Choice) -> _AfterImpact:
     before, hit, is_impact = first.before, first.problem.solution(choice), jnp.any(first.strikes)
     is_lawful = before.laws.are_valid(first.strikes, first.takes_part | jnp.asarray(layout.is_bearing))
     impulses = jnp.where(is_impact & hit.determined & is_lawful, hit.impulses, 0.0)
@@ -300,7 +331,8 @@ def _accelerations(
         slip = v / jnp.where(is_still, 1.0, jnp.where(speed > 0, speed, 1.0))[:, None]
         slip = jnp.sign(jax.lax.stop_gradient(slip)) if d == 1 else slip
         known = Slip(~is_still, slip, static, ~slips & (after.laws.static > 0))
-    problem = ContactProblem(G, a, jnp.zeros_like(kinetic), kinetic, candidates, known, layout.has_friction, False)
+    args = G, a, jnp.zeros_like(kinetic), kinetic, candidates, known, jnp.array(False)
+    problem = ContactProblem(*args, layout.has_friction)
     return _Accelerations(problem, delays, is_still, slip, slow)
 
 
@@ -384,7 +416,7 @@ def contact_event_values(system: System, t: Array, y: Array, inputs: dict[str, A
     layout, state = layout_of(system), unpacked(system, y)
     values = values_of(system, state.x, inputs)
     assert state.contacts is not None
-    _, _, forces, terms = forces_in_contact(system, layout, t, state.q, state.u, state.contacts, values)
+    _, forces, terms = forces_in_contact(system, t, state.q, state.u, state.contacts, values)
     memory = ContactMemory.unpacked(layout, state.contacts)
     functions = event_functions(layout, terms, memory, forces.forces)
     sizes = event_sizes(layout, terms, memory, forces.forces, gap_sizes.__wrapped__(system, t, state.q, state.u)[1])
