@@ -368,7 +368,7 @@ def _changed(
             signs = jnp.sign(start[:, :1]) * np.array([[1.0, 0.0, 0.0]], start.dtype)
             directions = jnp.where(bearing[:, None], signs, jnp.sum(start[:, :, None] * after.tangents, axis=1))
             goes_on = (memory.states == SLIDES) & ~event.stops
-            kept = jnp.where(is_still, third.slow, jnp.where(goes_on, memory.slow[:, 0], 0.0))
+            kept = jnp.where(is_still, third.slow, jnp.where(goes_on, memory.slow[:, 0], -third.slow))
             kept = jax.lax.stop_gradient(jnp.where((states == SLIDES) & ~bearing, kept, 0.0))[:, None]
             # A slip that begins without an acceleration is stiff. The error estimate does not contain the derivatives:
             # those of a particle were 21 instead of 3.
