@@ -482,6 +482,8 @@ class EventValues(NamedTuple):
             g0, s0, g1, s1 = self.values[i], self.rates[i], end.values[i], end.rates[i]
             size = jnp.abs(g0) + jnp.abs(g1) + 0.5 * h * (jnp.abs(s0) + jnp.abs(s1))
             bend = jnp.abs(g1 - g0 - 0.5 * h * (s0 + s1)) - 1e3 * jnp.finfo(h.dtype).eps * size
+            if end.noise is not None:  # of a force that vanishes all the time, as between bodies that only touch
+                bend = bend - 32 * end.noise[i]
             bends = (bend > 0) & (size < jnp.inf)  # a rate may be infinite, e.g. of a norm at zero
             allowed = jnp.where(bends, share * size, 1.0) / jnp.where(bends, bend, 1.0)
             # Not the cubic root, which is a slow call in native kernels: the fourth root is two square roots.

@@ -231,9 +231,11 @@ def _impact(
     is_low = 0.5 * (before.laws.restitution * v_N) ** 2 <= approach * (errors / 16)
     rests = strikes & (bounces < jnp.inf) & ((bounces < rest) | is_low)
     e = jnp.where(strikes & ~rests, before.laws.restitution, 0.0)
+    # One ball after the other, as in Newton's cradle: a contact without friction that bounces is hit next, if at all.
+    waits = ~jnp.asarray(layout.has_friction) & ~strikes & (before.laws.restitution > 0)
     friction = jnp.where(bearing, 0.0, before.laws.friction)
     unknown = Slip.unknown(friction, layout.d)
-    args = before.delassus, before.v, e, friction, takes_part, unknown, jnp.array(True)
+    args = before.delassus, before.v, e, friction, takes_part & ~waits, unknown, jnp.array(True)
     problem = ContactProblem(*args, layout.has_friction)
     return _Impact(problem, u, before, event, closed, near, takes_part, strikes, rests, bounces)
 
@@ -291,6 +293,7 @@ def _accelerations(
     negligible = jnp.maximum(_negligible(before), _negligible(after))
     v_N, goes_on = before.v[:, 0], first.strikes & ~first.rests & (first.bounces < jnp.inf)
     is_apart = after.v[:, 0] > negligible[:, 0] + jnp.where(is_impact, 1e-10 * jnp.abs(v_N), 0.0)
+    is_apart |= is_impact & (after.v[:, 0] < -negligible[:, 0])  # is hit next
     is_apart &= is_impact | ~event.is_own | event.touches
     # A block that rocks on its corners in turn: each corner opens for a shorter time than the one before. For a contact
     # that bounces, this rule would omit the rest of the bounces, which is longer than one bounce.
