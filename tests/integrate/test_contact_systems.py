@@ -243,7 +243,7 @@ class BallsInARow(jk.System):
 
 
 @pytest.mark.weekly
-def test_sequential_and_simultaneous_impacts_of_balls():
+def test_balls_in_a_row_are_hit_one_after_the_other():
     atol, ts = 1e-12, jnp.linspace(0, 5, 21)
 
     @jax.jit
@@ -257,13 +257,13 @@ def test_sequential_and_simultaneous_impacts_of_balls():
     np.testing.assert_allclose(
         ride.end.u, [7 / 45, 133 / 810, 2527 / 14580, 48013 / 262440, 130321 / 104976], atol=atol
     )
-    # Three balls that touch: one impact of both contacts, with v = (1, 0, 0) and masses 1, 4/5, 16/25.
+    # Three balls that touch are hit one after the other, with masses 1, 4/5, 16/25: (1 - 4/5 e) / 1.8, (1 + e) / 1.8.
     touching = jnp.array([0.0, 1.0, 1.0, 50.0, 90.0])
     by_e, ride = slopes(1.0, touching)
-    common = 1 / (1 + 1.44)
-    np.testing.assert_allclose(ride.end.u, [2 * common - 1, 2 * common, 2 * common, 0, 0], atol=atol)
-    np.testing.assert_allclose(by_e, [common - 1, common, common, 0, 0], atol=atol)
-    assert int(ride.jumps.count) == 1
+    kept, passed = 1 / 9, 10 / 9
+    np.testing.assert_allclose(ride.end.u, [kept, passed * kept, passed**2, 0, 0], atol=atol)
+    np.testing.assert_allclose(by_e, [-4 / 9, (kept - 0.8 * passed) / 1.8, 2 * passed / 1.8, 0, 0], atol=atol)
+    assert int(ride.jumps.count) == 2
     # Gaps that differ by 1e-13: two events at almost the same time.
     ride = slopes(1.0, touching.at[2].add(1e-13))[1]
     assert ride.ok
@@ -345,7 +345,7 @@ class Driven(Particle):
 
 
 @pytest.mark.weekly
-@pytest.mark.parametrize(("tolerance", "atol"), [(1e-6, 1e-6), (1e-10, 1e-9)])
+@pytest.mark.parametrize(("tolerance", "atol"), [(1e-6, 2e-6), (1e-10, 1e-9)])
 def test_slip_begins_with_zero_acceleration(tolerance, atol):
     """Static equals kinetic friction. In polar coordinates of the slip, by SciPy's Radau with 1e-11.
 

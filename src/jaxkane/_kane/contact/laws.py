@@ -279,7 +279,7 @@ def _searched(problem: ContactProblem) -> Choice:
     v = scales[:, None] * problem.v.at[:, 0].multiply(1.0 + problem.restitution)
     unit = jnp.max(jnp.abs(v))
     unit, scales = jnp.where(unit > 0, unit, 1.0), jnp.repeat(scales, r)
-    v, G = v.reshape(-1) / unit, scales[:, None] * problem.G.reshape(c * r, c * r) * scales
+    v, G = v.reshape(-1) / unit, scales[:, None] * problem.G.reshape(c * r, c * r) * scales[None]
 
     def before_projection(L: Array) -> Array:
         return (L - (v + G @ L)).reshape(c, r)
@@ -301,7 +301,7 @@ def _searched(problem: ContactProblem) -> Choice:
         def step(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             k, L, F = carry
             change, lengths = -_by_svd(jax.jacfwd(residual)(L)) @ F, jnp.asarray(0.5 ** np.arange(12), dtype)
-            each = jax.vmap(residual)(L + lengths[:, None] * change)
+            each = jax.vmap(residual)(L[None] + lengths[:, None] * change[None])
             norms = jnp.linalg.norm(each, axis=1)
             falls = norms < (1.0 - 1e-4 * lengths) * jnp.linalg.norm(F)
             i = jnp.where(jnp.any(falls), jnp.argmax(falls), jnp.argmin(norms))
