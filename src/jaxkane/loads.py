@@ -1,4 +1,4 @@
-"""Loads: springs, dampers, actuators, friction, drag, stops, backlash and motors.
+"""Loads: springs, dampers, actuators, friction, compliant contacts, drag, stops, backlash and motors.
 
 Loads between points or frames return a tuple of `Force`s or `Torque`s, including the reaction on the second point or
 frame, for `System.loads`:

@@ -1,5 +1,6 @@
 """Contacts of several bodies, of a block with two corners, and in space."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -414,3 +415,143 @@ def test_a_billiard_ball_with_side_spin():
         np.testing.assert_allclose(ride.jumps.after.u[0, :3], [*(np.array([3.0, 1.0]) + impulse), 1.0], atol=atol)
         spin = np.array([5.0, -10.0]) + np.array([impulse[1], -impulse[0]]) * 0.1 / 0.004
         np.testing.assert_allclose(ride.jumps.after.u[0, 3:], [*spin, 3.0], atol=atol)
+
+
+# -- Bodies that touch.
+class Cradle(jk.System):
+    """Three balls on strings of 0.5 m, without gaps between them."""
+
+    coordinates, speeds = ("a", "b", "c"), ("a_dot", "b_dot", "c_dot")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        strings = [N.rotate(3, angle, rate) for angle, rate in zip(q, u, strict=True)]
+        bobs = [O.fixed(0.05 * i * N.x).fixed(-0.5 * string.y) for i, string in enumerate(strings)]
+        return jk.Motion([jk.Body(0.1, 0.0, bob, name=f"ball {i}") for i, bob in enumerate(bobs)])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def contacts(self, t, q, u, motion):
+        balls = [body.center for body in motion.bodies]
+        gaps = [(balls[i + 1].position_from(balls[i])).norm() - 0.05 for i in range(2)]
+        return {f"{i}": jk.Contact(gap=gap, restitution=1.0) for i, gap in enumerate(gaps)}
+
+
+def test_as_many_balls_leave_newtons_cradle_as_arrive():
+    run = jax.jit(lambda q: jk.simulate(Cradle(), jk.State(q, jnp.zeros(3)), jnp.array([0.0, 0.5])))
+    together = run(jnp.full(3, 0.3))
+    assert together.ok
+    assert int(together.stats["steps"]) < 100  # they ended with "max steps"
+    np.testing.assert_allclose(together.end.q, together.end.q[0], rtol=1e-9)
+    for lifted in (1, 2):
+        ride = run(jnp.where(np.arange(3) < lifted, -0.5, 0.0))
+        assert ride.ok
+        np.testing.assert_allclose(ride.end.q[: 3 - lifted], 0.0, atol=1e-7)
+        assert (ride.end.q[3 - lifted :] > 0.1).all()
+        np.testing.assert_allclose(ride.jumps.energy[: int(ride.jumps.count)], 0.0, atol=1e-12)
+
+
+class NoContacts(jk.System):
+    coordinates, speeds = ("x",), ("v",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="mass")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(-q["x"] * motion.N.x, motion["mass"])
+
+    def contacts(self, t, q, u, motion):
+        return {}
+
+
+def test_contacts_may_be_empty():
+    ride = jk.simulate(NoContacts(), jk.State({"x": 1.0}, {}), jnp.array([0.0, 1.0]))
+    np.testing.assert_allclose(ride.end.q, np.cos(1.0), rtol=1e-6)
+    np.testing.assert_allclose(jk.stability.linearize(NoContacts(), jk.State({}, {})).A, [[0, 1], [-1, 0]], atol=1e-15)
+
+
+# -- A box in space.
+class Box(jk.System):
+    corners: int = eqx.field(static=True, default=1)
+    coordinates, speeds = ("x", "y", "z", "a", "b", "c"), ("vx", "vy", "vz", "wx", "wy", "wz")
+
+    def q_dot(self, t, q, u):
+        return (*u["vx":"vz"], *jk.rotations.angle_rates("3-1-2", q["a":"c"], u["wx":"wz"]))
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate_sequence("3-1-2", q["a":"c"], angular_velocity=u["wx":"wz"], name="B")
+        G = O.moving(N.vector(*q["x":"z"]), N.vector(*u["vx":"vz"]))
+        places = [(0.3, 0.2), (0.3, -0.2), (-0.3, 0.2), (-0.3, -0.2)][: self.corners]
+        points = {f"{i}": G.fixed(x * B.x + y * B.y - 0.1 * B.z) for i, (x, y) in enumerate(places)}
+        return jk.Motion([jk.Body(1.0, (0.02, 0.03, 0.04), G, B, name="box")], points=points)
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.z)
+
+    def contacts(self, t, q, u, motion):
+        law = {"friction": 0.4, "restitution": 0.2}
+        return {f"{i}": jk.Contact(motion[f"{i}"], motion.N.z, **law) for i in range(self.corners)}
+
+
+@pytest.mark.slow
+def test_the_direction_of_a_slip_that_ends_needs_no_small_steps():
+    """Starts that differ by a rounding error took 350 or 9600 steps."""
+
+    @jax.jit
+    @jax.vmap
+    def run(vx):
+        q, u = jnp.array([0.0, 0.0, 0.5, 0.1, 0.2, 0.15]), jnp.array([0.0, 0.0, 0.0, 0.3, 0.0, 1.0])
+        return jk.simulate(Box(), jk.State(q, u.at[0].set(vx)), jnp.linspace(0.0, 1.0, 11))
+
+    rides = run(0.5 + 1e-3 * jnp.arange(8.0))
+    np.testing.assert_array_equal(rides.status, 0)
+    assert rides.stats["steps"].max() < 600
+
+
+@pytest.mark.weekly
+def test_a_box_on_four_corners_comes_to_rest():
+    """Impulses push and are within the friction cone. Energy is lost, except what Newton's law adds."""
+
+    @jax.jit
+    def run(q, u):
+        return jk.simulate(Box(4), jk.State(q, u), jnp.linspace(0.0, 2.0, 21), max_jumps=200)
+
+    rng = np.random.default_rng(1)
+    for _ in range(8):
+        q, u = np.append([0.0, 0.0, 0.5], rng.uniform(-0.3, 0.3, 3)), rng.normal(size=6) * [0.5, 0.5, 0.2, 1, 1, 1]
+        ride = run(jnp.array(q), jnp.array(u))
+        assert ride.ok, ride.reason
+        n = int(ride.jumps.count)
+        impulses = np.asarray(ride.jumps.impulses[:n]).reshape(n, 4, 3)
+        assert (impulses[..., 0] >= -1e-12).all()
+        assert (np.hypot(impulses[..., 1], impulses[..., 2]) <= 0.4 * impulses[..., 0] + 1e-9).all()
+        np.testing.assert_allclose(ride.end.u, 0.0, atol=1e-6)
+        np.testing.assert_allclose(ride.end.q[2], 0.1, atol=1e-6)
+        assert jk.audit(Box(4), ride).ok
+
+
+@pytest.mark.weekly
+def test_the_handlebar_of_a_falling_bicycle_slips_in_a_stiff_direction():
+    """The mobilities of the contact are 2.6e-8, 0.0117 and 0.657. A grid of directions misses the solution."""
+
+    class Falling(jk.catalog.WhippleBicycle):
+        def motion(self, t, q, u):
+            motion = super().motion(t, q, u)
+            fork = motion["fork"]
+            return motion.extended([], points={"right": fork.center.fixed(0.3 * fork.frame.y - 0.25 * fork.frame.z)})
+
+        def contacts(self, t, q, u, motion):
+            return {"right": jk.Contact(motion["right"], -1.0 * motion.N.z, restitution=0.3, friction=0.5)}
+
+    bicycle = Falling.benchmark()
+    start = jk.assemble(bicycle, {"roll": 0.4}, {"rear_wheel_rate": -1.0 / bicycle.rR, "roll_rate": 1.0})
+    hold = {"steer_torque": lambda t, state: -60.0 * state["steer"] - 6.0 * state["steer_rate"]}
+    ride = jk.simulate(bicycle, start, jnp.linspace(0.0, 0.45, 46), hold, max_jumps=200)
+    assert ride.ok
+    np.testing.assert_allclose(jumps_of(ride)[0], 0.40920, atol=1e-5)
+    # by an independent solution of the laws
+    np.testing.assert_allclose(jnp.abs(ride.jumps.impulses[0]), [374.757745, 163.381180, 91.746564], rtol=1e-5)
+    np.testing.assert_allclose(ride.jumps.energy[0], 532.0, atol=0.5)

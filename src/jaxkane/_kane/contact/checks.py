@@ -45,6 +45,8 @@ def check_contacts(system: System, t: Component, q: Numbers, *, may_penetrate: b
     if not has_contacts(system) or in_batches(system):
         return
     layout, rng = layout_of(system), np.random.default_rng(0)
+    if not layout.names:
+        return
     given = constant((system, t, q))
     with concretely(), np.errstate(all="ignore"):
         system, t, q = at_random_point(given, rng)

@@ -90,8 +90,8 @@ class ContactLayout(eqx.Module):
 
     @property
     def memory_width(self) -> int:
-        """The number of floats of a contact state: the state itself, the direction of the slip and its `slow`."""
-        return 5 if self.d == 2 else 1 + self.d
+        """The number of floats of a contact state: the state itself, the direction of the slip, `slow` and an error."""
+        return 6 if self.d == 2 else 1 + self.d
 
     @property
     def memory_size(self) -> int:
@@ -391,9 +391,9 @@ def speeds_in_contact(
 class ContactMemory(NamedTuple):
     """The contact states: `states` (c,) as floats, `directions` (c, k) of the slip at its start, and `slow` (c, m).
 
-    In a plane, a direction is a sign, k = 1, m = 0. In space it is a unit vector in N, k = 3, m = 1. Without friction,
-    k = m = 0. A slip of less than |slow| [m/s] is slow. `slow` is positive if the slip began from rest (see
-    `_slow_directions`), and negative otherwise. `slow`^2 over the size of the terms of the slip is an error of a step.
+    In a plane, a direction is a sign, k = 1, m = 0. In space it is a unit vector in N, k = 3, m = 2. Without friction,
+    k = m = 0. `slow` has two speeds [m/s]. The first one is positive if the slip began from rest (see
+    `_slow_directions`). The second one is the error of a step when the slip began.
     """
 
     states: Array
@@ -591,7 +591,7 @@ def closed_contacts(system: System, t: Component, q: Numbers) -> Array:
     if not has_contacts(system):
         return jnp.zeros(0, bool)
     gaps, sizes = gap_sizes(system, t, q, jnp.zeros(len(system.speeds), q.dtype))
-    return jnp.asarray(layout_of(system).is_bearing) | ~(gaps > gap_tolerances(sizes))
+    return jnp.asarray(layout_of(system).is_bearing, bool) | ~(gaps > gap_tolerances(sizes))
 
 
 def refuse_closed_contacts(system: System, closed: Array) -> None:
@@ -622,13 +622,12 @@ def event_functions(
     starts = memory.starts(layout, terms.tangents)
     slip = jnp.sum(terms.v[:, 1:] * starts, axis=1)
     if layout.d == 2:
-        # A slip in space ends a tenth of an error of a step before zero: what remains is this error, whose direction turns ever
-        # faster (9000 steps instead of 350). A slip that begins without an acceleration does not end.
+        # A slip in space ends a tenth of the error of a step before zero. What remains is this error, and its direction
+        # turns ever faster (9000 steps instead of 350). A slip that begins without an acceleration does not end.
         rates = terms.a + jnp.sum(terms.delassus * forces[None, None], axis=(2, 3))
         by_friction = jnp.sum(terms.mobility[:, 1:] * jnp.abs(forces[:, 1:]), axis=1)
         slows = jnp.sum(rates[:, 1:] * starts, axis=1) < -0.01 * by_friction
-        size = jnp.sum(terms.size[:, 1:], axis=1)
-        slip = slip - jnp.where(slows, 0.1 * memory.slow[:, 0] ** 2 / jnp.where(size > 0, size, 1.0), 0.0)
+        slip = slip - jnp.where(slows, 0.1 * memory.slow[:, 1], 0.0)
     squares = jnp.sum(forces[:, 1:] ** 2, axis=1)  # the derivative of the length is zero at zero
     length = jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1.0)), 0.0)
     friction = jnp.abs(forces[:, 1]) if layout.d == 1 else length

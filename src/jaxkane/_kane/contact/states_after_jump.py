@@ -267,7 +267,7 @@ class _Accelerations(NamedTuple):
 
     - `delays`: the times that pass before contacts rest [s].
     - `is_still`, `slip` (c, d): whether the slip vanishes, and its direction otherwise.
-    - `slow`: see `ContactMemory`.
+    - `slow` (c, 2): see `ContactMemory`.
     """
 
     problem: ContactProblem
@@ -293,18 +293,18 @@ def _accelerations(
     negligible = jnp.maximum(_negligible(before), _negligible(after))
     v_N, goes_on = before.v[:, 0], first.strikes & ~first.rests & (first.bounces < jnp.inf)
     is_apart = after.v[:, 0] > negligible[:, 0] + jnp.where(is_impact, 1e-10 * jnp.abs(v_N), 0.0)
-    is_apart |= is_impact & (after.v[:, 0] < -negligible[:, 0])  # is hit next
     is_apart &= is_impact | ~event.is_own | event.touches
     # A block that rocks on its corners in turn: each corner opens for a shorter time than the one before. For a contact
     # that bounces, this rule would omit the rest of the bounces, which is longer than one bounce.
     fall, rise = -after.a[:, 0], after.v[:, 0]
     is_apart &= goes_on | ~((fall > 0) & ((2.0 * rise < rest * fall) | (0.5 * rise**2 <= fall * (errors / 16))))
+    is_apart |= is_impact & (rise < -negligible[:, 0])  # it is hit next
     bounces_on = is_impact & (second.states == OPEN) & first.strikes & (first.problem.restitution > 0)
     candidates = (first.takes_part & ~is_apart & ~event.opens & ~bounces_on) | bearing
     sticks = is_impact & ~bearing & (second.states == STICKS)
     delays = jnp.where(first.rests, first.bounces, 0.0)
     G, a, kinetic, d = after.delassus, after.a, after.laws.friction, layout.d
-    is_still, slow = jnp.zeros_like(bearing), jnp.zeros_like(kinetic)
+    is_still, slow = jnp.zeros_like(bearing), jnp.zeros((len(kinetic), 2), kinetic.dtype)
     slip, known = jnp.zeros((len(kinetic), d), kinetic.dtype), Slip.unknown(kinetic, d)
     if d:
         # A bearing is a contact with a normal force of its own: G_NN = 1 and a_N = -(the largest friction).
@@ -319,11 +319,13 @@ def _accelerations(
         speed = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(v) ** 2, axis=1))
         stops, (rtol, atol) = event.stops, tolerances
         errors_of_steps = atol * jnp.sum(jnp.abs(after.C), axis=1).reshape(after.v.shape) + rtol * after.size
-        is_slow = speed <= 100 * jnp.sum(errors_of_steps[:, 1:], axis=1)
-        slow = jnp.sum(errors_of_steps[:, 1:], axis=1)
-        slow = slow / jnp.sqrt(jnp.maximum(rtol, float(jnp.finfo(v.dtype).eps)))
+        error = jnp.sum(errors_of_steps[:, 1:], axis=1)
+        is_slow = speed <= 100 * error
+        slow = error / jnp.sqrt(jnp.maximum(rtol, float(jnp.finfo(v.dtype).eps)))
+        slow = jnp.stack([slow, error], axis=1)
         if d == 2:
             # In space, the slip need not vanish where its component along its first direction does.
+            is_slow |= speed <= 10 * memory.slow[:, 1]
             stops &= is_slow
         # Both corners of a block stop at the same time.
         stops |= jnp.any(stops) & is_slow & (memory.states == SLIDES) & ~bearing
@@ -371,8 +373,10 @@ def _changed(
             signs = jnp.sign(start[:, :1]) * np.array([[1.0, 0.0, 0.0]], start.dtype)
             directions = jnp.where(bearing[:, None], signs, jnp.sum(start[:, :, None] * after.tangents, axis=1))
             goes_on = (memory.states == SLIDES) & ~event.stops
-            kept = jnp.where(is_still, third.slow, jnp.where(goes_on, memory.slow[:, 0], -third.slow))
-            kept = jax.lax.stop_gradient(jnp.where((states == SLIDES) & ~bearing, kept, 0.0))[:, None]
+            first_slow = jnp.where(is_still, third.slow[:, 0], jnp.where(goes_on, memory.slow[:, 0], 0.0))
+            error = jnp.where(goes_on, memory.slow[:, 1], third.slow[:, 1])
+            is_sliding = ((states == SLIDES) & ~bearing)[:, None]
+            kept = jax.lax.stop_gradient(jnp.where(is_sliding, jnp.stack([first_slow, error], axis=1), 0.0))
             # A slip that begins without an acceleration is stiff. The error estimate does not contain the derivatives:
             # those of a particle were 21 instead of 3.
             begins = (kept[:, 0] > 0) & (memory.states != SLIDES)
