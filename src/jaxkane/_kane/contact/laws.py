@@ -255,7 +255,7 @@ def _combinations(n_tangential: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray
     return numbers[..., 0], numbers[..., 1]
 
 
-@ScalarFunction.compile_cheaply
+@ScalarFunction
 def _tried(problem: ContactProblem, states: Array, signs: Array) -> Choice:
     start = jnp.zeros(problem.v.size, problem.v.dtype)
     found = problem.solved(states, signs, start)
@@ -311,9 +311,9 @@ def _searched(problem: ContactProblem) -> Choice:
             k, L, F = carry
             return (k < _NEWTON_STEPS) & (jnp.max(jnp.abs(F)) > 16 * eps * jnp.maximum(jnp.max(jnp.abs(L)), 1.0))
 
-        return jax.lax.while_loop(goes_on, step, (0, L, residual(L)))[1]
+        return jax.lax.while_loop(goes_on, step, (jnp.array(0), L, residual(L)))[1]
 
-    def at(L: Array, friction: Array, slack: float, share: float) -> Choice:
+    def at(L: Array, friction: Array, slack: Array, share: Array) -> Choice:
         """The states at a solution: closed rather than open within the `slack`. `share`: of L at the start."""
         z, can_stick = before_projection(L), np.array(problem.has_friction) & problem.slip.may_stick & ~is_known
         pushes = moves & (z[:, 0] >= -slack)
@@ -346,7 +346,7 @@ def _searched(problem: ContactProblem) -> Choice:
 
     # A contact slips where its static friction is not enough, and slides with the kinetic one.
     limits = jnp.where(problem.slip.may_stick & ~is_known, problem.slip.static, problem.friction)
-    return jax.lax.while_loop(goes_on, attempt, (0, -_by_svd(G) @ v, limits, Choice.none(problem.v)))[3]
+    return jax.lax.while_loop(goes_on, attempt, (jnp.array(0), -_by_svd(G) @ v, limits, Choice.none(problem.v)))[3]
 
 
 def with_friction(ratios: Array) -> Array:

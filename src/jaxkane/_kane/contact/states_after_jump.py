@@ -195,7 +195,7 @@ class _Impact(NamedTuple):
     bounces: Array
 
 
-@ScalarFunction.compile_cheaply
+@ScalarFunction
 def _impact(
     layout: ContactLayout,
     before: ContactTerms,
@@ -252,7 +252,7 @@ class _AfterImpact(NamedTuple):
     is_determined: Array
 
 
-@ScalarFunction.compile_cheaply
+@ScalarFunction
 def _after_impact(layout: ContactLayout, first: _Impact, choice: Choice) -> _AfterImpact:
     before, hit, is_impact = first.before, first.problem.solution(choice), jnp.any(first.strikes)
     is_lawful = before.laws.are_valid(first.strikes, first.takes_part | jnp.asarray(layout.is_bearing))
@@ -277,7 +277,7 @@ class _Accelerations(NamedTuple):
     slow: Array
 
 
-@ScalarFunction.compile_cheaply
+@ScalarFunction
 def _accelerations(
     layout: ContactLayout,
     after: ContactTerms,
@@ -341,7 +341,7 @@ def _accelerations(
     return _Accelerations(problem, delays, is_still, slip, slow)
 
 
-@ScalarFunction.compile_cheaply
+@ScalarFunction
 def _changed(
     layout: ContactLayout,
     y: Array,
