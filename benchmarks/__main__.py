@@ -6,6 +6,7 @@
     rides             a thousand rides, and one: scipy's odeint and DOP853 around Cython and C; one and two devices
     sensitivities     all derivatives of a ride: finite differences with C
     first_calls       what a fresh process waits for, and a second one with the cache
+    contacts          first calls with contacts, in first calls without (two minutes)
     from_description  from the description to the first trajectory: SymPy's ways
     chains            three-dimensional chains of 2 to 40 links: MuJoCo, Pinocchio, MJX, JaxSim
     gpu               65 536 rides on a GPU, where there is one
@@ -49,6 +50,7 @@ SETTINGS = {
     "rides": (XLA, NATIVE, *TWO),
     "sensitivities": (XLA, NATIVE),
     "first_calls": (XLA, NATIVE),
+    "contacts": (NATIVE,),
     "from_description": (XLA, NATIVE),
     "chains": (XLA, NATIVE),
     "gpu": TWO[:1],

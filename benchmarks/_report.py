@@ -17,6 +17,7 @@ TITLES = {
     "rides": "Rides of 5 s",
     "sensitivities": "Derivatives of a ride",
     "first_calls": "First calls: trace, compile and run in a fresh process",
+    "contacts": "First calls with contacts, in first calls of the bicycle without",
     "from_description": "From the description to the first trajectory",
     "chains": "Three-dimensional chains of n links",
     "gpu": "On a GPU",
