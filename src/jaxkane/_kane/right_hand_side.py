@@ -195,7 +195,7 @@ def outputs_in_contact(
     return u, outputs | forces
 
 
-@ScalarFunction
+@ScalarFunction.compile_cheaply
 def _contact_forces(system: System, t: Time, y: PackedState, values: InputArrays):
     state, layout = unpacked(system, y), layout_of(system)
     u, (forces, u_dot), _ = forces_in_contact(system, t, state.q, state.u, state.contacts, values)
