@@ -115,7 +115,6 @@ outputs positions velocities constraint_forces audit
 animate Animation Sketch assemble best_dependent_speeds with_multipliers
 equations_of_motion accelerations mass_matrix forcing configure
 CATALOG mechanism Link Loop Site Actuator Coupling hinge slide universal ball planar fixed free
-spring damper actuator torsional_spring torsional_damper dc_motor rotor friction torsional_friction drag
 sweep grid Table Sweep trajectories audit fits equilibrium steady_turn SteadyMotion linearize LinearModel eigenvalues
 Eigenvalues critical_speeds solve Plan Phases Now continuation
 fit minimize LeastSquares Fit Trial check_records Problem Free Offset Gain Delay LowPass
