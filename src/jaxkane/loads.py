@@ -373,17 +373,18 @@ def hunt_crossley(
     """The normal force of a compliant contact: stiffness * depth^exponent * (1 + 1.5 dissipation * rate).
 
     It is zero without contact, and never pulls. Hunt and Crossley (1975), *Coefficient of restitution interpreted as
-    damping in vibroimpact*. For slow impacts, the coefficient of restitution is 1 - dissipation * (speed of approach).
+    damping in vibroimpact*. For slow impacts, the coefficient of restitution is about
+    1 - dissipation * (speed of approach).
 
     **Arguments:**
 
     - `depth`: how far the bodies overlap [m], negative without contact.
     - `rate`: d(depth)/dt [m/s].
-    - `stiffness`: [N/m^exponent]. By Hertz, 4/3 E sqrt(R) for two spheres of elastic material, with
+    - `stiffness`: [N/m^exponent]. For two elastic spheres and the exponent 3/2 (Hertz), 4/3 E sqrt(R), with
         1/R = 1/R1 + 1/R2 and 1/E = (1 - nu1^2)/E1 + (1 - nu2^2)/E2.
     - `dissipation`: [s/m], not negative.
-    - `exponent`: 3/2 by Hertz. For at least 3/2, the force begins with the slope zero, so implicit solvers and direct
-        collocation need no small steps there.
+    - `exponent`: above 1, the slope of the force is zero at first contact. Then implicit solvers and direct collocation
+        need no small steps at touch-down.
     """
     check_numbers("hunt_crossley", depth=depth, rate=rate, stiffness=stiffness, exponent=exponent)
     check_numbers("hunt_crossley", dissipation=dissipation)
@@ -415,14 +416,14 @@ def plane_contact(
 
     **Arguments:**
 
-    - `P`: the point; or the body that is a sphere around its mass centre, with a `radius`.
-    - `normal`: a Vector normal to the plane, of any length, that points to P.
+    - `P`: a Point; or, with `radius`, a Body whose surface is a sphere around its mass centre.
+    - `normal`: a Vector of any length that points out of the plane, towards P.
     - `stiffness`, `dissipation`, `exponent`: see `hunt_crossley`.
     - `radius`: of the sphere [m].
     - `surface`: a Point of the plane. None is the origin O of the ground.
     - `on`: the body to which the plane belongs. The reaction acts on it, below P. None is the ground, or a `surface`
         whose motion is prescribed.
-    - `friction`: the coefficient of friction, or a function speed [m/s] -> coefficient. See `friction`.
+    - `friction`: the coefficient of friction, or a function speed [m/s] -> coefficient. See `jaxkane.loads.friction`.
     - `speed`: the width of the smoothing of the friction [m/s].
 
     **Raises:** `TypeError` for a sphere that is not a Body. `ValueError` for `on` without `surface`.

@@ -160,8 +160,9 @@ def test_omitted_elements_are_reported():
 def test_only_the_limits_in_stops_become_contacts():
     limited = BODY.format(' range="-9 9"').replace("<geom ", '<geom contype="0" ')
     three = "".join(limited.replace('"a"', f'"{name}"').replace('"j"', f'"{name}"') for name in "klm")
-    with pytest.raises(ValueError, match=r"6 contacts.* k, l, m. At most 4 are possible. Name fewer joints in `stops`"):
-        jk.convert.from_mjcf(mjcf(three), stops=True)
+    five = three + "".join(limited.replace('"a"', f'"{name}"').replace('"j"', f'"{name}"') for name in "no")
+    with pytest.raises(ValueError, match=r"10 contacts.* k, l, m, n, o. At most 8 .* fewer joints in `stops`"):
+        jk.convert.from_mjcf(mjcf(five), stops=True)
     with pytest.warns(UserWarning, match="limits of joints"):
         system = jk.convert.from_mjcf(mjcf(three), stops=("k", "m"))
     assert set(system.lower) == {"k", "m"}

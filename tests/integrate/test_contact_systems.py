@@ -419,8 +419,9 @@ def test_a_billiard_ball_with_side_spin():
 
 # -- Bodies that touch.
 class Cradle(jk.System):
-    """Three balls on strings of 0.5 m, without gaps between them."""
+    """Balls on strings of 0.5 m, without gaps between them."""
 
+    n = 3
     coordinates, speeds = ("a", "b", "c"), ("a_dot", "b_dot", "c_dot")
 
     def motion(self, t, q, u):
@@ -434,21 +435,29 @@ class Cradle(jk.System):
 
     def contacts(self, t, q, u, motion):
         balls = [body.center for body in motion.bodies]
-        gaps = [(balls[i + 1].position_from(balls[i])).norm() - 0.05 for i in range(2)]
+        gaps = [(balls[i + 1].position_from(balls[i])).norm() - 0.05 for i in range(self.n - 1)]
         return {f"{i}": jk.Contact(gap=gap, restitution=1.0) for i, gap in enumerate(gaps)}
 
 
-def test_as_many_balls_leave_newtons_cradle_as_arrive():
-    run = jax.jit(lambda q: jk.simulate(Cradle(), jk.State(q, jnp.zeros(3)), jnp.array([0.0, 0.5])))
-    together = run(jnp.full(3, 0.3))
+class LongCradle(Cradle):
+    n = 9
+    coordinates, speeds = tuple("abcdefghi"), tuple(f"{name}_dot" for name in "abcdefghi")
+
+
+@pytest.mark.parametrize("kind", [Cradle, LongCradle])
+@pytest.mark.slow_cases("LongCradle")
+def test_as_many_balls_leave_newtons_cradle_as_arrive(kind):
+    n, ts = kind.n, jnp.array([0.0, 0.5])
+    run = jax.jit(lambda q: jk.simulate(kind(), jk.State(q, jnp.zeros(n)), ts, max_jumps=500))
+    together = run(jnp.full(n, 0.3))
     assert together.ok
     assert int(together.stats["steps"]) < 100  # they ended with "max steps"
     np.testing.assert_allclose(together.end.q, together.end.q[0], rtol=1e-9)
     for lifted in (1, 2):
-        ride = run(jnp.where(np.arange(3) < lifted, -0.5, 0.0))
+        ride = run(jnp.where(np.arange(n) < lifted, -0.5, 0.0))
         assert ride.ok
-        np.testing.assert_allclose(ride.end.q[: 3 - lifted], 0.0, atol=1e-7)
-        assert (ride.end.q[3 - lifted :] > 0.1).all()
+        np.testing.assert_allclose(ride.end.q[: n - lifted], 0.0, atol=1e-7)
+        assert (ride.end.q[n - lifted :] > 0.1).all()
         np.testing.assert_allclose(ride.jumps.energy[: int(ride.jumps.count)], 0.0, atol=1e-12)
 
 

@@ -578,9 +578,12 @@ def test_dry_friction_is_a_contact_of_a_mechanism():
     assert parameters_of(slider, ["friction.x"]).units == ("N",)
 
 
-def test_a_mechanism_has_at_most_four_stops():
-    with pytest.raises(ValueError, match=r"6 contacts, which are the limits of q0, q1, q2. At most 4 .* fewer joints"):
-        mechanism(pendulums(3, stops=(-1.0, 1.0)))
+def test_the_number_of_stops_is_limited():
+    limits = "the limits of q0, q1, q2, q3, q4"
+    with pytest.raises(ValueError, match=rf"10 contacts, which are {limits}. At most 8 .* fewer joints"):
+        mechanism(pendulums(5, stops=(-1.0, 1.0)))
+    with pytest.raises(ValueError, match=r"6 contacts, .* At most 4 .* fewer joints"):
+        mechanism(pendulums(2, stops=(-1.0, 1.0), friction=0.1))
 
 
 # Chains of many links: columns of M and f by transposition

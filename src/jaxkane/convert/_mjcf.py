@@ -56,8 +56,8 @@ def from_mjcf(
     - `model`: a path, or the text of a file, which begins with "<".
     - `strict`: raise an exception for unsupported elements, instead of omitting them with a warning.
     - `stops`: names of hinges and sliders whose limits become contacts without restitution, `NAME lower` and
-        `NAME upper`, with the parameters `lower.NAME`, `upper.NAME`. True: all that have a range. At most four contacts
-        are possible, so name the joints that reach their limits.
+        `NAME upper`, with the parameters `lower.NAME`, `upper.NAME`. True: all that have a range. A system has at
+        most four contacts, or eight without friction. Name the joints that reach their limits.
     - `friction`: names of hinges and sliders whose `frictionloss` becomes dry friction, the contact `NAME friction`
         with the parameter `friction.NAME`. True: all that have friction.
     - `dependent`: hinges and sliders that are solved for in closed loops, as in `jaxkane.joints.mechanism`.
@@ -73,7 +73,7 @@ def from_mjcf(
     those of the key frames, from which `jk.assemble(system, system.poses["qpos0"])` starts.
 
     **Raises:** `ImportError` without MuJoCo; `ValueError` for a file that MuJoCo cannot read, one without a moving
-    body, two names that differ only by a dot, `stops` without a limit, more than four contacts, and with `strict` for
+    body, two names that differ only by a dot, `stops` without a limit, too many contacts, and with `strict` for
     unsupported elements.
     """
     try:

@@ -271,7 +271,8 @@ def hinge(
         mass matrix.
     - `reference` [rad]: the coordinate at the link's `position` and `orientation`. An exact number, not a parameter.
     - `stops` [rad]: the lower and the upper limit of the coordinate; None for no limit. Each limit is a
-        `jaxkane.Contact` without restitution: `name lower`, `name upper`. At most four contacts are possible.
+        `jaxkane.Contact` without restitution: `name lower`, `name upper`. At most four are possible, or eight
+        without friction.
     - `friction` [N m]: of dry friction, a `jaxkane.DryFriction` with the name `name friction`. It is one of the
         contacts.
     """

@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import rotations
 from .._common.lookup import checked, refuse_any, refuse_if, refuse_unknown
-from .._kane.contact.laws import MOST_CONTACTS
+from .._kane.contact.laws import most_contacts
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, ComponentsLike
 from ..rotations import Matrix
@@ -382,13 +382,13 @@ def _check_names(structure: Structure) -> None:
 def _check_stops(structure: Structure) -> None:
     stops = [joint.name for joint in structure.joints for has in joint.has_stops if has]
     rough = [joint.name for joint in structure.joints if joint.has_friction]
-    if len(stops) + len(rough) > MOST_CONTACTS:
+    if len(stops) + len(rough) > (most := most_contacts(bool(rough))):
         kinds = (("the limits of", stops, "stops"), ("the dry friction of", rough, "friction"))
         parts = [f"{what} {', '.join(dict.fromkeys(names))}" for what, names, _ in kinds if names]
         options = [f"`{option}`" for _, names, option in kinds if names]
         raise ValueError(
             f"{structure.name} has {len(stops) + len(rough)} contacts, which are {' and '.join(parts)}. At most "
-            f"{MOST_CONTACTS} are possible. Name fewer joints in {' and '.join(options)}, or use MuJoCo."
+            f"{most} are possible. Name fewer joints in {' and '.join(options)}, or use MuJoCo."
         )
 
 

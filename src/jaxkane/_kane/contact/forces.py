@@ -58,7 +58,7 @@ from ..kanes_method import KaneEquations
 from ..scaling import RowBasis, term_sizes
 from .declarations import Contact, DryFriction
 from .impulses import Permanent, inverse_root
-from .laws import MOST_CONTACTS, SLIDES, STICKS, force_scales, with_friction
+from .laws import SLIDES, STICKS, force_scales, most_contacts, with_friction
 
 
 class ContactLayout(eqx.Module):
@@ -109,7 +109,7 @@ def layout_of(system: System) -> ContactLayout:
     """The contacts of a system, which are traced for this.
 
     **Raises:** `TypeError` or `ValueError` for contacts that are not a dict of contacts by name; `ValueError` for more
-    than four contacts, and for a system with too many speeds.
+    than four contacts (eight without friction), and for a system with too many speeds.
     """
     if not has_contacts(system) and not has_multipliers(system):
         return NO_CONTACTS
@@ -120,13 +120,13 @@ def layout_of(system: System) -> ContactLayout:
         at = kane.t, kane.q, kane.u_all
         motion, by_name = _contacts(kane, *at)
         contacts, names, own = [*by_name.values()], ", ".join(by_name), cast(Any, system)
-        refuse_if(
-            len(contacts) > MOST_CONTACTS,
-            f"{kane.name} has {len(contacts)} contacts: {names}. At most {MOST_CONTACTS} are possible. "
-            "Use MuJoCo for systems with many contacts.",
-        )
         is_bearing = tuple(isinstance(x, DryFriction) for x in contacts)
         has_friction = tuple(isinstance(x, DryFriction) or not is_zero(component(x.friction)) for x in contacts)
+        refuse_if(
+            len(contacts) > most_contacts(any(has_friction)),
+            f"{kane.name} has {len(contacts)} contacts: {names}. At most {most_contacts(True)} are possible, or "
+            f"{most_contacts(False)} if none has friction. Use `jaxkane.loads.plane_contact` for more, or MuJoCo.",
+        )
         has_point = tuple(isinstance(x, Contact) and x.point is not None for x in contacts)
         planes = tuple(_plane(x, motion.N) if has else 2 for x, has in zip(contacts, has_point, strict=True))
         in_space = any(f and p is None for f, p in zip(has_friction, planes, strict=True))

@@ -8,12 +8,12 @@ is v_T. L_N and L_T are the impulses of the whole impact:
     v+ = v- + G L,  G = C M^-1 C^T                             the Delassus matrix of all rows
 
 Every contact is open, slides or sticks after the impact. For given states and directions of the slip, these are linear
-equations. In a plane, all combinations of states are tried, and the one with the most sticking contacts is taken. In
-space, where directions are unknown, an iteration for all laws together finds the states: first Gauss and Seidel's
-method, which projects each contact onto its friction cone in turn, then Newton's method for these projections (Alart
-and Curnier 1991, "A mixed formulation for frictional contact problems prone to Newton like solution methods"). Both are
-accepted by the same test. The equations of the accepted states are then solved again and differentiated, so derivatives
-do not contain the search.
+equations. In a plane, all combinations of states are tried, and the admissible one with the largest sum of states is
+taken. In space, the directions are unknown. Gauss-Seidel sweeps project the impulse of each contact onto its friction
+cone in turn. Newton's method for the same projections refines the result (Alart and Curnier 1991, "A mixed formulation
+for frictional contact problems prone to Newton like solution methods"). In both cases the result must pass
+`is_admissible`. Then the equations of these states are solved again and differentiated, so derivatives do not contain
+the search.
 
 References: Moreau (1988), "Unilateral contact and dry friction in finite freedom dynamics"; Glocker (2001), "Set-Valued
 Force Laws", for impacts with several contacts.
@@ -35,10 +35,12 @@ from ..._scalarjit.nan import constant
 from ..._scalarjit.scalar_function import ScalarFunction
 from ..scaling import RowBasis
 
-MOST_CONTACTS = 4
-"""The contact forces of a motion are part of a program of scalars, which would be too long for more contacts."""
-
 OPEN, SLIDES, STICKS = 0, 1, 2
+
+
+def most_contacts(have_friction: bool) -> int:
+    """The contact forces of a motion are part of a program of scalars, which would be too long for more contacts."""
+    return 4 if have_friction else 8
 
 
 class ContactImpact(NamedTuple):
@@ -57,9 +59,9 @@ class ContactImpact(NamedTuple):
 
 
 class Slip(NamedTuple):
-    """What is known about the slip of c contacts.
+    """Slip directions of c contacts before the problem is solved.
 
-    - `is_known` (c,): whether a contact already slips, so that it slides in this direction or opens.
+    - `is_known` (c,): whether a contact already slips. It cannot stick: it slides along `directions`, or opens.
     - `directions` (c, d): unit vectors of this slip.
     - `static` (c,): the coefficients of static friction. A sticking contact has |L_T| <= static L_N.
     - `may_stick` (c,): whether a contact may stick.
@@ -77,11 +79,11 @@ class Slip(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """The states of all contacts after an impact, and what the solution of their equations needs. Not differentiated.
+    """The states of c contacts after an impact, and the data to solve their equations. r = 1 + d. Not differentiated.
 
     - `states` (c,): open, slides or sticks.
-    - `ways` (c,): of sliding contacts. In a plane the sign of the slip, in space the angle of its direction [rad].
-    - `start` (c r,): impulses. The solution is the nearest one, if the equations have several.
+    - `ways` (c,): slip direction of each sliding contact: its sign in a plane, its angle in space [rad].
+    - `start` (c r,): initial impulses. If the solution is not unique, the one nearest to them is used.
     - `inverse` (c r, c r): the pseudo-inverse of the equations.
     - `is_admissible` (): whether the solution satisfies all laws.
     """
@@ -104,8 +106,8 @@ class _Solution(NamedTuple):
     """The solution for one combination of states.
 
     - `impulses`, `velocities` (c, 1 + d): impulses, and velocities after the impact.
-    - `size` (c, 1 + d): the size of the terms of each velocity.
-    - `inverse` (K, K): the pseudo-inverse of the linear system.
+    - `size` (c, 1 + d): sum of the absolute terms of each velocity, the scale of its rounding error.
+    - `inverse`: as in `Choice`.
     """
 
     impulses: Array
@@ -117,15 +119,14 @@ class _Solution(NamedTuple):
 class ContactProblem(eqx.Module):
     """An impact with unilateral contacts.
 
-    With accelerations instead of velocities and forces instead of impulses, these are the contact forces of a motion
-    without an impact. Then the direction of the friction of contacts that already slip is known: `slip`.
+    The same class computes contact forces between impacts. Then `v` contains accelerations; the unknowns are forces.
 
     - `G` (c, 1 + d, c, 1 + d): the Delassus matrix. A contact has a normal row and d tangential rows: 0 without
         friction, 1 in a plane, 2 in space.
     - `v` (c, 1 + d): velocities before the impact [m/s]. Normal velocities are positive if the bodies separate.
     - `restitution` (c,), `friction` (c,): coefficients.
     - `closed` (c,): whether a contact takes part. The others transmit no impulse.
-    - `slip`: what is known about the slip.
+    - `slip`: the directions of contacts that already slip.
     - `has_friction`: for each contact, whether its tangential rows exist. Other rows are zero.
     - `is_impact` (): False for accelerations and forces.
     """
@@ -379,7 +380,7 @@ def _angles(directions: Array) -> Array:
 
 
 def _written_out(A: Array) -> Array:
-    """P (K, K), for which P b is the smallest solution x of A x = b. It can be part of a program of scalars."""
+    """P, for which P b is the smallest solution x of A x = b. It can be part of a program of scalars."""
     return RowBasis.of(A).least_norm(jnp.asarray(np.eye(len(A), dtype=A.dtype)))
 
 

@@ -3,8 +3,8 @@
 All of them happen at jumps. A jump has two stages:
 
 1. If contacts close, one impact with all of them and with the contacts that are closed already (`laws`).
-2. The contacts that neither approach nor separate get the state that their accelerations allow: the same conditions,
-   with accelerations and forces instead of velocities and impulses.
+2. For contacts with zero normal velocity, the same laws are solved again, with accelerations and forces instead of
+   velocities and impulses. The solution gives their new states.
 
 A contact rests if the rest of its bounces takes a negligible time (see `REST`). This time is added, so that the end of
 infinitely many bounces has a derivative.
@@ -92,7 +92,7 @@ class Change(NamedTuple):
     """The result of `changed_contacts`.
 
     - `y`: the packed state afterwards.
-    - `delay` [s]: the rest of the bounces of a contact that rests now.
+    - `delay` [s]: duration of the remaining bounces of a contact that comes to rest.
     - `impulses` (c, r): of the impact, zero without one [N s].
     - `is_lawful`: whether the coefficients of the contacts are in their ranges.
     - `is_determined`: whether the contact laws have a solution.
@@ -174,13 +174,18 @@ def _given_impact(
 
 
 class _Impact(NamedTuple):
-    """The impact if contacts close, and what is known before it. (c,) unless stated otherwise.
+    """The impact if contacts close. (c,) unless stated otherwise.
 
-    - `u` (n,): speeds before the impact. `before`: the terms at these speeds.
-    - `event`: what happens, where a contact without a force opens.
-    - `closed`: whether a contact is closed before. `near`: whether it closes within `reach` of the event.
-    - `takes_part`, `strikes`: whether it transmits impulses, and whether it is hit.
-    - `rests`, `bounces`: whether its bounces are over, and the time that all of them take [s].
+    - `problem`: the contact problem of the impact.
+    - `u` (n,): speeds before the impact.
+    - `before`: the terms at these speeds.
+    - `event`: the event, corrected: contacts whose normal force is zero open.
+    - `closed`: whether a contact is closed before.
+    - `near`: whether it closes within `reach` of the event.
+    - `takes_part`: whether it is closed or closes now.
+    - `strikes`: whether it takes part and its gap closes.
+    - `rests`: whether its bounces end with this impact.
+    - `bounces`: the time that all remaining bounces take [s].
     """
 
     problem: ContactProblem
@@ -217,7 +222,10 @@ def _impact(
     opens, slips = event.opens | (event.slips & vanishes), event.slips & ~vanishes
     event = event._replace(opens=opens, slips=slips)
     near = (memory.states == OPEN) & ~bearing & (jnp.abs(before.gaps) <= jnp.abs(v_N) * reach + errors)
-    closes = v_N < -_negligible(before)[:, 0]
+    closes, mobility = v_N < -_negligible(before)[:, 0], before.mobility[:, 0]
+    # Beside an impact, an approach with 1e-20 of its energy is a rounding error.
+    energies = jnp.where(closes, v_N**2 / jnp.where(mobility > 0, mobility, 1.0), 0.0)
+    closes &= energies >= 1e-20 * jnp.max(energies, initial=0.0)
     takes_part = (closed | event.touches | near) & ~bearing & ~(event.is_start & closes)
     strikes = takes_part & closes & ~(closed & event.is_own)
     # With all contacts open, a body would not approach the resting body on which it bounces.
@@ -241,8 +249,8 @@ def _impact(
 
 
 class _AfterImpact(NamedTuple):
-    """Speeds `u` (n,), `impulses` (c, r) and `states` (c,) after the impact, if it `is_impact`. `Change` has the
-    others."""
+    """Speeds `u` (n,), `impulses` (c, r) and `states` (c,) after the impact, and whether there is one (`is_impact`).
+    `is_lawful`, `is_determined`: see `Change`."""
 
     u: Array
     impulses: Array
@@ -262,11 +270,12 @@ def _after_impact(layout: ContactLayout, first: _Impact, choice: Choice) -> _Aft
 
 
 class _Accelerations(NamedTuple):
-    """The states between jumps that the accelerations allow, and what is known about them. (c,) unless stated
-    otherwise.
+    """The contact problem for the accelerations after a jump, whose solution gives the new contact states. (c,) unless
+    stated otherwise.
 
     - `delays`: the times that pass before contacts rest [s].
-    - `is_still`, `slip` (c, d): whether the slip vanishes, and its direction otherwise.
+    - `is_still`: whether the slip is zero.
+    - `slip` (c, d): the direction of the slip otherwise.
     - `slow` (c, 2): see `ContactMemory`.
     """
 
@@ -293,7 +302,7 @@ def _accelerations(
     negligible = jnp.maximum(_negligible(before), _negligible(after))
     v_N, goes_on = before.v[:, 0], first.strikes & ~first.rests & (first.bounces < jnp.inf)
     is_apart = after.v[:, 0] > negligible[:, 0] + jnp.where(is_impact, 1e-10 * jnp.abs(v_N), 0.0)
-    is_apart &= is_impact | ~event.is_own | event.touches
+    is_apart &= is_impact | ~event.is_own | ~first.closed  # the speeds of closed contacts are rounding errors
     # A block that rocks on its corners in turn: each corner opens for a shorter time than the one before. For a contact
     # that bounces, this rule would omit the rest of the bounces, which is longer than one bounce.
     fall, rise = -after.a[:, 0], after.v[:, 0]
