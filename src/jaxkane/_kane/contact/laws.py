@@ -163,8 +163,12 @@ class ContactProblem(eqx.Module):
             for _ in range(2):
                 ways = self._newton_step(choice, ways)
         found = self.solved(choice.states, ways, choice.start, choice.inverse)
-        impulses, velocities = (jnp.where(choice.is_admissible, x, jnp.nan) for x in (found.impulses, found.velocities))
-        return ContactImpact(impulses, velocities, choice.states, choice.is_admissible)
+        # Newton's method leaves the solution where its equations are singular.
+        tolerance = float(jnp.finfo(ways.dtype).eps) ** 0.5
+        remains = constant(self).is_admissible(choice.states, ways, constant(found), tolerance)
+        determined = choice.is_admissible & remains
+        impulses, velocities = (jnp.where(determined, x, jnp.nan) for x in (found.impulses, found.velocities))
+        return ContactImpact(impulses, velocities, choice.states, determined)
 
     def _newton_step(self, choice: Choice, ways: Array) -> Array:
         """One step towards angles at which the slip has the assumed direction, n x v_T+ = 0."""
@@ -179,7 +183,7 @@ class ContactProblem(eqx.Module):
         columns = [jax.jvp(deviation, (ways,), (jnp.asarray(e),))[1] for e in unit]
         slope = jnp.stack(columns, axis=1) + jnp.where(slides, 0.0, 1.0).astype(ways.dtype)[:, None] * unit
         step = _written_out(jax.lax.stop_gradient(slope)) @ deviation(ways)
-        return ways - jnp.clip(step, -0.5, 0.5)
+        return ways - jnp.clip(step, -0.5, 0.5)  # the inverse is that of the choice
 
     def solved(self, states: Array, ways: Array, start: Array, inverse: Array | None = None) -> _Solution:
         """The solution for given states and directions of the slip.
@@ -220,13 +224,18 @@ class ContactProblem(eqx.Module):
         L, v, size = (x.reshape(c, rows) for x in (L, v, size))
         return _Solution(L, v, size, inverse)
 
-    def is_admissible(self, states: Array, ways: Array, solution: _Solution) -> Array:
+    def is_admissible(self, states: Array, ways: Array, solution: _Solution, tolerance: float = 0.0) -> Array:
+        """Whether a solution satisfies all laws, within rounding errors or a larger relative `tolerance`."""
         eps = float(jnp.finfo(self.v.dtype).eps)
         L, v, d = solution.impulses, solution.velocities, self.v.shape[1] - 1
-        rounding, inconsistent = 1e3 * eps * solution.size, eps**0.5 * solution.size
+        rounding, inconsistent = max(1e3 * eps, tolerance) * solution.size, eps**0.5 * solution.size
         is_open, slides, sticks = (states == x for x in (OPEN, SLIDES, STICKS))
         rebound = v[:, 0] + self.restitution * self.v[:, 0]
-        inertia = jnp.stack([self.G[i, 0, i, 0] for i in range(len(v))])
+        mobility = jnp.sum(self.G.reshape(v.size, v.size) * np.eye(v.size, dtype=v.dtype), axis=1).reshape(v.shape)
+        inertia = mobility[:, 0]
+        # Singular equations have solutions of any size, beside which every error is small.
+        before, change = (x**2 / jnp.where(mobility > 0, mobility, 1.0) for x in (self.v, v - self.v))
+        is_bounded = jnp.max(change) <= 1e12 * jnp.max(before)
         # Impulses are compared as the changes of velocity that they cause.
         conditions = [L[:, 0] * inertia >= -rounding[:, 0], self.closed | is_open]
         conditions += [
@@ -239,11 +248,12 @@ class ContactProblem(eqx.Module):
             if d == 1:
                 is_opposite = ways * v[:, 1] >= -rounding[:, 1]
             else:
-                # L_T . v_T = -|L_T| |v_T|
+                # L_T . v_T = -|L_T| |v_T|, where L_T is more than a rounding error
                 is_opposite = jnp.sum(L[:, 1:] * v[:, 1:], axis=1) + force * slip <= force * limit
+                is_opposite |= force * inertia <= slack
             conditions += [~sticks | (is_held & self.slip.may_stick & ~self.slip.is_known)]
             conditions += [~slides | is_opposite | self.slip.is_known]
-        return jnp.all(jnp.stack(conditions)) & jnp.all(jnp.isfinite(v))
+        return jnp.all(jnp.stack(conditions)) & jnp.all(jnp.isfinite(v)) & is_bounded
 
 
 @functools.cache
