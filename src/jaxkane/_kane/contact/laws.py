@@ -163,10 +163,7 @@ class ContactProblem(eqx.Module):
             for _ in range(2):
                 ways = self._newton_step(choice, ways)
         found = self.solved(choice.states, ways, choice.start, choice.inverse)
-        # Newton's method leaves the solution where its equations are singular.
-        tolerance = float(jnp.finfo(ways.dtype).eps) ** 0.5
-        remains = constant(self).is_admissible(choice.states, ways, constant(found), tolerance)
-        determined = choice.is_admissible & remains
+        determined = choice.is_admissible & constant(self)._is_bounded(constant(found).velocities)
         impulses, velocities = (jnp.where(determined, x, jnp.nan) for x in (found.impulses, found.velocities))
         return ContactImpact(impulses, velocities, choice.states, determined)
 
@@ -183,7 +180,8 @@ class ContactProblem(eqx.Module):
         columns = [jax.jvp(deviation, (ways,), (jnp.asarray(e),))[1] for e in unit]
         slope = jnp.stack(columns, axis=1) + jnp.where(slides, 0.0, 1.0).astype(ways.dtype)[:, None] * unit
         step = _written_out(jax.lax.stop_gradient(slope)) @ deviation(ways)
-        return ways - jnp.clip(step, -0.5, 0.5)  # the inverse is that of the choice
+        # Where the equations are singular, a step may be long. The solution is known.
+        return ways - jnp.clip(step, -1e-3, 1e-3)
 
     def solved(self, states: Array, ways: Array, start: Array, inverse: Array | None = None) -> _Solution:
         """The solution for given states and directions of the slip.
@@ -224,18 +222,25 @@ class ContactProblem(eqx.Module):
         L, v, size = (x.reshape(c, rows) for x in (L, v, size))
         return _Solution(L, v, size, inverse)
 
-    def is_admissible(self, states: Array, ways: Array, solution: _Solution, tolerance: float = 0.0) -> Array:
-        """Whether a solution satisfies all laws, within rounding errors or a larger relative `tolerance`."""
+    def _is_bounded(self, v: Array) -> Array:
+        """False for a solution (c, 1 + d) of singular equations. It may have any size, and beside it errors are small."""
+        before, change = (x**2 / jnp.where(self._mobility > 0, self._mobility, 1.0) for x in (self.v, v - self.v))
+        return jnp.max(change) <= 1e12 * jnp.max(before)
+
+    @property
+    def _mobility(self) -> Array:
+        """The diagonal (c, 1 + d) of G."""
+        n = self.v.size
+        return jnp.sum(self.G.reshape(n, n) * np.eye(n, dtype=self.v.dtype), axis=1).reshape(self.v.shape)
+
+    def is_admissible(self, states: Array, ways: Array, solution: _Solution) -> Array:
+        """Whether a solution satisfies all laws."""
         eps = float(jnp.finfo(self.v.dtype).eps)
         L, v, d = solution.impulses, solution.velocities, self.v.shape[1] - 1
-        rounding, inconsistent = max(1e3 * eps, tolerance) * solution.size, eps**0.5 * solution.size
+        rounding, inconsistent = 1e3 * eps * solution.size, eps**0.5 * solution.size
         is_open, slides, sticks = (states == x for x in (OPEN, SLIDES, STICKS))
         rebound = v[:, 0] + self.restitution * self.v[:, 0]
-        mobility = jnp.sum(self.G.reshape(v.size, v.size) * np.eye(v.size, dtype=v.dtype), axis=1).reshape(v.shape)
-        inertia = mobility[:, 0]
-        # Singular equations have solutions of any size, beside which every error is small.
-        before, change = (x**2 / jnp.where(mobility > 0, mobility, 1.0) for x in (self.v, v - self.v))
-        is_bounded = jnp.max(change) <= 1e12 * jnp.max(before)
+        inertia = self._mobility[:, 0]
         # Impulses are compared as the changes of velocity that they cause.
         conditions = [L[:, 0] * inertia >= -rounding[:, 0], self.closed | is_open]
         conditions += [
@@ -253,7 +258,7 @@ class ContactProblem(eqx.Module):
                 is_opposite |= force * inertia <= slack
             conditions += [~sticks | (is_held & self.slip.may_stick & ~self.slip.is_known)]
             conditions += [~slides | is_opposite | self.slip.is_known]
-        return jnp.all(jnp.stack(conditions)) & jnp.all(jnp.isfinite(v)) & is_bounded
+        return jnp.all(jnp.stack(conditions)) & self._is_bounded(v)  # not NaN
 
 
 @functools.cache
