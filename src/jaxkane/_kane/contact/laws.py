@@ -223,7 +223,7 @@ class ContactProblem(eqx.Module):
         return _Solution(L, v, size, inverse)
 
     def _is_bounded(self, v: Array) -> Array:
-        """False for a solution (c, 1 + d) of singular equations. It may have any size, and beside it errors are small."""
+        """False for a solution (c, 1 + d) of singular equations. Its size hides every error."""
         before, change = (x**2 / jnp.where(self._mobility > 0, self._mobility, 1.0) for x in (self.v, v - self.v))
         return jnp.max(change) <= 1e12 * jnp.max(before)
 
