@@ -6,7 +6,7 @@
     rides             a thousand rides, and one: scipy's odeint and DOP853 around Cython and C; one and two devices
     sensitivities     all derivatives of a ride: finite differences with C
     first_calls       what a fresh process waits for, and a second one with the cache
-    contacts          first calls with contacts, in first calls without (two minutes)
+    contacts          first calls with contacts, in first calls without (five minutes)
     from_description  from the description to the first trajectory: SymPy's ways
     chains            three-dimensional chains of 2 to 40 links: MuJoCo, Pinocchio, MJX, JaxSim
     gpu               65 536 rides on a GPU, where there is one
@@ -22,8 +22,8 @@ Every answer is compared before it is timed; a peer that is not installed is nam
 Run:      python -m benchmarks [part ...] [--quick] [--out FOLDER] [--publish]
 Appears:  every figure with its target; results.md, results.json and speed.png in the folder. Parts that were measured
           before, on the same machine with the same versions, stay in the table.
-Takes:    about twenty minutes without the last three parts, which are measured only where they are named; some minutes
-          with `--quick`, whose figures mean nothing.
+Takes:    about twenty-five minutes without the last three parts, which are measured only where they are named; some
+          minutes with `--quick`, whose figures mean nothing.
 """
 
 from __future__ import annotations

@@ -12,6 +12,12 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+import jaxkane as jk
+
 from ._figures import Figure
 from ._process import Setting, answer, configure
 
@@ -38,47 +44,41 @@ def seconds(name: str, call: str) -> float:
     return min(answer("benchmarks.contacts", [name, call])["seconds"] for _ in range(2))
 
 
+class Box(jk.System):
+    """A box of 1 kg above a floor, on which some of its lower corners can stand."""
+
+    corners: int = eqx.field(static=True, default=1)
+    coordinates, speeds = ("x", "y", "z", "a", "b", "c"), ("vx", "vy", "vz", "wx", "wy", "wz")
+
+    def q_dot(self, t, q, u):
+        return (*u["vx":"vz"], *jk.rotations.angle_rates("3-1-2", q["a":"c"], u["wx":"wz"]))
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate_sequence("3-1-2", q["a":"c"], angular_velocity=u["wx":"wz"], name="B")
+        G = O.moving(N.vector(*q["x":"z"]), N.vector(*u["vx":"vz"]))
+        places = [(0.3, 0.2), (0.3, -0.2), (-0.3, 0.2), (-0.3, -0.2)][: self.corners]
+        points = {f"{i}": G.fixed(x * B.x + y * B.y - 0.1 * B.z) for i, (x, y) in enumerate(places)}
+        return jk.Motion([jk.Body(1.0, (0.02, 0.03, 0.04), G, B, name="box")], points=points)
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.z)
+
+    def contacts(self, t, q, u, motion):
+        law = {"friction": 0.4, "restitution": 0.2}
+        return {f"{i}": jk.Contact(motion[f"{i}"], motion.N.z, **law) for i in range(self.corners)}
+
+
 def system_of(name: str) -> tuple[Any, Any]:
     """A system and its state at the start."""
-    import equinox as eqx
-
-    import jaxkane as jk
-
     if name in jk.catalog.CATALOG:
         entry = jk.catalog.CATALOG[name]
         return entry.example(), jk.State(list(entry.q), list(entry.u))
-
-    class Box(jk.System):
-        corners: int = eqx.field(static=True)
-        coordinates, speeds = ("x", "y", "z", "a", "b", "c"), ("vx", "vy", "vz", "wx", "wy", "wz")
-
-        def q_dot(self, t, q, u):
-            return (*u["vx":"vz"], *jk.rotations.angle_rates("3-1-2", q["a":"c"], u["wx":"wz"]))
-
-        def motion(self, t, q, u):
-            N, O = jk.inertial()
-            B = N.rotate_sequence("3-1-2", q["a":"c"], angular_velocity=u["wx":"wz"], name="B")
-            G = O.moving(N.vector(*q["x":"z"]), N.vector(*u["vx":"vz"]))
-            places = [(0.3, 0.2), (0.3, -0.2), (-0.3, 0.2), (-0.3, -0.2)][: self.corners]
-            points = {f"{i}": G.fixed(x * B.x + y * B.y - 0.1 * B.z) for i, (x, y) in enumerate(places)}
-            return jk.Motion([jk.Body(1.0, (0.02, 0.03, 0.04), G, B, name="box")], points=points)
-
-        def loads(self, t, q, u, motion, inputs):
-            return jk.weight(motion, -9.81 * motion.N.z)
-
-        def contacts(self, t, q, u, motion):
-            law = {"friction": 0.4, "restitution": 0.2}
-            return {f"{i}": jk.Contact(motion[f"{i}"], motion.N.z, **law) for i in range(self.corners)}
 
     return Box(1 if "one" in name else 4), jk.State({"z": 0.2, "a": 0.2, "b": 0.1}, {"vx": 0.5})
 
 
 def child(name: str, call: str) -> float:
-    import jax
-    import jax.numpy as jnp
-
-    import jaxkane as jk
-
     configure(Setting(native=True))
     system, state = system_of(name)
     state, ts = jk.assemble(system, state.q, state.u), jnp.linspace(0.0, 0.1 if name == "Woodpecker" else 1.0, 11)

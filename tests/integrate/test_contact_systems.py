@@ -1,10 +1,10 @@
 """Contacts of several bodies, of a block with two corners, and in space."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from benchmarks.contacts import Box
 from test_contact_laws import OPEN, SLIDES, STICKS, TIGHT, end_of, jumps_of
 
 import jaxkane as jk
@@ -482,29 +482,6 @@ def test_contacts_may_be_empty():
 
 
 # -- A box in space.
-class Box(jk.System):
-    corners: int = eqx.field(static=True, default=1)
-    coordinates, speeds = ("x", "y", "z", "a", "b", "c"), ("vx", "vy", "vz", "wx", "wy", "wz")
-
-    def q_dot(self, t, q, u):
-        return (*u["vx":"vz"], *jk.rotations.angle_rates("3-1-2", q["a":"c"], u["wx":"wz"]))
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        B = N.rotate_sequence("3-1-2", q["a":"c"], angular_velocity=u["wx":"wz"], name="B")
-        G = O.moving(N.vector(*q["x":"z"]), N.vector(*u["vx":"vz"]))
-        places = [(0.3, 0.2), (0.3, -0.2), (-0.3, 0.2), (-0.3, -0.2)][: self.corners]
-        points = {f"{i}": G.fixed(x * B.x + y * B.y - 0.1 * B.z) for i, (x, y) in enumerate(places)}
-        return jk.Motion([jk.Body(1.0, (0.02, 0.03, 0.04), G, B, name="box")], points=points)
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -9.81 * motion.N.z)
-
-    def contacts(self, t, q, u, motion):
-        law = {"friction": 0.4, "restitution": 0.2}
-        return {f"{i}": jk.Contact(motion[f"{i}"], motion.N.z, **law) for i in range(self.corners)}
-
-
 @pytest.mark.slow
 def test_the_direction_of_a_slip_that_ends_needs_no_small_steps():
     """Starts that differ by a rounding error took 350 or 9600 steps."""

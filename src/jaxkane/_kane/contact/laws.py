@@ -263,7 +263,7 @@ class ContactProblem(eqx.Module):
 
 @functools.cache
 def _combinations(n_tangential: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """States and signs of all combinations. Those with the most sticking and closed contacts are the first."""
+    """States and signs of all combinations. Those with the largest sum of states are the first."""
     choices = {0: [(SLIDES, 0), (OPEN, 0)], 1: [(STICKS, 0), (SLIDES, 1), (SLIDES, -1), (OPEN, 0)]}
     table = [*itertools.product(*(choices[d] for d in n_tangential))]
     table.sort(key=lambda contacts: -sum(state for state, _ in contacts))
@@ -282,7 +282,7 @@ _SWEEPS, _ATTEMPTS, _NEWTON_STEPS = 15, 4, 30
 
 
 def _searched(problem: ContactProblem) -> Choice:
-    """The states by an iteration for all laws together; with more sweeps if they are not admissible.
+    """The states in space by an iteration for all laws together; with more sweeps if they are not admissible.
 
     It begins where all contacts stick, and remains there if that is a solution. Rows are divided by the square root of
     the mobility of their contact: then one is a good step of the projections, whatever the units are.
@@ -336,17 +336,14 @@ def _searched(problem: ContactProblem) -> Choice:
         size = jnp.sqrt(jnp.sum(z[:, 1:] ** 2, axis=1))
         sticks = pushes & can_stick & (size <= friction * z[:, 0] + slack)
         states = jnp.where(sticks, STICKS, jnp.where(pushes, SLIDES, OPEN)).astype(dtype)
-        ways = -jnp.sign(z[:, 1]) if r == 2 else jnp.zeros(c, dtype)
-        if problem.in_space:
-            known = _angles(problem.slip.directions)
-            ways = jnp.where(is_known, known, _angles(-z[:, 1:]))
+        ways = jnp.where(is_known, _angles(problem.slip.directions), _angles(-z[:, 1:]))
         start = share * unit * scales * L
         found = problem.solved(states, ways, start)
         return Choice(states, ways, start, found.inverse, problem.is_admissible(states, ways, found))
 
     def attempt(carry: tuple[Array, Array, Array, Choice]) -> tuple[Array, Array, Array, Choice]:
         k, L, friction, _ = carry
-        L = jnp.where(k == 1, 0.0, L)
+        L = jnp.where(k == 1, 0.0, L)  # once without the sticking state
 
         def swept(i: Array, L: Array) -> Array:
             return jnp.where(jnp.repeat(jnp.arange(c) == (i // 3) % c, r), projected(L, friction), L)

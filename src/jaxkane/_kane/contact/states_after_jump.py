@@ -143,7 +143,8 @@ def changed_contacts(
         problems = fixed.first.problem, _given_impact(layout, fixed, last)[2].problem
         return last, jax.tree.map(functools.partial(jnp.where, i == 0), *problems).choice()
 
-    # A loop, because XLA would compile two searches. At the start no contact strikes.
+    # The stages are separate programs, because a choice is not part of a program of scalars. A loop makes both choices,
+    # because XLA would compile two searches. At the start no contact strikes.
     none = Choice.none(before.v)
     hit, found = jax.lax.fori_loop(jnp.where(event.is_start, 1, 0), 2, stage, (none, none))
     after, second, third = _given_impact(layout, given, hit)
@@ -168,9 +169,6 @@ def _given_impact(
     second: _AfterImpact = _after_impact(layout, first, hit)
     after: ContactTerms = terms_at(system, t, state.q, second.u, values)
     return after, second, _accelerations(layout, after, state, first, second, errors, rest, tolerances)
-
-
-# The functions below are separate, because a choice is not part of a program of scalars. A jump is rare.
 
 
 class _Impact(NamedTuple):
