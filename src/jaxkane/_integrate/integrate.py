@@ -299,7 +299,8 @@ class Problem(NamedTuple):
         limits = adjoint, settings.max_steps, self.valid
         if is_supported(solver, controller, adjoint, settings.progress):
             jumps = (self.jump, settings.max_jumps) if self.events.continue_ else None
-            return fast_loop(*how, *limits, jumps, errors=self.errors_of_tangent(solver, controller, jumps))
+            errors = None if self.args_dot is None else constant(self).errors_of_tangent(solver, constant(controller))
+            return fast_loop(*how, *limits, jumps, errors=errors)
         if self.events.continue_:
             raise ValueError(
                 f"{type(self.system).__name__} has contacts, or an event that changes the state (`then`). This needs "
@@ -308,23 +309,16 @@ class Problem(NamedTuple):
             )
         return diffrax_loop(*how, *limits, settings.progress)
 
-    def errors_of_tangent(
-        self,
-        solver: diffrax.AbstractSolver,
-        controller: StepSizeController,
-        jumps: tuple[Callable[..., Jump], int] | None,
-    ) -> Array | None:
-        """The errors of a tangent in all steps, None if they are not controlled."""
-        if self.args_dot is None:
-            return None
+    def errors_of_tangent(self, solver: diffrax.AbstractSolver, controller: StepSizeController) -> Array:
+        """The errors of a tangent in all steps. `self` is constant: also a jump must not be differentiated here."""
         # The states of contacts have no tangent. A tangent that moves at the start would hide a smaller one of a
         # parameter, 1e-9 m/N for a heavy body for example.
         n = self.start.size - self.events.layout.memory_size if self.start_moves else 0
         noise = 10 * jnp.finfo(self.start.dtype).eps / controller.rtol
-        probing = Probing(self.rates(True), generic(self.start, n), self.args_dot, constant(noise))
-        controller, start, args, taus, valid = constant((controller, self.start, self.args, self.taus[-1:], self.valid))
-        how = probing.rates, solver, controller, start, args, taus, diffrax.ForwardMode(), self.settings.max_steps
-        errors = fast_loop(*how, valid, jumps, probing).errors
+        probing = Probing(self.rates(True), generic(self.start, n), self.args_dot, noise)
+        jumps = (self.jump, self.settings.max_jumps) if self.events.continue_ else None
+        how = probing.rates, solver, controller, self.start, self.args, self.taus[-1:], diffrax.ForwardMode()
+        errors = fast_loop(*how, self.settings.max_steps, self.valid, jumps, probing).errors
         assert errors is not None
         return as_integers(errors)
 
@@ -379,7 +373,7 @@ class Problem(NamedTuple):
         def stepped(point: EventPoint) -> EventPoint:
             read = y_dot if self.events.read_rates else None
             if self.events.layout.names:
-                quantities = self.event_values(point.t, point.y, args, y_dot)
+                quantities = self.event_values(point.t, point.y, args, y_dot, moves=True)
                 return moved_to_event(quantities, point, y_dot, reach, event, happened, REST * self.taus[-1])
             return next_point(args.system, args.origin, point, y_dot, read, reach, event, happened)
 
@@ -387,17 +381,26 @@ class Problem(NamedTuple):
         bend = near.step * (rates(t + 0.5 * near.step, y + 0.5 * near.step * y_dot, args) - y_dot)
         return stepped(near._replace(y=near.y + bend))
 
-    def event_values(self, t: Array, y: Array, args: RateArguments, y_dot: Array | None) -> EventValues:
-        """The event functions of the system and of its contacts, `t` after the start."""
+    def event_values(
+        self, t: Array, y: Array, args: RateArguments, y_dot: Array | None, moves: bool = False
+    ) -> EventValues:
+        """The event functions of the system and of its contacts, `t` after the start.
+
+        `moves`: whether the functions of the contacts are differentiated. Their rates are never differentiated: second
+        derivatives of contact forces are long programs.
+        """
         events, system = self.events, tree_of(args.system)
         own = event_values(args.system, args.clock(t), y, y_dot)
         if not events.layout.names:
             return own
 
-        def of_contacts(t: Array, y: Array) -> tuple[Array, Array]:
-            return contact_event_values(args.system, args.clock(t), y, args.inputs(system, t, unpacked(system, y)))
+        def of_contacts(args: RateArguments, t: Array, y: Array) -> tuple[Array, Array]:
+            inputs = args.inputs(system, t, unpacked(system, y))
+            return contact_event_values(args.system, args.clock(t), y, inputs)
 
-        (values, noise), (rates, _) = jax.jvp(of_contacts, (t, y), (jnp.ones_like(t), y_dot))
+        fixed, at, along = constant((args, (t, y), (jnp.ones_like(t), y_dot)))
+        (values, noise), (rates, _) = jax.jvp(functools.partial(of_contacts, fixed), at, along)
+        values = of_contacts(args, t, y)[0] if moves else values
         # The own events and the contacts, each in alphabetical order
         n, places = len(own.values), itertools.count()
         order = [next(places) if contact is None else n + 2 * contact[0] + contact[1] for contact in events.contacts]

@@ -282,7 +282,7 @@ def vector_field(
     - `forward`: whether the value and its forward-mode derivative are one operation.
     """
     packed_system, system = system, tree_of(system)
-    if is_written_out(len(system.speeds)):
+    if _is_one_program(system, y):
         written_out = _vector_field.in_forward_mode if forward else _vector_field
         return written_out(packed_system, t, y, dict(inputs))
     state = unpacked(system, y)
@@ -294,7 +294,12 @@ def vector_field(
 
 def rates_are_native(system: System, t: Time, y: PackedState, inputs: Mapping[str, Any]) -> bool:
     """Whether `vector_field` runs as one native kernel for these arguments."""
-    return is_written_out(len(tree_of(system).speeds)) and _vector_field.is_native(system, t, y, dict(inputs))
+    return _is_one_program(tree_of(system), y) and _vector_field.is_native(system, t, y, dict(inputs))
+
+
+def _is_one_program(system: System, y: PackedState) -> bool:
+    """Whether the right-hand side is one program of scalars: for few speeds, and for contacts."""
+    return is_written_out(len(system.speeds)) or unpacked(system, y).contacts is not None
 
 
 def reads_time(system: System, dtype: DTypeLike) -> bool:

@@ -330,7 +330,7 @@ class Scalars:
 
 def _compiled(text: str, level: int = 2) -> tuple[int, str]:
     folder = cache_folder()
-    if len(text) > 2_500_000:
+    if len(text) > 2_000_000:
         level = 0  # the time to optimize grows faster than the text: 5 s and 0.4 s for 3.6 MB
     return llvm_compiler().compile(text, ObjectCache(folder) if folder else None, level)
 

@@ -43,7 +43,6 @@ from ..._scalarjit.components import (
     component,
     cross,
     is_exact,
-    is_written_out,
     is_zero,
     stack,
 )
@@ -98,6 +97,9 @@ class ContactLayout(eqx.Module):
         return len(self.names) * self.memory_width
 
 
+MOST_SPEEDS = 18
+"""With four contacts with friction, the largest product of matrices in a program of scalars (12, 18) (18, 18)."""
+
 NO_CONTACTS = ContactLayout((), (), (), False, (), ())
 
 
@@ -106,45 +108,59 @@ def has_contacts(system: System) -> bool:
 
 
 def layout_of(system: System) -> ContactLayout:
-    """The contacts of a system, which are traced for this.
+    """The contacts of a system, which are traced once.
 
     **Raises:** `TypeError` or `ValueError` for contacts that are not a dict of contacts by name; `ValueError` for more
     than four contacts (eight without friction), and for a system with too many speeds.
     """
     if not has_contacts(system) and not has_multipliers(system):
         return NO_CONTACTS
-    found: list[ContactLayout] = []
-
-    def trace(t: Array, q: Array, u: Array) -> Any:
-        kane = KaneEquations(system, t, q, u)
-        at = kane.t, kane.q, kane.u_all
-        motion, by_name = _contacts(kane, *at)
-        contacts, names, own = [*by_name.values()], ", ".join(by_name), cast(Any, system)
-        is_bearing = tuple(isinstance(x, DryFriction) for x in contacts)
-        has_friction = tuple(isinstance(x, DryFriction) or not is_zero(component(x.friction)) for x in contacts)
-        refuse_if(
-            len(contacts) > most_contacts(any(has_friction)),
-            f"{kane.name} has {len(contacts)} contacts: {names}. At most {most_contacts(True)} are possible, or "
-            f"{most_contacts(False)} if none has friction. Use `jaxkane.loads.plane_contact` for more, or MuJoCo.",
-        )
-        has_point = tuple(isinstance(x, Contact) and x.point is not None for x in contacts)
-        planes = tuple(_plane(x, motion.N) if has else 2 for x, has in zip(contacts, has_point, strict=True))
-        in_space = any(f and p is None for f, p in zip(has_friction, planes, strict=True))
-        n_residuals = len(own.multiplier_residuals(*at)) if has_multipliers(system) else 0
-        layout = tuple(by_name), has_friction, is_bearing, in_space, planes, has_point
-        found.append(ContactLayout(*layout, n_residuals=n_residuals))
-        rows = ContactRows(kane, found[-1])
-        return rows.velocities(*at), rows.gaps(*at), [_laws(x) for x in contacts]
-
+    most, n = MOST_SPEEDS if has_contacts(system) and not has_multipliers(system) else 12, len(system.speeds)
     refuse_if(
-        not is_written_out(len(system.speeds)),
-        f"{type(system).__name__}: contacts need a system with at most 12 speeds, and this one has "
-        f"{len(system.speeds)}. Use MuJoCo for large systems with contacts.",
+        n > most,
+        f"{type(system).__name__}: contacts need a system with at most {MOST_SPEEDS} speeds, or 12 with multipliers, "
+        f"and this one has {n}. Use `jaxkane.loads.plane_contact`, or MuJoCo.",
     )
     dtype = dtype_of(system)
-    q, u = (jnp.zeros(len(names), dtype) for names in (system.coordinates, system.speeds))
-    program = jax.make_jaxpr(trace)(jnp.zeros((), dtype), q, u)
-    return dataclasses.replace(found[0], reads_time=bool(any(depends_on(program, [0]))))
+    q, u = (np.zeros(len(names), dtype) for names in (system.coordinates, system.speeds))
+    arguments = system, np.zeros((), dtype), q, u
+    numbers, program = _traced_layout.program(*arguments)
+    if program is None:
+        layout, reads_time = jax.eval_shape(_traced_layout.__wrapped__, *arguments)[0], True
+    else:
+        layout = jax.tree.unflatten(program.structure, program.out_avals)[0]
+        reads_time = program.reads[len(numbers) - 3]
+    return dataclasses.replace(layout, reads_time=reads_time)
+
+
+@ScalarFunction
+def _traced_layout(system: System, t: Component, q: Array, u: Array) -> Any:
+    """The layout, and numbers that depend on the time if any contact does."""
+    kane = KaneEquations(system, t, q, u)
+    at = kane.t, kane.q, kane.u_all
+    motion, by_name = _contacts(kane, *at)
+    contacts, names, own = [*by_name.values()], ", ".join(by_name), cast(Any, system)
+    is_bearing = tuple(isinstance(x, DryFriction) for x in contacts)
+    has_friction = tuple(isinstance(x, DryFriction) or not is_zero(component(x.friction)) for x in contacts)
+    refuse_if(
+        len(contacts) > most_contacts(any(has_friction)),
+        f"{kane.name} has {len(contacts)} contacts: {names}. At most {most_contacts(True)} are possible, or "
+        f"{most_contacts(False)} if none has friction. Use `jaxkane.loads.plane_contact` for more, or MuJoCo.",
+    )
+    has_point = tuple(isinstance(x, Contact) and x.point is not None for x in contacts)
+    planes = tuple(_plane(x, motion.N) if has else 2 for x, has in zip(contacts, has_point, strict=True))
+    in_space = any(f and p is None for f, p in zip(has_friction, planes, strict=True))
+    n_residuals = len(own.multiplier_residuals(*at)) if has_multipliers(system) else 0
+    layout = ContactLayout(
+        tuple(by_name), has_friction, is_bearing, in_space, planes, has_point, n_residuals=n_residuals
+    )
+    rows = ContactRows(kane, layout)
+    numbers = [
+        *rows.gaps(*at),
+        *(x for row in rows.velocities(*at) for x in row),
+        *(x for y in contacts for x in _laws(y)),
+    ]
+    return layout, as_vector(numbers, q)
 
 
 def _contacts(kane: KaneEquations, t: Component, q: Row, u: Row) -> tuple[Motion, dict[str, Any]]:
@@ -315,51 +331,67 @@ class ContactRows:
         return [normal, *(_tangents(normal, self.layout.planes[i], d == 2) if has_tangents else [ZERO3] * d)]
 
 
-def _terms(kane: KaneEquations, layout: ContactLayout, with_forces: bool = True) -> ContactTerms:
-    rows, c, r = ContactRows(kane, layout), len(layout.names), 1 + layout.d
-    t, q, u = kane.t, kane.q, kane.u_all
-    like, n_q = jnp.zeros((), kane.dtype), len(q)
+class _Geometry:
+    """The terms of Kane's equations and of the contacts that depend on time and coordinates only."""
 
-    def velocities(t: Component, q: Row, u: Row) -> list[Component]:
-        return [x for row in rows.velocities(t, q, u) for x in row]
+    def __init__(self, kane: KaneEquations, layout: ContactLayout):
+        self.layout, self.rows = layout, ContactRows(kane, layout)
+        t, q, u = kane.t, kane.q, kane.u_all
+        c, like = len(layout.names), jnp.zeros((), kane.dtype)
+        self.C = kane.jacobian(lambda u: self._velocities(t, q, u)) if c else jnp.zeros((0, kane.n), kane.dtype)
+        self.Q = kane.jacobian(lambda u: kane.rates(t, q, u))
+        self.partials = kane.partial_velocities()
+        mass = kane.mass_matrix(self.partials)
+        permanent = Permanent.of(kane)
+        if permanent is not None:
+            A, M = permanent.C, stack(mass).astype(kane.dtype)
+            # A massless link: M is regular for the permitted speeds only. On these, M + A^T W A is the same as M.
+            m = jnp.stack([M[i, i] for i in range(kane.n)])[None]
+            sizes = jax.lax.stop_gradient(jnp.max(jnp.where(m > 0, A**2 / jnp.where(m > 0, m, 1.0), 0.0), axis=1))
+            M = M + A.T @ (A / jnp.where(sizes > 0, sizes, 1.0)[:, None])
+            mass = [[M[i, j] for j in range(kane.n)] for i in range(kane.n)]
+        root = self.X = stack(inverse_root(mass)).astype(kane.dtype)  # X^T M X = 1
+        self.basis: RowBasis | None = None
+        if permanent is not None:
+            self.basis = permanent.basis(root)
+            self.X = root - (root @ self.basis.Q.T) @ self.basis.Q
+        self.root = root
+        motion, contacts = _contacts(kane, t, q, u)
+        axes = [self.rows.axes(x, i, motion.N)[1:] for i, x in enumerate(contacts.values())]
+        tangents = [x for each in axes for e in each for x in e]
+        self.tangents = as_vector(tangents, like).reshape(c, layout.d, 3)
+        self.gaps = as_vector(self.rows.gaps(t, q, u), like)
 
-    v = as_vector(velocities(t, q, u), like)
-    C = kane.jacobian(lambda u: velocities(t, q, u)) if c else jnp.zeros((0, kane.n), kane.dtype)
-    partials = kane.partial_velocities()
-    mass = kane.mass_matrix(partials)
-    permanent = Permanent.of(kane)
-    if permanent is not None:
-        A, M = permanent.C, stack(mass).astype(kane.dtype)
-        # A massless link: M is regular for the permitted speeds only. On these, M + A^T W A is the same as M.
-        m = jnp.stack([M[i, i] for i in range(kane.n)])[None]
-        sizes = jax.lax.stop_gradient(jnp.max(jnp.where(m > 0, A**2 / jnp.where(m > 0, m, 1.0), 0.0), axis=1))
-        M = M + A.T @ (A / jnp.where(sizes > 0, sizes, 1.0)[:, None])
-        mass = [[M[i, j] for j in range(kane.n)] for i in range(kane.n)]
-    X = stack(inverse_root(mass)).astype(kane.dtype)  # X^T M X = 1
-    a0 = shift = jnp.zeros(kane.n, kane.dtype)
-    moving = (1.0, *kane.q_dot, *(0.0,) * kane.n, *kane.bias())
-    if permanent is not None:
-        system: Any = kane.system
-        drift = jvp(lambda t, *z: system.multiplier_residuals(t, z[:n_q], z[n_q:]), (t, *q, *u), moving)[1]
-        basis = permanent.basis(X)
-        a0, shift = (X @ basis.least_norm(-b) for b in (as_vector(drift, like), permanent.residuals))
-        X = X - (X @ basis.Q.T) @ basis.Q
-    size = jnp.abs(v) + jnp.abs(C) @ jnp.abs(as_vector(kane.u, like))
-    motion, contacts = _contacts(kane, t, q, u)
-    laws = [_laws(x) for x in contacts.values()]
-    laws = Laws(*(as_vector([law[i] for law in laws], like) for i in range(3)))
-    tangents = [y for i, x in enumerate(contacts.values()) for e in rows.axes(x, i, motion.N)[1:] for y in e]
-    T = as_vector(tangents, like).reshape(c, layout.d, 3)
-    gaps = as_vector(rows.gaps(t, q, u), like)
-    if with_forces:
-        f = as_vector([add(x, y) for x, y in zip(kane.active_forces(partials), kane.inertia_forces(partials))], like)
-        v_dot = jvp(lambda t, *z: velocities(t, z[:n_q], z[n_q:]), (t, *q, *u), moving)[1]
-        b = as_vector(v_dot, like) + C @ a0
-        w = X.T @ f
-    else:
-        b, w = jnp.zeros_like(v), jnp.zeros(kane.n, kane.dtype)
-    Q = kane.jacobian(lambda u: kane.rates(t, q, u))
-    return ContactTerms(gaps, v.reshape(c, r), size.reshape(c, r), C, b, X, w, laws, T, Q, a0, shift)
+    def _velocities(self, t: Component, q: Row, u: Row) -> list[Component]:
+        return [x for row in self.rows.velocities(t, q, u) for x in row]
+
+    def terms(self, kane: KaneEquations, with_forces: bool = True) -> ContactTerms:
+        """The terms at the speeds of `kane`. Without forces, `b`, `w` and `a0` are zero."""
+        t, q, u, like = kane.t, kane.q, kane.u_all, jnp.zeros((), kane.dtype)
+        C, X, shape, none = self.C, self.X, (len(self.gaps), 1 + self.layout.d), jnp.zeros(kane.n, kane.dtype)
+        b, w, a0, shift = jnp.zeros(len(C), kane.dtype), none, none, none
+        if with_forces:
+            n_q, moving = len(q), (1.0, *kane.q_dot, *(0.0,) * kane.n, *kane.bias())
+            at = (t, *q, *u)
+            v, v_dot = jvp(lambda t, *z: self._velocities(t, z[:n_q], z[n_q:]), at, moving)
+            forces = zip(kane.active_forces(self.partials), kane.inertia_forces(self.partials), strict=True)
+            b, w = as_vector(v_dot, like), X.T @ as_vector([add(x, y) for x, y in forces], like)
+            if self.basis is not None:
+                residuals = cast(Any, kane.system).multiplier_residuals
+                drift = jvp(lambda t, *z: residuals(t, z[:n_q], z[n_q:]), at, moving)[1]
+                a0 = self.root @ self.basis.least_norm(-as_vector(drift, like))
+                b = b + C @ a0
+        else:
+            v = self._velocities(t, q, u)
+        if self.basis is not None:
+            residuals = as_vector(cast(Any, kane.system).multiplier_residuals(t, q, u), like)
+            shift = self.root @ self.basis.least_norm(-residuals)
+        v = as_vector(v, like)
+        size = jnp.abs(v) + jnp.abs(C) @ jnp.abs(as_vector(kane.u, like))
+        laws = [_laws(x) for x in _contacts(kane, t, q, u)[1].values()]
+        laws = Laws(*(as_vector([law[i] for law in laws], like) for i in range(3)))
+        v, size, T, Q = v.reshape(shape), size.reshape(shape), self.tangents, self.Q
+        return ContactTerms(self.gaps, v, size, C, b, X, w, laws, T, Q, a0, shift)
 
 
 def _laws(contact: Contact | DryFriction) -> tuple[Component, Component, Component]:
@@ -558,15 +590,17 @@ def forces_in_contact(
     layout = layout_of(system)
     states = ContactMemory.unpacked(layout, jnp.zeros(layout.memory_size, q.dtype) if memory is None else memory)
     free = KaneEquations(system, t, q, u, values)
-    u = projected_speeds(layout, _terms(free, layout, with_forces=False), states, u)
-    terms = _terms(KaneEquations(system, t, q, u, values), layout)
+    geometry = _Geometry(free, layout)
+    u = projected_speeds(layout, geometry.terms(free, with_forces=False), states, u)
+    terms = geometry.terms(KaneEquations(system, t, q, u, values))
     return u, solve_forces(layout, terms, states), terms
 
 
 @ScalarFunction
 def terms_at(system: System, t: Component, q: Array, u: Array, values: InputValues) -> ContactTerms:
     """The terms of all contacts at speeds that are not projected."""
-    return _terms(KaneEquations(system, t, q, u, values), layout_of(system))
+    kane = KaneEquations(system, t, q, u, values)
+    return _Geometry(kane, layout_of(system)).terms(kane)
 
 
 @ScalarFunction.compile_cheaply
