@@ -33,7 +33,6 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._common.lookup import checked, refuse_if
-from ..._scalarjit.compat import depends_on
 from ..._scalarjit.components import (
     ZERO3,
     Component,
