@@ -45,7 +45,7 @@ def seconds(name: str, call: str) -> float:
 
 
 class Box(jk.System):
-    """A box of 1 kg above a floor, on which some of its lower corners can stand."""
+    """A box of 1 kg. One or more of its lower corners have a contact with the floor."""
 
     corners: int = eqx.field(static=True, default=1)
     coordinates, speeds = ("x", "y", "z", "a", "b", "c"), ("vx", "vy", "vz", "wx", "wy", "wz")

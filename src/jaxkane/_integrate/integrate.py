@@ -299,6 +299,7 @@ class Problem(NamedTuple):
         limits = adjoint, settings.max_steps, self.valid
         if is_supported(solver, controller, adjoint, settings.progress):
             jumps = (self.jump, settings.max_jumps) if self.events.continue_ else None
+            # Everything is constant, also what the jumps read, so that the loop for the errors is not differentiated.
             errors = None if self.args_dot is None else constant(self).errors_of_tangent(solver, constant(controller))
             return fast_loop(*how, *limits, jumps, errors=errors)
         if self.events.continue_:
@@ -310,7 +311,7 @@ class Problem(NamedTuple):
         return diffrax_loop(*how, *limits, settings.progress)
 
     def errors_of_tangent(self, solver: diffrax.AbstractSolver, controller: StepSizeController) -> Array:
-        """The errors of a tangent in all steps. `self` is constant: also a jump must not be differentiated here."""
+        """The errors of a tangent in all steps. The numbers of `self` and `controller` must have no derivatives."""
         # The states of contacts have no tangent. A tangent that moves at the start would hide a smaller one of a
         # parameter, 1e-9 m/N for a heavy body for example.
         n = self.start.size - self.events.layout.memory_size if self.start_moves else 0
@@ -386,8 +387,8 @@ class Problem(NamedTuple):
     ) -> EventValues:
         """The event functions of the system and of its contacts, `t` after the start.
 
-        `moves`: whether the functions of the contacts are differentiated. Their rates are never differentiated: second
-        derivatives of contact forces are long programs.
+        `moves`: whether the functions of the contacts have derivatives. Their rates have none, because nothing needs
+        them, and second derivatives of contact forces are long programs.
         """
         events, system = self.events, tree_of(args.system)
         own = event_values(args.system, args.clock(t), y, y_dot)

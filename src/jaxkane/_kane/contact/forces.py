@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -97,7 +97,8 @@ class ContactLayout(eqx.Module):
 
 
 MOST_SPEEDS = 18
-"""With four contacts with friction, the largest product of matrices in a program of scalars (12, 18) (18, 18)."""
+"""A program of scalars contains products of small matrices only. Four contacts with friction and 18 speeds have the
+largest one that is possible, (12, 18) (18, 18)."""
 
 NO_CONTACTS = ContactLayout((), (), (), False, (), ())
 
@@ -107,16 +108,16 @@ def has_contacts(system: System) -> bool:
 
 
 def layout_of(system: System) -> ContactLayout:
-    """The contacts of a system, which are traced once.
+    """The contacts of a system. They are traced at the first call.
 
     **Raises:** `TypeError` or `ValueError` for contacts that are not a dict of contacts by name; `ValueError` for more
     than four contacts (eight without friction), and for a system with too many speeds.
     """
     if not has_contacts(system) and not has_multipliers(system):
         return NO_CONTACTS
-    most, n = MOST_SPEEDS if has_contacts(system) and not has_multipliers(system) else 12, len(system.speeds)
+    n = len(system.speeds)
     refuse_if(
-        n > most,
+        n > (12 if has_multipliers(system) else MOST_SPEEDS),
         f"{type(system).__name__}: contacts need a system with at most {MOST_SPEEDS} speeds, or 12 with multipliers, "
         f"and this one has {n}. Use `jaxkane.loads.plane_contact`, or MuJoCo.",
     )
@@ -154,12 +155,8 @@ def _traced_layout(system: System, t: Component, q: Array, u: Array) -> Any:
         tuple(by_name), has_friction, is_bearing, in_space, planes, has_point, n_residuals=n_residuals
     )
     rows = ContactRows(kane, layout)
-    numbers = [
-        *rows.gaps(*at),
-        *(x for row in rows.velocities(*at) for x in row),
-        *(x for y in contacts for x in _laws(y)),
-    ]
-    return layout, as_vector(numbers, q)
+    numbers = [rows.gaps(*at), *rows.velocities(*at), *map(_laws, contacts)]
+    return layout, as_vector([x for row in numbers for x in row], q)
 
 
 def _contacts(kane: KaneEquations, t: Component, q: Row, u: Row) -> tuple[Motion, dict[str, Any]]:
@@ -349,12 +346,10 @@ class _Geometry:
             sizes = jax.lax.stop_gradient(jnp.max(jnp.where(m > 0, A**2 / jnp.where(m > 0, m, 1.0), 0.0), axis=1))
             M = M + A.T @ (A / jnp.where(sizes > 0, sizes, 1.0)[:, None])
             mass = [[M[i, j] for j in range(kane.n)] for i in range(kane.n)]
-        root = self.X = stack(inverse_root(mass)).astype(kane.dtype)  # X^T M X = 1
-        self.basis: RowBasis | None = None
-        if permanent is not None:
-            self.basis = permanent.basis(root)
-            self.X = root - (root @ self.basis.Q.T) @ self.basis.Q
-        self.root = root
+        self.root = self.X = stack(inverse_root(mass)).astype(kane.dtype)  # X^T M X = 1
+        self.basis = None if permanent is None else permanent.basis(self.root)
+        if self.basis is not None:
+            self.X = self.root - (self.root @ self.basis.Q.T) @ self.basis.Q
         motion, contacts = _contacts(kane, t, q, u)
         axes = [self.rows.axes(x, i, motion.N)[1:] for i, x in enumerate(contacts.values())]
         tangents = [x for each in axes for e in each for x in e]
@@ -365,27 +360,27 @@ class _Geometry:
         return [x for row in self.rows.velocities(t, q, u) for x in row]
 
     def terms(self, kane: KaneEquations, with_forces: bool = True) -> ContactTerms:
-        """The terms at the speeds of `kane`. Without forces, `b`, `w` and `a0` are zero."""
+        """All terms, at the speeds of `kane`. Without forces, `b`, `w` and `a0` are zero."""
         t, q, u, like = kane.t, kane.q, kane.u_all, jnp.zeros((), kane.dtype)
-        C, X, shape, none = self.C, self.X, (len(self.gaps), 1 + self.layout.d), jnp.zeros(kane.n, kane.dtype)
-        b, w, a0, shift = jnp.zeros(len(C), kane.dtype), none, none, none
+        C, X, shape = self.C, self.X, (len(self.gaps), 1 + self.layout.d)
+        along = (1.0, *kane.q_dot, *(0.0,) * kane.n, *kane.bias()) if with_forces else ()
+
+        def with_rates(f: Callable[[Component, Row, Row], Sequence[Component]]) -> tuple[Array, Array]:
+            """`f` and its rate at u_dot = 0; without forces, the rate is zero."""
+            if not with_forces:
+                return (value := as_vector(f(t, q, u), like)), jnp.zeros_like(value)
+            value, rate = jvp(lambda t, *z: f(t, z[: len(q)], z[len(q) :]), (t, *q, *u), along)
+            return as_vector(value, like), as_vector(rate, like)
+
+        v, b = with_rates(self._velocities)
+        w = a0 = shift = jnp.zeros(kane.n, kane.dtype)
         if with_forces:
-            n_q, moving = len(q), (1.0, *kane.q_dot, *(0.0,) * kane.n, *kane.bias())
-            at = (t, *q, *u)
-            v, v_dot = jvp(lambda t, *z: self._velocities(t, z[:n_q], z[n_q:]), at, moving)
             forces = zip(kane.active_forces(self.partials), kane.inertia_forces(self.partials), strict=True)
-            b, w = as_vector(v_dot, like), X.T @ as_vector([add(x, y) for x, y in forces], like)
-            if self.basis is not None:
-                residuals = cast(Any, kane.system).multiplier_residuals
-                drift = jvp(lambda t, *z: residuals(t, z[:n_q], z[n_q:]), at, moving)[1]
-                a0 = self.root @ self.basis.least_norm(-as_vector(drift, like))
-                b = b + C @ a0
-        else:
-            v = self._velocities(t, q, u)
+            w = X.T @ as_vector([add(x, y) for x, y in forces], like)
         if self.basis is not None:
-            residuals = as_vector(cast(Any, kane.system).multiplier_residuals(t, q, u), like)
-            shift = self.root @ self.basis.least_norm(-residuals)
-        v = as_vector(v, like)
+            residuals, drift = with_rates(cast(Any, kane.system).multiplier_residuals)
+            a0, shift = (self.root @ self.basis.least_norm(-x) for x in (drift, residuals))
+            b = b + C @ a0
         size = jnp.abs(v) + jnp.abs(C) @ jnp.abs(as_vector(kane.u, like))
         laws = [_laws(x) for x in _contacts(kane, t, q, u)[1].values()]
         laws = Laws(*(as_vector([law[i] for law in laws], like) for i in range(3)))
