@@ -52,7 +52,7 @@ ROBOT = robot()
 
 
 class Standing(type(ROBOT)):
-    """Springs and dampers hold the stance."""
+    """The robot with springs and dampers in its joints, which return its legs to the stance."""
 
     spring: jk.Scalar = jk.parameter(5.0)
     damper: jk.Scalar = jk.parameter(0.2)
@@ -71,7 +71,7 @@ class Standing(type(ROBOT)):
 
 
 class Pushed(Standing):
-    """Known forces act on the feet instead of contacts."""
+    """The same robot without contacts. Given forces act on its feet."""
 
     pushes: jax.Array = eqx.field(default_factory=lambda: jnp.zeros((4, 3)))
     contacts = jk.System.contacts

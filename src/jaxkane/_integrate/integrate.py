@@ -274,7 +274,7 @@ class Problem(NamedTuple):
     events: Events
     settings: Settings
     args_dot: Any = None
-    start_moves: bool = False
+    start_differentiable: bool = False
 
     @property
     def constrained(self) -> bool:
@@ -311,7 +311,7 @@ class Problem(NamedTuple):
         return diffrax_loop(*how, *limits, settings.progress)
 
     def errors_of_tangent(self, solver: diffrax.AbstractSolver, controller: StepSizeController) -> Array:
-        """The errors of a tangent in all steps. The numbers of `self` and `controller` must have no derivatives."""
+        """The error of one tangent in each step. `self` and `controller` must be constant (see `constant`)."""
         # The states of contacts have no tangent. A tangent that moves at the start would hide a smaller one of a
         # parameter, 1e-9 m/N for a heavy body for example.
         n = self.start.size - self.events.layout.memory_size if self.start_moves else 0
@@ -374,7 +374,7 @@ class Problem(NamedTuple):
         def stepped(point: EventPoint) -> EventPoint:
             read = y_dot if self.events.read_rates else None
             if self.events.layout.names:
-                quantities = self.event_values(point.t, point.y, args, y_dot, moves=True)
+                quantities = self.event_values(point.t, point.y, args, y_dot, differentiable=True)
                 return moved_to_event(quantities, point, y_dot, reach, event, happened, REST * self.taus[-1])
             return next_point(args.system, args.origin, point, y_dot, read, reach, event, happened)
 
@@ -383,12 +383,12 @@ class Problem(NamedTuple):
         return stepped(near._replace(y=near.y + bend))
 
     def event_values(
-        self, t: Array, y: Array, args: RateArguments, y_dot: Array | None, moves: bool = False
+        self, t: Array, y: Array, args: RateArguments, y_dot: Array | None, differentiable: bool = False
     ) -> EventValues:
-        """The event functions of the system and of its contacts, `t` after the start.
+        """The values of the event functions of the system and of its contacts. `t`: time since the start [s].
 
-        `moves`: whether the functions of the contacts have derivatives. Their rates have none, because nothing needs
-        them, and second derivatives of contact forces are long programs.
+        `differentiable`: whether the event functions of the contacts have derivatives. Their rates are constant in both
+        cases: nothing uses derivatives of the rates, and a program for second derivatives of contact forces is long.
         """
         events, system = self.events, tree_of(args.system)
         own = event_values(args.system, args.clock(t), y, y_dot)
@@ -401,7 +401,7 @@ class Problem(NamedTuple):
 
         fixed, at, along = constant((args, (t, y), (jnp.ones_like(t), y_dot)))
         (values, noise), (rates, _) = jax.jvp(functools.partial(of_contacts, fixed), at, along)
-        values = of_contacts(args, t, y)[0] if moves else values
+        values = of_contacts(args, t, y)[0] if differentiable else values
         # The own events and the contacts, each in alphabetical order
         n, places = len(own.values), itertools.count()
         order = [next(places) if contact is None else n + 2 * contact[0] + contact[1] for contact in events.contacts]

@@ -97,8 +97,8 @@ class ContactLayout(eqx.Module):
 
 
 MOST_SPEEDS = 18
-"""A program of scalars contains products of small matrices only. Four contacts with friction and 18 speeds have the
-largest one that is possible, (12, 18) (18, 18)."""
+"""The largest number of speeds of a system with contacts. A program of scalars cannot contain large products of
+matrices. Four contacts with friction and 18 speeds need (12, 18) (18, 18), which is just possible."""
 
 NO_CONTACTS = ContactLayout((), (), (), False, (), ())
 
@@ -108,10 +108,10 @@ def has_contacts(system: System) -> bool:
 
 
 def layout_of(system: System) -> ContactLayout:
-    """The contacts of a system. They are traced at the first call.
+    """The `ContactLayout` of a system. The first call traces its contacts.
 
-    **Raises:** `TypeError` or `ValueError` for contacts that are not a dict of contacts by name; `ValueError` for more
-    than four contacts (eight without friction), and for a system with too many speeds.
+    **Raises:** `TypeError` or `ValueError` if `contacts` does not return a dict of contacts by name; `ValueError` for
+    more than four contacts (eight without friction), and for too many speeds.
     """
     if not has_contacts(system) and not has_multipliers(system):
         return NO_CONTACTS
@@ -135,7 +135,7 @@ def layout_of(system: System) -> ContactLayout:
 
 @ScalarFunction
 def _traced_layout(system: System, t: Component, q: Array, u: Array) -> Any:
-    """The layout, and numbers that depend on the time if any contact does."""
+    """The layout, and all numbers of the contacts (n,). They show whether a contact depends on the time."""
     kane = KaneEquations(system, t, q, u)
     at = kane.t, kane.q, kane.u_all
     motion, by_name = _contacts(kane, *at)
@@ -328,7 +328,7 @@ class ContactRows:
 
 
 class _Geometry:
-    """The terms of Kane's equations and of the contacts that depend on time and coordinates only."""
+    """Terms of `ContactTerms` that depend on time and coordinates, but not on speeds."""
 
     def __init__(self, kane: KaneEquations, layout: ContactLayout):
         self.layout, self.rows = layout, ContactRows(kane, layout)
@@ -360,7 +360,7 @@ class _Geometry:
         return [x for row in self.rows.velocities(t, q, u) for x in row]
 
     def terms(self, kane: KaneEquations, with_forces: bool = True) -> ContactTerms:
-        """All terms, at the speeds of `kane`. Without forces, `b`, `w` and `a0` are zero."""
+        """All terms, with the speeds of `kane`. If `with_forces` is False, `b`, `w` and `a0` are zero."""
         t, q, u, like = kane.t, kane.q, kane.u_all, jnp.zeros((), kane.dtype)
         C, X, shape = self.C, self.X, (len(self.gaps), 1 + self.layout.d)
         along = (1.0, *kane.q_dot, *(0.0,) * kane.n, *kane.bias()) if with_forces else ()
