@@ -274,7 +274,7 @@ class Problem(NamedTuple):
     events: Events
     settings: Settings
     args_dot: Any = None
-    start_differentiable: bool = False
+    start_moves: bool = False
 
     @property
     def constrained(self) -> bool:
