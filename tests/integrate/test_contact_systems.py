@@ -346,7 +346,7 @@ class Driven(Particle):
 
 
 @pytest.mark.weekly
-@pytest.mark.parametrize(("tolerance", "atol"), [(1e-6, 2e-6), (1e-10, 1e-9)])
+@pytest.mark.parametrize(("tolerance", "atol"), [(1e-6, 2e-6), (1e-8, 1e-7), (1e-10, 1e-9)])
 def test_slip_begins_with_zero_acceleration(tolerance, atol):
     """Static equals kinetic friction. In polar coordinates of the slip, by SciPy's Radau with 1e-11.
 
@@ -359,7 +359,8 @@ def test_slip_begins_with_zero_acceleration(tolerance, atol):
         return ride.u, ride
 
     slopes, ride = jax.jit(jax.jacfwd(speeds, has_aux=True))(0.5)
-    np.testing.assert_array_equal(np.isnan(slopes).any(axis=1), ride.t > 0.1)  # correct derivatives or none
+    # By central differences of fourth order with tolerances of 1e-12.
+    np.testing.assert_allclose(slopes[-1, :2], [3.17694607, -3.04133415], rtol=0, atol=10 * atol)
     np.testing.assert_allclose(ride.jumps.t[0], 0.1, atol=1e-12)
     np.testing.assert_allclose(ride.end.u[:2], [-0.5208914533291, 0.2588472904328], atol=atol)
     assert int(ride.stats["steps"]) < 1000  # there were 600 000, and an error of 3e-6, with the direction v / |v|

@@ -456,7 +456,6 @@ class Problem(NamedTuple):
         is_finite = jnp.all(jnp.isfinite(after))
         status = jnp.where(change.is_determined & is_finite, jump.status, float(Status.UNDETERMINED_CONTACT))
         status = jnp.where(change.is_lawful, status, float(Status.INVALID_COEFFICIENT))
-        jump = jump._replace(smooth=jnp.where(change.is_smooth, jump.smooth, jnp.zeros_like(jump.smooth)))
         return jump._replace(t=jump.t + change.delay, after=after, impulses=change.impulses.reshape(-1), status=status)
 
     def _changed_contacts(self, t: Array, y: Array, what: ContactEvent, reach: Array) -> Change:

@@ -458,10 +458,10 @@ def slip_directions(layout: ContactLayout, terms: ContactTerms, memory: ContactM
     speed = jnp.sqrt(jnp.where(is_fast, speed2, 1.0))
     way = jnp.where(jnp.sum(v * start, axis=1) < 0, -1.0, 1.0)
     directions = jnp.where(is_fast[:, None], (way / speed)[:, None] * v, start)
-    return _slow_directions(terms, memory.slow[:, 0], jnp.where(is_fast, speed, 0.0), directions)
+    return _slow_directions(terms, memory.slow[:, 0], jnp.where(is_fast, speed, 0.0), directions, start)
 
 
-def _slow_directions(terms: ContactTerms, slow: Array, speed: Array, directions: Array) -> Array:
+def _slow_directions(terms: ContactTerms, slow: Array, speed: Array, directions: Array, start: Array) -> Array:
     """The `directions` (c, 2) of slips in space; where a slip of less than `slow` begins, the quasi-steady ones.
 
     With a = mu F_N g, where g is the mean of the two mobilities, a quasi-steady direction e satisfies
@@ -478,7 +478,10 @@ def _slow_directions(terms: ContactTerms, slow: Array, speed: Array, directions:
     mean = 0.5 * (G[:, 1, 1] + G[:, 2, 2])
     begins = (speed < slow) & (mu * mean > 0)
     size = jnp.where(begins, slow * (1.0 - speed / jnp.where(begins, slow, 1.0)) ** 2, 0.0)
-    found = directions
+    # The first guess has no derivative: that of v / |v| is infinite, and two steps do not remove all of it.
+    guess = jax.lax.stop_gradient(jnp.where(begins[:, None], v + size[:, None] * start, directions))
+    length2 = jnp.sum(guess**2, axis=1)
+    found = guess / jnp.sqrt(jnp.where(length2 > 0, length2, 1.0))[:, None]
 
     def relative(e: Array) -> tuple[Array, Array]:
         """The slip acceleration (c, 2) over a, and whether the contact pushes."""

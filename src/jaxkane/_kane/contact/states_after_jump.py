@@ -96,7 +96,6 @@ class Change(NamedTuple):
     - `impulses` (c, r): of the impact, zero without one [N s].
     - `is_lawful`: whether the coefficients of the contacts are in their ranges.
     - `is_determined`: whether the contact laws have a solution.
-    - `is_smooth`: whether derivatives afterwards are correct.
     """
 
     y: Array
@@ -104,7 +103,6 @@ class Change(NamedTuple):
     impulses: Array
     is_lawful: Array
     is_determined: Array
-    is_smooth: Array
 
 
 def changed_contacts(
@@ -362,7 +360,6 @@ def _changed(
     memory, bearing = ContactMemory.unpacked(layout, cast(Array, state.contacts)), jnp.asarray(layout.is_bearing)
     found, event, is_still = third.problem.solution(choice), first.event, third.is_still
     states, directions, kept = jnp.where(third.problem.closed, found.states, OPEN), memory.directions, memory.slow
-    is_smooth = jnp.array(True)
     if layout.d:
         # A slip that begins is opposite to the friction.
         slides = (states == SLIDES)[:, None]
@@ -384,10 +381,6 @@ def _changed(
             error = jnp.where(goes_on, memory.slow[:, 1], third.slow[:, 1])
             is_sliding = ((states == SLIDES) & ~bearing)[:, None]
             kept = jax.lax.stop_gradient(jnp.where(is_sliding, jnp.stack([first_slow, error], axis=1), 0.0))
-            # A slip that begins without an acceleration is stiff. The error estimate does not contain the derivatives:
-            # those of a particle were 21 instead of 3.
-            begins = (kept[:, 0] > 0) & (memory.states != SLIDES)
-            is_smooth = ~jnp.any(begins & (after.laws.static <= after.laws.friction))
     new = ContactMemory(states, directions, kept)
     u = projected_speeds(layout, after, new, second.u)
     # Gaps of closed contacts drift by the error of the solver.
@@ -397,7 +390,7 @@ def _changed(
     y = jnp.concatenate([q, u, rest, new.packed()])
     delay = jnp.max(jnp.where(states != OPEN, third.delays, 0.0), initial=0.0)
     is_lawful = second.is_lawful & after.laws.are_valid(False, states >= SLIDES)
-    return Change(y, delay, second.impulses, is_lawful, found.determined & second.is_determined, is_smooth)
+    return Change(y, delay, second.impulses, is_lawful, found.determined & second.is_determined)
 
 
 def _negligible(terms: ContactTerms) -> Array:
