@@ -72,7 +72,7 @@ from .settings import (
     with_tolerances,
 )
 from .step_control import FEWEST_STEPS, SHARE, StepSizeController, evenly_spread, first_step
-from .tangents import Probing, as_integers, direction_of, generic, with_own_tangents
+from .tangents import Probing, Replay, direction_of, generic, with_own_tangents
 from .trajectory import InputDiscontinuities, Trajectory
 
 
@@ -234,8 +234,14 @@ def _solved(
     end: End = _end(problem.valid, taus[-1], problem.start, steps.t, steps.y, steps.state.status, nothing)
     if determined is not None:
         end = end._replace(status=jnp.where(determined, end.status, float(Status.UNDETERMINED_CONTACT)))
-    end = problem.located(end, steps.rates, steps.state.reach) if problem.events.names else end
+    if problem.events.names:
+        slack = 1.0 if steps.replay is None else SLACK
+        end = problem.located(end, steps.rates, slack * steps.state.reach)
     return _trajectory(problem, steps, end, follows_from)
+
+
+SLACK = 1e4
+"""Recorded steps end this many times farther from an event: each bounce multiplies rounding errors by ten."""
 
 
 class End(NamedTuple):
@@ -298,10 +304,11 @@ class Problem(NamedTuple):
         adjoint: Any = settings.adjoint  # not None: `solve` replaces None before it comes here
         limits = adjoint, settings.max_steps, self.valid
         if is_supported(solver, controller, adjoint, settings.progress):
-            jumps = (self.jump, settings.max_jumps) if self.events.continue_ else None
-            # Everything is constant, also what the jumps read, so that the loop for the errors is not differentiated.
-            errors = None if self.args_dot is None else constant(self).errors_of_tangent(solver, constant(controller))
-            return fast_loop(*how, *limits, jumps, errors=errors)
+            # Everything is constant, also what the jumps read, so that the loop for the steps is not differentiated.
+            replay = None if self.args_dot is None else constant(self).steps_of_tangent(solver, constant(controller))
+            jump = functools.partial(self.jump, slack=1.0 if replay is None else SLACK)
+            jumps = (jump, settings.max_jumps) if self.events.continue_ else None
+            return fast_loop(*how, *limits, jumps, replay=replay)
         if self.events.continue_:
             raise ValueError(
                 f"{type(self.system).__name__} has contacts, or an event that changes the state (`then`). This needs "
@@ -310,8 +317,8 @@ class Problem(NamedTuple):
             )
         return diffrax_loop(*how, *limits, settings.progress)
 
-    def errors_of_tangent(self, solver: diffrax.AbstractSolver, controller: StepSizeController) -> Array:
-        """The error of one tangent in each step. `self` and `controller` must be constant (see `constant`)."""
+    def steps_of_tangent(self, solver: diffrax.AbstractSolver, controller: StepSizeController) -> Replay:
+        """The steps that motion and a tangent need. `self` and `controller` must be constant (see `constant`)."""
         # The states of contacts have no tangent. A tangent that moves at the start would hide a smaller one of a
         # parameter, 1e-9 m/N for a heavy body for example.
         n = self.start.size - self.events.layout.memory_size if self.start_moves else 0
@@ -319,9 +326,9 @@ class Problem(NamedTuple):
         probing = Probing(self.rates(True), generic(self.start, n), self.args_dot, noise)
         jumps = (self.jump, self.settings.max_jumps) if self.events.continue_ else None
         how = probing.rates, solver, controller, self.start, self.args, self.taus[-1:], diffrax.ForwardMode()
-        errors = fast_loop(*how, self.settings.max_steps, self.valid, jumps, probing).errors
-        assert errors is not None
-        return as_integers(errors)
+        replay = fast_loop(*how, self.settings.max_steps, self.valid, jumps, probing).replay
+        assert replay is not None
+        return replay
 
     def controller(self, rates: Callable[..., Any]) -> StepSizeController:
         system, settings, events = self.system, self.settings, self.events
@@ -409,9 +416,9 @@ class Problem(NamedTuple):
         values, rates, noise = (jnp.stack([jnp.concatenate(pair)[i] for i in order]) for pair in pairs)
         return own._replace(values=values, rates=rates, noise=noise)
 
-    def jump(self, t: Array, y: Array, event: Array, reach: Array) -> Jump:
-        """The jump of an event, from a time and a packed state near it."""
-        point = self.event_point(t, y, None, event, reach, jnp.array(True))
+    def jump(self, t: Array, y: Array, event: Array, reach: Array, slack: float = 1.0) -> Jump:
+        """The jump of an event, from a time and a packed state near it. `slack`: see `SLACK`."""
+        point = self.event_point(t, y, None, event, slack * reach, jnp.array(True))
         after, none = point.y, float(Status.COMPLETED)
         if any((which := stages_of(self.events)).stages):
             after = state_after(self.args.system, self.args.clock(point.t), point.y, event, which)
@@ -641,6 +648,7 @@ def _rates(stabilize: float, forward: bool = False) -> Callable[..., Array]:
 def _trajectory(problem: Problem, steps: Steps, end: End, follows_from: list[Array]) -> Trajectory:
     """The trajectory of these steps, NaN after the last one. `follows_from`: the values on which it depends."""
     system, taus, args, found = problem.system, problem.taus, problem.args, problem.discontinuities
+    layout = problem.events.layout
     ts, blur = args.origin + taus, rounding(taus[-1], taus[-1])
     # The last step ends shortly before or after the event. Samples between both times get the state at the event.
     before = taus <= end.t + blur
@@ -659,11 +667,16 @@ def _trajectory(problem: Problem, steps: Steps, end: End, follows_from: list[Arr
 
         motion = away_from_jumps(taus, motion)
         end = end._replace(y=jnp.where(end.by_event, end.y, away_from_jumps(end.t[None], end.y[None])[0]))
-        rough = jnp.min(jnp.where(happened & (record.smooth == 0), constant(record.t), jnp.inf), initial=jnp.inf)
+        smooth = record.smooth > 0
+        if steps.replay is not None and steps.replay.after is not None and layout.names:
+            # A jump at a limit, whose contact states depend on rounding errors
+            memories = (x[:, x.shape[1] - layout.memory_size :] for x in (record.after, steps.replay.after))
+            now, then = (x.reshape(len(x), len(layout.names), -1)[:, :, 0] for x in memories)
+            smooth &= jnp.all(now == then, axis=1)
+        rough = jnp.min(jnp.where(happened & ~smooth, constant(record.t), jnp.inf), initial=jnp.inf)
         motion = nan_derivative_where(taus >= rough, motion, follows_from)
         motion = nan_beyond_second_derivative(steps.n_jumps > 0, motion, follows_from)
         end = end._replace(smooth=end.smooth & (rough == jnp.inf))
-    layout = problem.events.layout
     # States that were not reached are replaced by the first: masking the outputs would leave NaN in derivatives.
     motion = jnp.where(reached[:, None], motion, problem.start[None])
     if problem.settings.project and problem.constrained:

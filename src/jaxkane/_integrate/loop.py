@@ -21,7 +21,7 @@ from .events import Status
 from .inputs import RateArguments
 from .settings import rates_at_ends, with_scan_kind
 from .step_control import ControllerState, StepSizeController
-from .tangents import Probe, Probing, read_errors
+from .tangents import Probe, Probing, Replay
 
 # How the loop of equinox is differentiated, by adjoint.
 _KINDS: dict[type, str] = {
@@ -59,7 +59,7 @@ class Steps(NamedTuple):
     - `state`: the state of the controller.
     - `taken`, `accepted`: numbers of steps.
     - `jumps`, `n_jumps`: the jumps and their number, or None if no event changes the state. Later rows are unused.
-    - `errors`: the errors of the tangent in all steps if it is integrated with the motion, or None.
+    - `replay`: the recorded steps if a tangent is integrated with the motion, or None.
     """
 
     motion: Array
@@ -72,7 +72,7 @@ class Steps(NamedTuple):
     accepted: Array
     jumps: Jump | None = None
     n_jumps: Any = None
-    errors: Array | None = None
+    replay: Replay | None = None
 
 
 class Carry(NamedTuple):
@@ -127,13 +127,13 @@ def fast_loop(
     may_begin: Array,
     jumps: tuple[Callable[[Array, Array, Array, Array], Jump], int] | None,
     probing: Probing | None = None,
-    errors: Array | None = None,
+    replay: Replay | None = None,
 ) -> Steps:
     """The steps of `diffeqsolve`, to the last digit. No steps are taken unless the simulation `may_begin`.
 
     `jumps`: a function (t, y, event, reach) -> `Jump`, from a time near the event, and the largest number of jumps.
     `probing`: integrate a tangent with the motion. A step is accepted only if the error of the tangent is small, too.
-    `errors`: the errors of this tangent, recorded by an earlier loop.
+    `replay`: take the recorded steps of an earlier loop with a tangent, without error control and event functions.
     """
     kind: Any = _KINDS[type(adjoint)]
     checkpoints = getattr(adjoint, "checkpoints", None)
@@ -141,8 +141,19 @@ def fast_loop(
     solver = solver if kind == "checkpointed" else with_scan_kind(solver, kind)
     term: Any = diffrax.ODETerm(rates if probing is None else probing.of_both)  # pyright: ignore[reportArgumentType]
     start, order = jnp.zeros_like(controller.duration), solver.error_order(term)
-    end, state = controller.init(term, start, controller.duration, y0, None, args, solver.func, order)
-    begin, probe = (y0, None) if probing is None else probing.start(y0, max_steps)
+    duration, state = controller.duration, None
+
+    def next_step(i: Array, t0: Array) -> tuple[Array, Array, Array]:
+        assert replay is not None
+        found = controller.discontinuities
+        return replay.end(i, t0, duration, None if found is None else found.after(t0, duration))
+
+    if replay is None:
+        end, state = controller.init(term, start, duration, y0, None, args, solver.func, order)
+    else:
+        end = next_step(jnp.zeros((), int), start)[0]
+        may_begin &= replay.count > 0
+    begin, probe = (y0, None) if probing is None else probing.start(y0, max_steps, 0 if jumps is None else jumps[1])
     needs_rates = bool(controller.events.names) and rates_at_ends(solver)
     restart = controller.discontinuities is not None and controller.discontinuities.restart
     table = None
@@ -168,51 +179,69 @@ def fast_loop(
         if not getattr(solver, "always_succeeds", False):
             failed = result != diffrax.RESULTS.successful
             y1, error = jax.tree.map(lambda x: jnp.where(failed, jnp.inf, x), (y1, error))
-        probe, error_of_tangent = c.probe, None if errors is None else read_errors(errors, c.steps[0], y0.dtype)
-        if probing is not None and probe is not None:
-            error_of_tangent, probe = probing.step(probe, y1, error, c.steps[0])
-        keep, t0, t1, jumped, state, ended = controller.adapt_step_size(
-            c.t0, c.t1, motion_of(c.y), motion_of(y1), args, None if error is None else motion_of(error), order,
-            c.controller_state, error_of_tangent,
-        )  # fmt: skip
+        i, event, reach = c.steps[0], None, None
+        if replay is None:
+            size = error_of_tangent = None
+            if probing is not None and c.probe is not None:
+                error_of_tangent, size = probing.step(c.probe, y1, error)
+            keep, t0, t1, jumped, state, ended = controller.adapt_step_size(
+                c.t0, c.t1, motion_of(c.y), motion_of(y1), args, None if error is None else motion_of(error), order,
+                c.controller_state, error_of_tangent,
+            )  # fmt: skip
+            running = ended == diffrax.RESULTS.successful
+            if jumps is not None:
+                now = ControllerState.unpacked(state[0], n_events)
+                event, reach = now.jump, now.reach
+            probe = c.probe
+            if probe is not None:
+                jump = None if event is None or reach is None else (c.n_jumps, event, reach)
+                probe = probe._replace(size=jnp.where(keep, size, probe.size))
+                probe = probe.recorded(c.t1, keep, ~running if event is None else ~running | (event >= 0), jump)
+        else:
+            _, keep, jumped = next_step(i, c.t0)
+            t0 = jnp.where(keep, c.t1, c.t0)
+            t1, state, running, probe = next_step(i + 1, t0)[0], None, i + 1 < replay.count, None
+            if jumps is not None:
+                event, reach = replay.jump_of(i, c.n_jumps, c.t1)
 
         def chosen(new: PyTree, old: PyTree) -> Any:
             return jax.tree.map(functools.partial(jnp.where, keep), new, old)
 
         k: Any = constant(motion_of(dense["k"])) if needs_rates else None
         interpolation = solver.interpolation_cls(t0=c.t0, t1=c.t1, **dense)
-        running, y_next = ended == diffrax.RESULTS.successful, chosen(y1, c.y)
+        y_next = chosen(y1, c.y)
         rates_next = chosen(k[-1], k[0]) / (c.t1 - c.t0) if needs_rates else None
         solver_state, cut = chosen(solver_state, c.solver_state), None
-        if probing is not None and probe is not None and c.probe is not None:
-            probe = probe._replace(size=chosen(probe.size, c.probe.size))
         following = Carry(
             t0, t1, y_next, rates_next, solver_state, state, None, running, None, None, None, c.jumps, c.n_jumps, None
         )  # fmt: skip
-        if jumps is not None:
+        if jumps is not None and event is not None:
             # The loop runs once if a jump is due. In a batch it runs if a jump is due in any member: a condition would
             # be evaluated in every step.
             jump_at, most = jumps
-            is_due = ControllerState.unpacked(state[0], n_events).jump >= 0
+            is_due = event >= 0
 
             def jumped_at(due_and_carry: tuple[Array, Carry]) -> tuple[Array, Carry]:
                 due, a = due_and_carry
-                now, start = ControllerState.unpacked(a.controller_state[0], n_events), jnp.where(keep, c.t1, c.t0)
-                jump, fits = jump_at(start, motion_of(a.y), now.jump, now.reach), a.n_jumps < most
+                start = jnp.where(keep, c.t1, c.t0)
+                jump, fits = jump_at(start, motion_of(a.y), event, reach), a.n_jumps < most
                 # A state that is not finite must not reach the solver.
                 status_of_jump = jump.status
                 is_possible = status_of_jump == float(Status.COMPLETED)
                 jump = jump._replace(after=jnp.where(fits & is_possible, jump.after, jump.before), status=None)
-                end, (changed, inner) = controller.after_jump(a.controller_state, jump.t, jump.after, args)
+                if replay is None:
+                    end, (changed, inner) = controller.after_jump(a.controller_state, jump.t, jump.after, args)
+                    status = jnp.where(is_possible, ControllerState.unpacked(changed, n_events).status, status_of_jump)
+                    status = jnp.where(fits, status, float(Status.MAX_JUMPS))
+                    state, goes_on = (changed.at[0].set(status), inner), status == float(Status.COMPLETED)
+                else:
+                    end, state, goes_on = next_step(i + 1, jump.t)[0], None, a.running
                 y = jump.after if probing is None or probe is None else probing.again(jump.after, probe)
-                status = jnp.where(is_possible, ControllerState.unpacked(changed, n_events).status, status_of_jump)
-                status = jnp.where(fits, status, float(Status.MAX_JUMPS))
                 # JAX drops a row that does not fit. In reverse mode, the arrays are objects of equinox.
                 rows = [x.at[a.n_jumps].set(row) for x, row in zip(a.jumps[:-1], jump[:-1], strict=True)]
                 return jnp.zeros_like(due), a._replace(
                     t0=jump.t, t1=end, y=y, rates=None if a.rates is None else jnp.zeros_like(a.rates),
-                    solver_state=solver.init(term, jump.t, end, y, args),
-                    controller_state=(changed.at[0].set(status), inner), running=status == float(Status.COMPLETED),
+                    solver_state=solver.init(term, jump.t, end, y, args), controller_state=state, running=goes_on,
                     jumps=Jump._make([*rows, None]), n_jumps=jnp.minimum(a.n_jumps + 1, most),
                 )  # fmt: skip
 
@@ -254,16 +283,21 @@ def fast_loop(
 
     def buffers(c: Carry) -> Any:
         # Not `c.jumps is None`: equinox calls this with wrapped leaves.
-        more = [*(() if jumps is None else c.jumps[:-1]), *(() if probing is None else [c.probe.errors])]  # pyright: ignore
+        more = [*(() if jumps is None else c.jumps[:-1]), *(() if probing is None else [c.probe.ends])]  # pyright: ignore
         return [c.motion, *more]
 
     last = loop(lambda c: c.running, step, carry, max_steps, checkpoints, buffers)
     reached = jnp.arange(len(ts)) < last.count
-    state = ControllerState.unpacked(last.controller_state[0], n_events)
-    errors = None if last.probe is None else last.probe.errors
+    if replay is None:
+        state = ControllerState.unpacked(last.controller_state[0], n_events)
+        taken, accepted = last.steps
+        after = None if last.jumps is None else last.jumps.after
+        replay = None if last.probe is None else Replay.of(last.probe, after, state, taken, accepted)
+    else:
+        state, taken, accepted = replay.state, replay.taken, replay.accepted
     return Steps(
-        last.motion, reached, last.t0, motion_of(last.y), last.rates, state, last.steps[0], last.steps[1], last.jumps,
-        last.n_jumps, errors,
+        last.motion, reached, last.t0, motion_of(last.y), last.rates, state, taken, accepted, last.jumps,
+        last.n_jumps, replay,
     )  # fmt: skip
 
 

@@ -9,8 +9,9 @@ tangents obey the same equation. Therefore one tangent with a generic direction 
 
     y_dot = f(t, y, args),   d_dot = df/dy d + df/dargs args_dot
 
-This tangent is called the probe. A first loop integrates motion and probe, and records the errors of the probe. The
-loop that is differentiated reads these errors, so that it takes the same steps.
+This tangent is called the probe. A first loop integrates motion and probe with error control, and records the ends of
+its steps and its jumps. The loop that is differentiated takes the recorded steps. It makes no decisions of its own, so
+a rounding error cannot change them.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jax.typing import DTypeLike
 from jaxtyping import Array, PyTree
 
 from .._scalarjit.compat import as_lowering, is_no_tangent, is_undefined_primal, new_primitive
 from .._scalarjit.components import Component, Numbers
 from .._scalarjit.nan import constant
 from .._scalarjit.scalar_function import Packed, tree_of
+from .discontinuities import rounding
 from .inputs import RateArguments, is_samples
 
 Run = Callable[..., Any]
@@ -240,16 +241,78 @@ _in_one_batch: Any = new_primitive(
     lower_on_cpu=as_lowering(_first),
 )
 
-RECORDED = 16384
-"""The largest number of steps whose errors are recorded."""
+RECORDED = 2**18
+"""The largest number of steps that can be differentiated if `max_steps` is None."""
 
 
 class Probe(NamedTuple):
-    """The largest sizes (2, n) so far of motion and tangent, by component, and the errors (m,) of the tangent in all
-    steps."""
+    """What a loop with a probe carries and records.
+
+    - `size` (2, n): the largest sizes so far of motion and tangent, by component.
+    - `ends` (m,): the ends of the steps [s]; negative if the step is not accepted, but a jump occurs at its start, or
+      the simulation ends there. All other rejected steps are omitted.
+    - `count`: the number of ends.
+    - `jumps` (k, 3): for each jump the number of its step, its event, and its reach [s].
+    """
 
     size: Array
-    errors: Array
+    ends: Array
+    count: Array
+    jumps: Array
+
+    def recorded(self, t1: Array, keep: Array, stays: Array, jump: tuple[Array, Array, Array] | None) -> Probe:
+        """The same with a step that ends at t1, if it is accepted (`keep`) or recorded nevertheless (`stays`).
+
+        `jump`: the number of the next jump, its event, or -1 if none is due, and its reach."""
+        i, jumps = self.count, self.jumps
+        if jump is not None:
+            k, event, reach = jump
+            row = jnp.stack([i.astype(reach.dtype), event, reach])
+            jumps = jumps.at[jnp.where(event >= 0, k, len(jumps))].set(row, mode="drop")
+        ends = self.ends.at[i].set(jnp.where(keep, t1, -t1))
+        return self._replace(ends=ends, count=i + (keep | stays).astype(i.dtype), jumps=jumps)
+
+
+class Replay(NamedTuple):
+    """The recorded steps of a loop with a probe.
+
+    - `ends`, `count`, `jumps`: see `Probe`. Floats are stored as integers: in reverse mode, a loop would add a cotangent
+      of the size of an array of floats in each step that reads it, even if the array is constant.
+    - `after` (k, n): the packed states after the jumps, None if no event changes the state.
+    - `state`, `taken`, `accepted`: the results of that loop, see `Steps`.
+    """
+
+    ends: Array
+    count: Array
+    jumps: Array
+    after: Array | None
+    state: Any
+    taken: Array
+    accepted: Array
+
+    @classmethod
+    def of(cls, probe: Probe, after: Array | None, state: Any, taken: Array, accepted: Array) -> Replay:
+        bits = {4: jnp.int32, 8: jnp.int64}[probe.ends.dtype.itemsize]
+        ends, jumps = (jax.lax.bitcast_convert_type(x, bits) for x in (probe.ends, probe.jumps))
+        return cls(ends, jnp.minimum(probe.count, len(ends)), jumps, after, state, taken, accepted)
+
+    def end(self, i: Array, t0: Array, duration: Array, stop: Array | None) -> tuple[Array, Array, Array]:
+        """The end of step i, which begins at t0; whether it is accepted; and whether it ends at a discontinuity.
+
+        `stop`: the next discontinuity, or None. An end at `stop` or at `duration` has its derivative. After the last
+        step the result is t0."""
+        recorded = jax.lax.bitcast_convert_type(self.ends[i], t0.dtype)
+        t1, at_stop = jnp.abs(recorded), jnp.zeros_like(recorded, bool)
+        t1 = jnp.where(t1 == duration, duration, t1)
+        if stop is not None:
+            at_stop = (recorded > 0) & (jnp.abs(t1 - stop) <= rounding(t1, duration))
+            t1 = jnp.where(at_stop, stop, t1)
+        return jnp.where(i < self.count, t1, constant(t0)), recorded > 0, at_stop
+
+    def jump_of(self, i: Array, k: Array, like: Array) -> tuple[Array, Array]:
+        """The event of the jump k, -1 if it does not occur in step i, and its reach [s]."""
+        step, event, reach = jax.lax.bitcast_convert_type(self.jumps[jnp.minimum(k, len(self.jumps) - 1)], like.dtype)
+        return jnp.where((step == i) & (k < len(self.jumps)), event, -1.0), reach
 
 
 class Probing(NamedTuple):
@@ -266,11 +329,11 @@ class Probing(NamedTuple):
     args: Any
     noise: Array
 
-    def start(self, y: Array, most: int | None) -> tuple[Array, Probe]:
+    def start(self, y: Array, most: int | None, most_jumps: int) -> tuple[Array, Probe]:
         """Motion and tangent at the start of a simulation of at most `most` steps, and the probe."""
-        errors = jnp.zeros(min(most or RECORDED, RECORDED), jnp.float32)
-        both = jnp.stack([y, self.y])
-        return both, Probe(jnp.abs(both), errors)
+        both, m = jnp.stack([y, self.y]), RECORDED if most is None else most
+        jumps = jnp.full((most_jumps, 3), -1.0, y.dtype)
+        return both, Probe(jnp.abs(both), jnp.zeros(m, y.dtype), jnp.zeros((), int), jumps)
 
     def again(self, y: Array, probe: Probe) -> Array:
         """Motion and tangent after a jump of the motion to y.
@@ -278,16 +341,13 @@ class Probing(NamedTuple):
         The direction is generic again, because an event may reset a coordinate. Its components keep their sizes."""
         return jnp.stack([y, jnp.sign(generic(y, y.size)) * probe.size[1]])
 
-    def step(self, probe: Probe, both: Array, error: Array, i: Array) -> tuple[Array, Probe]:
-        """The error of the tangent in the step i, relative to its size; and the probe. `both`: the end of the step."""
+    def step(self, probe: Probe, both: Array, error: Array) -> tuple[Array, Array]:
+        """The error of the tangent in a step, relative to its size; and the sizes. `both`: the end of the step."""
         size = jnp.maximum(probe.size, jnp.abs(both))
         # A tangent that is zero but for rounding errors is not smooth: its steps would become as short as possible.
         least = jnp.maximum(size[1], self.noise * jnp.maximum(size[0], jnp.max(size[1])))
         share = jnp.where(least > 0, error[1] / jnp.where(least > 0, least, 1.0), 0.0)
-        # Both loops use the rounded number: one that differs in the last digit can decide about an additional step
-        # before a discontinuity, and from then on each step would read the error of its neighbour.
-        e = jnp.sqrt(jnp.mean(share * share)).astype(jnp.float32)
-        return e.astype(both.dtype), Probe(size, probe.errors.at[i].set(e))
+        return jnp.sqrt(jnp.mean(share * share)), size
 
     def of_both(self, t: Array, both: Array, args: RateArguments) -> Array:
         """The rates of motion and tangent, (2, n). As one state, they need no more operations of the solver."""
@@ -310,17 +370,6 @@ class Probing(NamedTuple):
             for name, d in self.args.signals.items()
         }
         return dataclasses.replace(self.args, signals=signals)
-
-
-def as_integers(errors: Array) -> Array:
-    """The bits of recorded errors as integers. In reverse mode, a loop would add a cotangent of the size of an array of
-    floats in every step that reads it, even if the array is constant."""
-    return jax.lax.bitcast_convert_type(errors, jnp.int32)
-
-
-def read_errors(errors: Array, i: Array, dtype: DTypeLike) -> Array:
-    """The error in the step i, from recorded errors as integers."""
-    return jax.lax.bitcast_convert_type(errors[i], jnp.float32).astype(dtype)
 
 
 def generic(like: Array, n: int) -> Array:
