@@ -206,7 +206,7 @@ class ContactProblem(eqx.Module):
         G, mask = self.G.reshape(c * rows, c * rows), active.reshape(-1)
         # For the active rows:  G W z = v+ - v-
         A = jnp.where(mask[:, None] & mask[None], G @ W, 0.0)
-        b = jnp.where(mask, target.reshape(-1), 0.0)
+        b, z = jnp.where(mask, target.reshape(-1), 0.0), jnp.where(mask, start, 0.0)
         if inverse is None:
             fixed = jax.lax.stop_gradient(A)
             inverse = invert(fixed)
@@ -214,9 +214,17 @@ class ContactProblem(eqx.Module):
                 limits = self.slip.static * (W @ (inverse @ jax.lax.stop_gradient(b))).reshape(c, rows)[:, 0]
                 scales = jnp.where(self.is_impact, 1.0, force_scales(limits, sticks, rows))
                 inverse = scales[:, None] * invert(fixed * scales[None])
-        z = jnp.where(mask, start, 0.0)
+            drift = jnp.zeros_like(z)
+        else:
+            # If the solution is not unique, z - start = A^T y is the smallest one, and the null space of A has a
+            # derivative, too. The value of `drift` is zero.
+            y = inverse.T @ jax.lax.stop_gradient(inverse @ (b - A @ z))
+            y = y + inverse.T @ (inverse @ (b - A @ (z + A.T @ y)))
+            drift = A.T @ y
+            drift = jnp.where(self.is_impact, drift - inverse @ (jax.lax.stop_gradient(A) @ drift), 0.0)
         for _ in range(3):  # the last two are the derivative of A z = b; the inverse is not differentiated
             z = z + inverse @ (b - A @ z)
+        z = z + drift
         L = W @ z
         v, size = self.v.reshape(-1) + G @ L, jnp.abs(self.v.reshape(-1)) + jnp.abs(G) @ jnp.abs(L)
         L, v, size = (x.reshape(c, rows) for x in (L, v, size))
@@ -278,7 +286,7 @@ def _tried(problem: ContactProblem, states: Array, signs: Array) -> Choice:
     return Choice(states, signs, start, found.inverse, problem.is_admissible(states, signs, found))
 
 
-_SWEEPS, _ATTEMPTS, _NEWTON_STEPS = 15, 4, 30
+_SWEEPS, _ATTEMPTS, _NEWTON_STEPS, _TURNS = 15, 4, 30, 8
 
 
 def _searched(problem: ContactProblem) -> Choice:
@@ -338,8 +346,20 @@ def _searched(problem: ContactProblem) -> Choice:
         states = jnp.where(sticks, STICKS, jnp.where(pushes, SLIDES, OPEN)).astype(dtype)
         ways = jnp.where(is_known, _angles(problem.slip.directions), _angles(-z[:, 1:]))
         start = share * unit * scales * L
-        found = problem.solved(states, ways, start)
-        return Choice(states, ways, start, found.inverse, problem.is_admissible(states, ways, found))
+
+        def along(ways: Array) -> tuple[Choice, Array]:
+            """The choice for these angles, and the angles of its velocities."""
+            found = problem.solved(states, ways, start)
+            moves = jnp.linalg.norm(found.velocities[:, 1:], axis=1) > eps**0.5 * jnp.max(found.size, axis=1)
+            after = jnp.where(moves & ~is_known, _angles(found.velocities[:, 1:]), ways)
+            return Choice(states, ways, start, found.inverse, problem.is_admissible(states, ways, found)), after
+
+        # If the impulses are not unique, the smallest ones turn the slip. They are preferred to those at which Newton
+        # ends, since they have a derivative.
+        def goes_on(carry: tuple[Array, tuple[Choice, Array]]) -> Array:
+            return (carry[0] < _TURNS) & (share == 0) & ~carry[1][0].is_admissible
+
+        return jax.lax.while_loop(goes_on, lambda x: (x[0] + 1, along(x[1][1])), (jnp.array(0), along(ways)))[1][0]
 
     def attempt(carry: tuple[Array, Array, Array, Choice]) -> tuple[Array, Array, Array, Choice]:
         k, L, friction, _ = carry
