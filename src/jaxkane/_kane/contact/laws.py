@@ -214,17 +214,15 @@ class ContactProblem(eqx.Module):
                 limits = self.slip.static * (W @ (inverse @ jax.lax.stop_gradient(b))).reshape(c, rows)[:, 0]
                 scales = jnp.where(self.is_impact, 1.0, force_scales(limits, sticks, rows))
                 inverse = scales[:, None] * invert(fixed * scales[None])
-            drift = jnp.zeros_like(z)
         else:
-            # If the solution is not unique, z - start = A^T y is the smallest one, and the null space of A has a
-            # derivative, too. The value of `drift` is zero.
+            # If the solution is not unique, z - start = A^T y is the smallest one. Its part in the null space of A is
+            # zero, but its derivative is not.
             y = inverse.T @ jax.lax.stop_gradient(inverse @ (b - A @ z))
             y = y + inverse.T @ (inverse @ (b - A @ (z + A.T @ y)))
-            drift = A.T @ y
-            drift = jnp.where(self.is_impact, drift - inverse @ (jax.lax.stop_gradient(A) @ drift), 0.0)
+            null = A.T @ y
+            z = z + jnp.where(self.is_impact, null - inverse @ (A @ null), 0.0)
         for _ in range(3):  # the last two are the derivative of A z = b; the inverse is not differentiated
             z = z + inverse @ (b - A @ z)
-        z = z + drift
         L = W @ z
         v, size = self.v.reshape(-1) + G @ L, jnp.abs(self.v.reshape(-1)) + jnp.abs(G) @ jnp.abs(L)
         L, v, size = (x.reshape(c, rows) for x in (L, v, size))
