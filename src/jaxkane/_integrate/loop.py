@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import diffrax
 import equinox.internal as eqxi
@@ -179,11 +179,11 @@ def fast_loop(
         if not getattr(solver, "always_succeeds", False):
             failed = result != diffrax.RESULTS.successful
             y1, error = jax.tree.map(lambda x: jnp.where(failed, jnp.inf, x), (y1, error))
-        i, event, reach = c.steps[0], None, None
+        i, probe, event, reach = c.steps[0], c.probe, c.t0, c.t0  # the last two only for jumps
         if replay is None:
-            size = error_of_tangent = None
-            if probing is not None and c.probe is not None:
-                error_of_tangent, size = probing.step(c.probe, y1, error)
+            size = error_of_tangent = cast(Any, None)
+            if probing is not None and probe is not None:
+                error_of_tangent, size = probing.step(probe, y1, error)
             keep, t0, t1, jumped, state, ended = controller.adapt_step_size(
                 c.t0, c.t1, motion_of(c.y), motion_of(y1), args, None if error is None else motion_of(error), order,
                 c.controller_state, error_of_tangent,
@@ -192,15 +192,13 @@ def fast_loop(
             if jumps is not None:
                 now = ControllerState.unpacked(state[0], n_events)
                 event, reach = now.jump, now.reach
-            probe = c.probe
             if probe is not None:
-                jump = None if event is None or reach is None else (c.n_jumps, event, reach)
                 probe = probe._replace(size=jnp.where(keep, size, probe.size))
-                probe = probe.recorded(c.t1, keep, ~running if event is None else ~running | (event >= 0), jump)
+                probe = probe.recorded(c.t1, keep, ~running, None if jumps is None else (c.n_jumps, event, reach))
         else:
             _, keep, jumped = next_step(i, c.t0)
             t0 = jnp.where(keep, c.t1, c.t0)
-            t1, state, running, probe = next_step(i + 1, t0)[0], None, i + 1 < replay.count, None
+            t1, state, running = next_step(i + 1, t0)[0], None, i + 1 < replay.count
             if jumps is not None:
                 event, reach = replay.jump_of(i, c.n_jumps, c.t1)
 
@@ -215,7 +213,7 @@ def fast_loop(
         following = Carry(
             t0, t1, y_next, rates_next, solver_state, state, None, running, None, None, None, c.jumps, c.n_jumps, None
         )  # fmt: skip
-        if jumps is not None and event is not None:
+        if jumps is not None:
             # The loop runs once if a jump is due. In a batch it runs if a jump is due in any member: a condition would
             # be evaluated in every step.
             jump_at, most = jumps

@@ -260,24 +260,25 @@ class Probe(NamedTuple):
     count: Array
     jumps: Array
 
-    def recorded(self, t1: Array, keep: Array, stays: Array, jump: tuple[Array, Array, Array] | None) -> Probe:
-        """The same with a step that ends at t1, if it is accepted (`keep`) or recorded nevertheless (`stays`).
+    def recorded(self, t1: Array, keep: Array, ends: Array, jump: tuple[Array, Array, Array] | None) -> Probe:
+        """The same with a step that ends at t1, if it is accepted (`keep`) or the simulation `ends` here.
 
         `jump`: the number of the next jump, its event, or -1 if none is due, and its reach."""
         i, jumps = self.count, self.jumps
         if jump is not None:
             k, event, reach = jump
+            ends |= event >= 0
             row = jnp.stack([i.astype(reach.dtype), event, reach])
             jumps = jumps.at[jnp.where(event >= 0, k, len(jumps))].set(row, mode="drop")
-        ends = self.ends.at[i].set(jnp.where(keep, t1, -t1))
-        return self._replace(ends=ends, count=i + (keep | stays).astype(i.dtype), jumps=jumps)
+        times = self.ends.at[i].set(jnp.where(keep, t1, -t1))
+        return self._replace(ends=times, count=i + (keep | ends).astype(i.dtype), jumps=jumps)
 
 
 class Replay(NamedTuple):
     """The recorded steps of a loop with a probe.
 
-    - `ends`, `count`, `jumps`: see `Probe`. Floats are stored as integers: in reverse mode, a loop would add a cotangent
-      of the size of an array of floats in each step that reads it, even if the array is constant.
+    - `ends`, `count`, `jumps`: see `Probe`. Floats are stored as integers: in reverse mode, a loop would add a
+      cotangent of the size of an array of floats in each step that reads it, even if the array is constant.
     - `after` (k, n): the packed states after the jumps, None if no event changes the state.
     - `state`, `taken`, `accepted`: the results of that loop, see `Steps`.
     """
@@ -312,7 +313,7 @@ class Replay(NamedTuple):
     def jump_of(self, i: Array, k: Array, like: Array) -> tuple[Array, Array]:
         """The event of the jump k, -1 if it does not occur in step i, and its reach [s]."""
         step, event, reach = jax.lax.bitcast_convert_type(self.jumps[jnp.minimum(k, len(self.jumps) - 1)], like.dtype)
-        return jnp.where((step == i) & (k < len(self.jumps)), event, -1.0), reach
+        return jnp.where((step == i.astype(step.dtype)) & (k < len(self.jumps)), event, -1.0), reach
 
 
 class Probing(NamedTuple):
