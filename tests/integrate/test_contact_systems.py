@@ -366,6 +366,36 @@ def test_slip_begins_with_zero_acceleration(tolerance, atol):
     assert int(ride.stats["steps"]) < 1000  # there were 600 000, and an error of 3e-6, with the direction v / |v|
 
 
+class SlipperyBox(Box):
+    friction: jk.Scalar = jk.parameter(0.4)
+
+    def contacts(self, t, q, u, motion):
+        law = {"friction": self.friction, "restitution": 0.2}
+        return {f"{i}": jk.Contact(motion[f"{i}"], motion.N.z, **law) for i in range(self.corners)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("corners", "friction", "q", "u"),
+    [
+        (1, 0.42, [0.5, 0.12, -0.25, 0.2], [0.4, -0.3, 0.1, 0.8, -1.1, 0.6]),
+        (4, 0.57, [0.35, 0.21, 0.13, -0.08], [-0.2, 0.5, 0.1, 0.7, 0.9, -0.4]),
+    ],
+)
+def test_derivatives_of_a_box_that_lands_and_slides(corners, friction, q, u):
+    """By the friction, against central differences. The four corners have more contact forces than equations."""
+
+    def end(friction, rtol):
+        box, start = SlipperyBox(corners=corners, friction=friction), jk.State([0.0, 0.0, *q], u)
+        ride = jk.simulate(box, start, jnp.linspace(0.0, 1.0, 3), rtol=rtol, atol=rtol, max_jumps=300)
+        return ride.q[-1], ride.ok
+
+    slope, ok = jax.jit(jax.jacfwd(lambda x: end(x, 1e-9), has_aux=True))(friction)
+    accurate, h = jax.jit(lambda x: end(x, 1e-11)[0]), 1e-5
+    assert ok
+    np.testing.assert_allclose(slope, (accurate(friction + h) - accurate(friction - h)) / (2 * h), rtol=0, atol=1e-6)
+
+
 class Billiard(jk.System):
     """A ball of 1 kg on a table. Its attitude is not a coordinate."""
 
