@@ -65,8 +65,8 @@ if _typing.TYPE_CHECKING:  # the same names as below, for type checkers and the 
     from ._kane.constraint_residuals import best_dependent_speeds as best_dependent_speeds
     from ._kane.contact.declarations import Contact as Contact
     from ._kane.contact.declarations import DryFriction as DryFriction
+    from ._kane.contact.impact import impact as impact
     from ._kane.contact.impulses import Impact as Impact
-    from ._kane.contact.impulses import impact as impact
     from ._kane.multipliers import with_multipliers as with_multipliers
     from ._scalarjit.cache_key import forget as forget
     from ._scalarjit.components import Scalar as Scalar
@@ -104,7 +104,8 @@ _NAMES = {
     "_kane.consistent_state": "assemble",
     "_kane.constraint_residuals": "best_dependent_speeds",
     "_kane.contact.declarations": "Contact DryFriction",
-    "_kane.contact.impulses": "Impact impact",
+    "_kane.contact.impact": "impact",
+    "_kane.contact.impulses": "Impact",
     "_kane.multipliers": "with_multipliers",
     "_scalarjit.cache_key": "forget",
     "_scalarjit.components": "Scalar",

@@ -485,6 +485,22 @@ def test_a_contact_that_closes_at_the_start_has_an_impact(kind):
     laws_of(ride, values)
     np.testing.assert_allclose(ride.jumps.t[0], 0.0, atol=1e-14)
     assert float(ride.jumps.impulses[0, 0]) > 0
+    p = [{**ROD, "static": values.get("friction", 0.0), **values}.get(name, 0.0) for name in NAMES]
+    alone = jk.impact(RoundRod(*p[:12]), 0.0, p[12:15], p[15:])
+    np.testing.assert_allclose(alone.u, ride.jumps.after.u[0], atol=1e-14)
+    np.testing.assert_allclose(alone.impulses, ride.jumps.impulses[0], atol=1e-14)
+    np.testing.assert_allclose(alone.energy_lost, ride.jumps.energy[0], atol=1e-13)
+    assert alone.unique
+
+
+@pytest.mark.parametrize(
+    ("h", "restitution", "message"),
+    [(0.2, 0.5, "no contact touches"), (0.05, 0.5, "contacts penetrate: table"), (0.1, 1.5, "not in its range")],
+)
+def test_an_impact_of_contacts_that_is_impossible(h, restitution, message):
+    ball = RoundRod(restitution, 0.0, 0.0, 0.0, 0.1, 0.0, 1.0, 0.004, 10.0, 0.0, 0.0, 0.0)
+    with pytest.raises(ValueError, match=message):
+        jk.impact(ball, 0.0, {"h": h}, {"vy": -1.0})
 
 
 def test_derivatives_after_an_impact_at_the_start():

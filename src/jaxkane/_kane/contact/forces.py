@@ -525,6 +525,12 @@ def _active_rows(layout: ContactLayout, memory: ContactMemory) -> Array:
     return jnp.concatenate([normal[:, None], tangential], axis=1)
 
 
+def are_independent(layout: ContactLayout, terms: ContactTerms, memory: ContactMemory) -> Array:
+    """Whether the velocities that closed contacts fix are linearly independent."""
+    mask = _active_rows(layout, memory).reshape(-1)
+    return jnp.all(RowBasis.of(jnp.where(mask[:, None], terms.B, 0.0)).is_new | ~mask)
+
+
 def projected_speeds(layout: ContactLayout, terms: ContactTerms, memory: ContactMemory, u: Array) -> Array:
     """The nearest speeds (n,), in the metric of M, for which closed contacts do not move."""
     if not layout.names:

@@ -34,10 +34,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..._common.lookup import checked, not_there, refuse_if
-from ..._scalarjit.cache_key import jit
 from ..._scalarjit.components import (
     Component,
-    Numbers,
     Rows,
     add,
     as_vector,
@@ -53,13 +51,11 @@ from ..._scalarjit.components import (
     sub,
     total,
 )
-from ..._scalarjit.nan import nan_where
 from ..._scalarjit.scalar_function import ScalarFunction
 from ..._system.kinematics import Frame, Point
 from ..._system.motion import flatten_residuals
 from ..._system.parameters import module_text
-from ..._system.system import NamedVector, System
-from ..api import checked_arrays, finite_or_explained
+from ..._system.system import System
 from ..arguments import Coordinates, InputArrays, Row, Speeds, Time, as_row, check_number, has_multipliers, is_concrete
 from ..kanes_method import KaneEquations, mass_matrix_columns
 from ..multipliers import AuxiliarySpeeds
@@ -485,98 +481,3 @@ def _inverse_root(M: Rows, sizes: Sequence[Component] | None) -> tuple[Rows, Row
         return X, []
     Z = [[jnp.where(regular[i], 0.0, x) for i, x in enumerate(row)] for row in X]
     return [[jnp.where(regular[i], x, 0.0) for i, x in enumerate(row)] for row in X], Z
-
-
-class _OfFunction(eqx.Module):
-    function: Callable[..., Any]
-    restitution: Any
-    release: tuple[str, ...] = eqx.field(static=True)
-
-    def __call__(self, system: System, t: Component, q: Row, u: Row) -> Impact:
-        motion = system.motion(t, q, u)
-        q_named = NamedVector(q, system.coordinates)
-        u_named = NamedVector(u, (*system.speeds, *system.dependent_speeds))
-        residuals = self.function(t, q_named, u_named, motion)
-        residuals = residuals if isinstance(residuals, (tuple, list)) else (residuals,)
-        return Impact(*residuals, restitution=self.restitution, release=self.release)
-
-
-_compiled = jit(impact_at)
-
-
-def impact(
-    system: System,
-    t: Component,
-    q: Numbers,
-    u: Numbers,
-    residuals: Callable[..., Any],
-    restitution: Coefficients = 0.0,
-    release: str | Sequence[str] = (),
-) -> ImpactResult:
-    """The speeds after an impact, by Kane's impulse equations. See `Impact` for the equations.
-
-        def toe(t, q, u, motion):
-            v = motion["toe"].velocity
-            return v.dot(motion.N.x), v.dot(motion.N.y)
-
-        after = jk.impact(walker, 0.0, q, u, toe, release=("foot",))
-
-    **Arguments:**
-
-    - `system`: a `System`.
-    - `t`: time [s].
-    - `q`: coordinates (n_q,), or a dict by name.
-    - `u`: independent speeds (n,) before the impact, or a dict by name.
-    - `residuals`: a function (t, q, u, motion) -> the velocity residuals [m/s or rad/s]: a number, a Vector, or a tuple
-        of these. They are affine in the speeds. `u` also contains the dependent speeds.
-    - `restitution`: one coefficient for all residuals, or one for each residual.
-    - `release`: names of points and frames whose constraints transmit no impulse.
-
-    **Returns:** an `ImpactResult`. If arguments are traced, it is NaN where an exception would be raised.
-
-    **Raises:** `ValueError` if the residuals contradict each other, if a residual does not depend on the speeds or is
-    not affine in them, and if the mass matrix is singular.
-    """
-    what = "impact(system, t, q, u, residuals): pass a function (t, q, u, motion) -> velocity residuals"
-    checked(residuals, Callable, what)
-    arrays = checked_arrays(system, t, q, u)
-    coefficients = jax.tree.map(lambda e: jnp.asarray(e, arrays[2].dtype), checked_restitution(restitution))
-    if jax.tree_util.all_leaves([residuals]):  # a method of a Module is a tree, and its arrays are arguments
-        residuals = jax.tree_util.Partial(residuals)
-    read = _OfFunction(residuals, coefficients, checked_release(release))
-    solution = (impact_at if is_written_out(len(system.speeds)) else _compiled)(*arrays, read)
-    result = solution.result
-    values = result.u, result.impulses, result.energy_lost
-    if not is_concrete(values):
-        is_solved = jnp.isfinite(result.energy_lost)
-        u, impulses, energy_lost = nan_where(~is_solved, values, (arrays, coefficients))
-        return ImpactResult(u, impulses, energy_lost, result.unique)
-    _explain(solution, arrays)
-    return result
-
-
-def _explain(solution: ImpactSolution, arrays: tuple[System, Array, Array, Array, InputArrays]) -> None:
-    if np.isfinite(solution.result.energy_lost):
-        return
-    name, C, is_affine = type(arrays[0]).__name__, np.asarray(solution.C), np.asarray(solution.is_affine)
-    for i in range(len(C)):
-        if not is_affine[i]:
-            raise ValueError(f"{name}: the velocity residual {i} of the impact is not affine in the speeds.")
-        if not C[i].any():
-            raise ValueError(
-                f"{name}: the velocity residual {i} of the impact is not zero and does not depend on the speeds, so no "
-                "impulse can change it. Pass a velocity, such as motion['P'].velocity.dot(motion.N.y)."
-            )
-    refuse_if(
-        not solution.is_determined,
-        f"{name}: a released part can move without moving a mass, and a residual of the impact depends on this "
-        "motion, so the speeds after the impact are undetermined. Give the bodies an inertia, or do not release "
-        "the part.",
-    )
-    finite_or_explained(solution.result, arrays)
-    refuse_if(
-        not solution.is_consistent,
-        f"{name}: the velocity residuals of the impact contradict each other. There are {len(C)} residuals, and no "
-        "speeds after the impact satisfy all of them. Omit the dependent residuals, or give them the same "
-        "coefficient of restitution.",
-    )

@@ -29,6 +29,7 @@ from .forces import (
     ContactLayout,
     ContactMemory,
     ContactTerms,
+    are_independent,
     event_functions,
     event_sizes,
     forces_in_contact,
@@ -147,6 +148,31 @@ def changed_contacts(
     hit, found = jax.lax.fori_loop(jnp.where(event.is_start, 1, 0), 2, stage, (none, none))
     after, second, third = _given_impact(layout, given, hit)
     return _changed(layout, y, after, state, first, second, third, found)
+
+
+def impact_of_contacts(system: System, t: Array, state: State) -> tuple[Any, ...]:
+    """The impact of all contacts that touch at a state without contact states, by the contact laws.
+
+    **Returns:** the speeds (n,), impulses (c r,), lost energy and whether the impulses are unique; whether each contact
+    touches, and whether it penetrates (c,); whether the coefficients are in their ranges, and whether there is a
+    solution."""
+    layout = layout_of(system)
+    gaps, sizes = gap_sizes(system, t, state.q, state.u)
+    tolerance, none = gap_tolerances(sizes), jnp.zeros_like(t)
+    touches = (jnp.abs(gaps) <= tolerance) & ~jnp.asarray(layout.is_bearing)
+    memory = jnp.zeros(layout.memory_size, gaps.dtype)
+    state = State(state.q, state.u, contacts=memory)
+    terms = terms_at(system, t, state.q, state.u, dict.fromkeys(system.inputs, none))
+    event = ContactEvent.of_start(touches)._replace(is_start=jnp.array(False))
+    first: _Impact = _impact(layout, terms, state, event, jnp.zeros_like(gaps), none, none)
+    found: _AfterImpact = _after_impact(layout, first, first.problem.choice())
+    p = found.impulses.reshape(-1)
+    # The power of the impulses is that of the mean speeds, also on a surface that moves.
+    energy = -0.5 * p @ (terms.C @ (state.u + found.u))
+    states = jnp.where(found.is_impact & touches, found.states, 0.0)
+    is_unique = are_independent(layout, terms, ContactMemory.unpacked(layout, memory)._replace(states=states))
+    result = found.u, p, energy, is_unique
+    return result, touches, gaps < -tolerance, found.is_lawful, found.is_determined
 
 
 class _Given(NamedTuple):
