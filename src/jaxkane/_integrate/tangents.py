@@ -10,8 +10,8 @@ tangents obey the same equation. Therefore one tangent with a generic direction 
     y_dot = f(t, y, args),   d_dot = df/dy d + df/dargs args_dot
 
 This tangent is called the probe. A first loop integrates motion and probe with error control, and records the ends of
-its steps and its jumps. The loop that is differentiated takes the recorded steps. It makes no decisions of its own, so
-a rounding error cannot change them.
+its steps and its jumps. The loop that is differentiated takes the recorded steps. It decides nothing about steps, so
+rounding errors cannot change them.
 """
 
 from __future__ import annotations
@@ -249,10 +249,11 @@ class Probe(NamedTuple):
     """What a loop with a probe carries and records.
 
     - `size` (2, n): the largest sizes so far of motion and tangent, by component.
-    - `ends` (m,): the ends of the steps [s]; negative if the step is not accepted, but a jump occurs at its start, or
-      the simulation ends there. All other rejected steps are omitted.
-    - `count`: the number of ends.
-    - `jumps` (k, 3): for each jump the number of its step, its event, and its reach [s].
+    - `ends` (m,): the ends of the steps [s]. They are negative for a rejected step at whose start a jump or the end of
+      the simulation occurs. Other rejected steps are omitted.
+    - `count`: the number of recorded steps; the ends of those after m are lost.
+    - `jumps` (k, 3): for each jump the index of its step in `ends`, its event, and the distance to the event within
+      which the step ends [s]. Unused rows are -1.
     """
 
     size: Array
@@ -277,8 +278,8 @@ class Probe(NamedTuple):
 class Replay(NamedTuple):
     """The recorded steps of a loop with a probe.
 
-    - `ends`, `count`, `jumps`: see `Probe`. Floats are stored as integers: in reverse mode, a loop would add a
-      cotangent of the size of an array of floats in each step that reads it, even if the array is constant.
+    - `ends`, `count`, `jumps`: see `Probe`. Their bits are stored as integers: otherwise each step in reverse mode
+      would add a cotangent of the size of the array, even if the array is constant.
     - `after` (k, n): the packed states after the jumps, None if no event changes the state.
     - `state`, `taken`, `accepted`: the results of that loop, see `Steps`.
     """
@@ -300,8 +301,8 @@ class Replay(NamedTuple):
     def end(self, i: Array, t0: Array, duration: Array, stop: Array | None) -> tuple[Array, Array, Array]:
         """The end of step i, which begins at t0; whether it is accepted; and whether it ends at a discontinuity.
 
-        `stop`: the next discontinuity, or None. An end at `stop` or at `duration` has its derivative. After the last
-        step the result is t0."""
+        `stop`: the next discontinuity, or None. An end at `stop` or `duration` has the derivative of this time.
+        After the last step, the end is t0."""
         recorded = jax.lax.bitcast_convert_type(self.ends[i], t0.dtype)
         t1, at_stop = jnp.abs(recorded), jnp.zeros_like(recorded, bool)
         t1 = jnp.where(t1 == duration, duration, t1)

@@ -446,14 +446,14 @@ class ContactMemory(NamedTuple):
 def slip_directions(layout: ContactLayout, terms: ContactTerms, memory: ContactMemory) -> Array:
     """Directions (c, d) of the slip in the tangents, opposite to the friction.
 
-    In space it is the direction of the velocity v. It continues beyond a zero of the velocity along a line, so that a
-    step over this zero is smooth. If the slip began from rest in the direction e, it is that of
+    In a plane it is a sign. In space it is the direction of s v, where v is the velocity, e the direction at the start
+    and s the sign of v . e: a step over a zero of v is smooth. If the slip began from rest, it is the direction of
 
-        v + slow (1 - v^2 / slow^2)^2 e    while |v| < slow
+        s v + slow (1 - v^2 / slow^2)^2 e    while |v| < slow [m/s]
 
-    This tends to e, where the direction of v consists of errors. That direction also changes at the rate a / |v|, where
-    a is the acceleration by friction. If the slip begins without an acceleration, as for static = kinetic friction, it
-    needed 600 000 steps for tolerances of 1e-10, and the error was 3e-6 m/s.
+    For small v this tends to e. The direction of v alone is then an error, and turns at the rate a / |v|, where a is
+    the acceleration by friction. With it, a slip that began without an acceleration (static = kinetic friction) took
+    600 000 steps for tolerances of 1e-10, and its error was 3e-6 m/s.
     """
     start = memory.starts(layout, terms.tangents)
     if layout.d < 2:

@@ -80,15 +80,17 @@ def impact(
     - `restitution`: one coefficient for all residuals, or one for each residual.
     - `release`: names of points and frames whose constraints transmit no impulse.
 
-    **Returns:** an `ImpactResult`. If arguments are traced, it is NaN where an exception would be raised. The impulses
-    of contacts are in the order of `ride.jumps.impulses`; those of contacts that do not touch are zero.
+    **Returns:** an `ImpactResult`. If arguments are traced, errors that depend on values give NaN instead of an
+    exception. Contacts are in alphabetical order, and the normal impulse of each precedes its friction impulses. The
+    impulses of contacts that do not touch are zero.
 
     **Raises:** `ValueError` if the residuals contradict each other, if a residual does not depend on the speeds or is
     not affine in them, and if the mass matrix is singular. Without `residuals`: if the system has no contacts, if a
-    contact penetrates, if none touches, and if the contact laws have no solution.
+    contact penetrates, if none touches, if a coefficient is out of its range, and if the contact laws have no solution.
     """
     if residuals is None:
-        return _impact_of_contacts(system, t, q, u, (restitution, release))
+        has_more = not (isinstance(restitution, int | float) and restitution == 0.0) or len(release) > 0
+        return _impact_of_contacts(system, t, q, u, has_more)
     what = "impact(system, t, q, u, residuals): pass a function (t, q, u, motion) -> velocity residuals"
     checked(residuals, Callable, what)
     arrays = checked_arrays(system, t, q, u)
@@ -134,7 +136,7 @@ def _explain(solution: ImpactSolution, arrays: tuple[System, Array, Array, Array
     )
 
 
-def _impact_of_contacts(system: System, t: Component, q: Numbers, u: Numbers, others: tuple[Any, Any]) -> ImpactResult:
+def _impact_of_contacts(system: System, t: Component, q: Numbers, u: Numbers, has_more: bool) -> ImpactResult:
     arrays = checked_arrays(system, t, q, u)
     name = type(system).__name__
     refuse_if(
@@ -142,8 +144,8 @@ def _impact_of_contacts(system: System, t: Component, q: Numbers, u: Numbers, ot
         f"{name} has no contacts. Pass a function (t, q, u, motion) -> velocity residuals, or define System.contacts.",
     )
     refuse_if(
-        others != (0.0, ()),
-        f"{name}: restitution and release belong to residuals. The coefficients of contacts are those of `contacts`.",
+        has_more,
+        f"{name}: restitution and release need residuals. Contacts have the coefficients that `contacts` returns.",
     )
     result, touches, penetrates, is_lawful, is_determined = _compiled_of_contacts(*arrays[:4])
     values, reasons = result[:3], (touches, penetrates, is_lawful, is_determined)
@@ -163,7 +165,7 @@ def _impact_of_contacts(system: System, t: Component, q: Numbers, u: Numbers, ot
             not is_lawful,
             f"{name}: a coefficient of a contact is not in its range: 0 <= restitution <= 1, 0 <= friction <= static.",
         )
-        refuse_if(not is_determined, f"{name}: the contact laws have no solution at this impact.")
+        refuse_if(not is_determined, f"{name}: the contact laws have no solution here. Use a smaller friction.")
     u_after, impulses, energy_lost = nan_where(~possible, values, (arrays,))
     return ImpactResult(u_after, impulses, energy_lost, result[3])
 
