@@ -26,6 +26,7 @@ from .._kane.contact.states_after_jump import (
     changed_contacts,
     contact_event_values,
     gaps_at_start,
+    without_penetration,
 )
 from .._kane.kanes_method import KaneEquations
 from .._kane.right_hand_side import outputs_at, outputs_in_contact, rates_are_native, values_of, vector_field
@@ -179,7 +180,7 @@ def _solved(
     touches = None
     if (layout := layout_of(system)).names and state.contacts is None:
         memory = jnp.zeros(layout.memory_size, state.q.dtype)
-        state = State(state.q, state.u, state.x, memory)
+        state = without_penetration(system, origin, State(state.q, state.u, state.x, memory))
         touches, is_apart = gaps_at_start(system, origin, state)
         others_are_valid &= is_apart
     if layout.names and jnp.ndim(settings.atol):

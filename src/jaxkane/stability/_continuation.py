@@ -112,14 +112,22 @@ class SolutionCurve:
         return ahead / np.linalg.norm(ahead)
 
     def follow(
-        self, place: int, sign: float, step: float, max_step: float | None, steps: int
+        self,
+        place: int,
+        sign: float,
+        step: float,
+        max_step: float | None,
+        steps: int,
+        ahead: np.ndarray | None = None,
     ) -> tuple[Any, list[float], str]:
         """Follow the curve from its start. `sign`: whether the unknown at `place` increases or decreases at first.
+        `ahead`: the tangent there, if more than one curve passes through the start.
 
         **Returns:** unknowns z (m, n), arclengths (m,), and why the curve ends.
         """
         y, arc, h, reason = self.first, [0.0], step, ""
-        points, tangent, max_step = [y], self.tangent(y, None), 4 * step if max_step is None else max_step
+        points, max_step = [y], 4 * step if max_step is None else max_step
+        tangent = self.tangent(y, None) if ahead is None else ahead
         tangent = tangent * float(np.sign(sign * tangent[place]) or 1.0)
         while len(points) <= steps and h >= 1e-4 * step:
             attempt = self.correct(y + h * tangent, tangent)

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Bool, Complex, Float
 
-from .._common.lookup import not_there, refuse_unknown
+from .._common.lookup import not_there, refuse_if, refuse_unknown
 from .._integrate.trajectory import refuse_other_system
 from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Component
@@ -113,6 +113,7 @@ def family(
     step: float = 0.05,
     max_step: float | None = None,
     steps: int = 500,
+    switch: str | None = None,
 ) -> Family | OrbitFamily:
     """The family of steady motions or periodic orbits through one of them, by pseudo-arclength continuation.
 
@@ -137,6 +138,8 @@ def family(
     - `max_step`: the largest step of arclength; four times `step` by default. Two bifurcations of the same kind within
         one step are not detected.
     - `steps`: the largest number of steps.
+    - `switch`: "doubling" follows the orbits with twice the period, which begin at a period doubling. `start` is then
+        the orbit there, `family.bifurcations[i].orbit`, and `towards` the side on which these orbits exist.
 
     Steady motions: angles are in rad; speeds and inputs are relative to their values at the start. Lengths and unknowns
     that are zero at the start are scaled by the change that balances the terms of an equation. Orbits: all unknowns are
@@ -146,10 +149,12 @@ def family(
     one to `steady_turn` or `periodic` for that. An `OrbitFamily` contains folds, branch points, period doublings and
     Neimark-Sacker points.
 
-    **Raises:** `ValueError` if no curve, or more than one, passes through the start.
+    **Raises:** `ValueError` if no curve, or more than one, passes through the start, or if no period doubling is there.
     """
     label, until = f"family({type(system).__name__})", dict(until or {})
+    refuse_unknown([switch] if switch else [], ["doubling"], f"{label}: `switch` cannot be", "it can be")
     if isinstance(start, SteadyMotion):
+        refuse_if(switch is not None, f"{label}: `switch` needs an Orbit as `start`, with a multiplier of -1.")
         refuse_other_system(label, system, start)
         steady = SteadyCurve(system, start, tuple(hold), tuple(find), until)
         return steady.family(*steady.follow(steady.place(towards), sum(towards.values()), step, max_step, steps))
@@ -161,22 +166,37 @@ def family(
             "`find`: the family uses the `hold` of `periodic`."
         )
     ((name, sign),) = towards.items()
-    curve = _OrbitCurve(*_released(label, system, start, name), start.unknowns, until, label)
-    equations, parameter, args = curve.orbit, curve.parameter, curve.args
+    equations, parameter, args = _released(label, system, start, name)
+    z = start.unknowns
+    if switch:
+        refuse_if(
+            not parameter or np.min(np.abs(np.asarray(start.multipliers) + 1.0), initial=np.inf) > 1e-4,
+            f"{label}: `start` has no multiplier of -1, or `towards` names no parameter. Pass the orbit of a period "
+            "doubling, `family.bifurcations[i].orbit`.",
+        )
+        equations, args, z = _with_twice_the_period(label, equations, args, z)
+    curve = _OrbitCurve(equations, parameter, args, z, until, label)
     if parameter and not equations.autonomous:
-        z, other = start.unknowns, _with_value(args, parameter, 1.01 * _value(args, parameter) + 1e-4)
+        other = _with_value(args, parameter, 1.01 * _value(args, parameter) + 1e-4)
         if not repeats(*other[:3], other.start, equations.period(z, other), equations.skipped(z, other)):
             raise ValueError(f"{label}: {name!r} changes the period of the force. Pass a function as its `period`.")
     if np.max(np.abs(curve.evaluate(curve.first)[0])) > 1e-6:
         raise ValueError(f"{label}: `start` is not an orbit of this system. Pass its own system, `start.system`.")
     curve.move_phase(curve.first)
-    zs, arc, reason = curve.follow(curve.places[name], sign, step, max_step, steps)
+    ahead = curve.across() if switch else None
+    zs, arc, reason = curve.follow(curve.places[name], sign, step, max_step, steps, ahead)
+    refuse_if(
+        switch is not None and len(zs) > 1 and sign * (zs[1, -1] - zs[0, -1]) < 0,
+        f"{label}: the orbits with twice the period exist on the other side. Reverse the sign in `towards`.",
+    )
     rows = [curve.member(z / curve.scale) for z in zs]
     values, period, states, multipliers = map(jnp.asarray, map(np.array, zip(*rows, strict=True)))
-    first = dataclasses.replace(start, equations=equations, arguments=args, system=system)
+    first = dataclasses.replace(start, equations=equations, arguments=args, system=system, unknowns=z)
     special = tuple(
         Bifurcation(kind, curve.member(y)[0], _orbit_at(equations, parameter, jnp.asarray(y * curve.scale), args))
         for kind, y in curve.found
+        # Where the family begins, two curves meet: any sign there is a rounding error.
+        if not switch or np.linalg.norm(y - curve.first) > 1e-3 * step
     )
     arc, zs = jnp.asarray(arc), jnp.asarray(zs)
     return OrbitFamily(values, period, states, multipliers, arc, zs, first, special, parameter, reason)
@@ -206,6 +226,20 @@ def _released(label: str, system: System, start: Orbit, name: str) -> tuple[Orbi
     kept = np.array([k for k, i in enumerate(equations.hold) if i != released], int)
     equations = dataclasses.replace(equations, hold=tuple(i for i in equations.hold if i != released))
     return equations, "", args._replace(targets=args.targets[kept])
+
+
+def _with_twice_the_period(
+    label: str, equations: OrbitEquations, args: OrbitArguments, z: Array
+) -> tuple[OrbitEquations, OrbitArguments, Array]:
+    """The same orbit, run through twice."""
+    refuse_if(equations.jumps and equations.segments > 1, f"{label}: `switch` needs an orbit with one segment.")
+    states, T, own = equations.states(z, args), equations.period(z, args), equations.period_of
+    many = {"returns" if equations.jumps else "segments": 2 * (equations.returns if equations.jumps else len(states))}
+    states = states if equations.jumps else jnp.concatenate([states, states + args.advance])
+    period_of = None if own is None else lambda system: 2.0 * own(system)
+    equations = dataclasses.replace(equations, **many, period_of=period_of)
+    args = args._replace(period=2.0 * args.period, advance=2.0 * args.advance, skipped=0.5 * args.skipped)
+    return equations, args, equations.unknowns(states, 2.0 * T)
 
 
 class _OrbitCurve(SolutionCurve):
@@ -282,6 +316,12 @@ class _OrbitCurve(SolutionCurve):
             found["Neimark-Sacker"] = float(np.real(np.prod(pairs))) if pairs else 1.0
             found["branch point"] = np.linalg.det(M - np.eye(len(M)))
         return found
+
+    def across(self) -> np.ndarray:
+        """The tangent of the second curve at a period doubling, along which the parameter does not change at first."""
+        one, other = np.linalg.svd(self.evaluate(self.first)[1])[2][-2:]
+        tangent = one * other[-1] - other * one[-1]
+        return tangent / np.linalg.norm(tangent)
 
     def accepts(self, y: np.ndarray, tangent: np.ndarray, z: np.ndarray, new: np.ndarray, met: int | None) -> bool:
         new = new if met is None else self.tangent(z, tangent)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from jaxtyping import Array
 
@@ -17,7 +19,7 @@ from ..constraint_residuals import configuration_residual
 from ..description import at_random_point
 from ..kanes_method import KaneEquations
 from ..scaling import nearest_root
-from .forces import ContactLayout, ContactRows, gap_sizes, gap_tolerances, has_contacts, layout_of
+from .forces import PENETRATION, ContactLayout, ContactRows, gap_sizes, gap_tolerances, has_contacts, layout_of
 
 
 @ScalarFunction
@@ -58,12 +60,15 @@ def check_contacts(system: System, t: Component, q: Numbers, *, may_penetrate: b
         if may_penetrate or given[2] is None or not is_concrete(given):
             return
         gaps, sizes = gap_sizes.numpy(system, t, q, np.zeros(len(system.speeds), q.dtype))
-    for name, gap, tolerance in zip(layout.names, gaps, gap_tolerances(sizes), strict=True):
+    for name, gap, tolerance, size in zip(layout.names, gaps, gap_tolerances(sizes), sizes, strict=True):
+        text = f"{type(system).__name__}.contacts: the gap of {name!r} is {gap:.6g} at the start."
         refuse_if(
-            gap < -tolerance,
-            f"{type(system).__name__}.contacts: the gap of {name!r} is {gap:.6g} at the start. It must not be "
-            f"negative. Find touching coordinates with jaxkane.assemble(system, q, touching=({name!r},)).",
+            gap < -PENETRATION * size,
+            f"{text} It must not be negative. Find touching coordinates with "
+            f"jaxkane.assemble(system, q, touching=({name!r},)).",
         )
+        if gap < -tolerance:
+            warnings.warn(f"{text} The simulation starts from the nearest coordinates with a gap of zero.", stacklevel=2)
 
 
 def _touching(system: System, t: np.ndarray, q: np.ndarray, i: int) -> np.ndarray:

@@ -584,6 +584,11 @@ def gap_sizes(system: System, t: Component, q: Array, u: Array) -> tuple[Array, 
     return gaps(system, t, q, u), term_sizes(gaps, system, t, q, u)
 
 
+PENETRATION = 3e-4
+"""The largest penetration at the start that is removed, as a share of the size of the terms of the gap: published
+starts have three or four digits."""
+
+
 def gap_tolerances(sizes: Array) -> Array:
     """The largest gaps (c,) that are rounding errors, for gaps whose terms have these sizes (c,)."""
     return float(jnp.finfo(sizes.dtype).eps) ** 0.6 * sizes

@@ -26,6 +26,7 @@ from ..._system.system import State, System, packed, unpacked
 from ..arguments import InputValues
 from ..right_hand_side import values_of, vector_field
 from .forces import (
+    PENETRATION,
     ContactLayout,
     ContactMemory,
     ContactTerms,
@@ -68,6 +69,21 @@ class ContactEvent(NamedTuple):
     def of_start(cls, touches: Array) -> ContactEvent:
         no = jnp.zeros_like(touches)
         return cls(touches, no, no, no, jnp.array(False), jnp.array(True))
+
+
+def without_penetration(system: System, t: Array, state: State) -> State:
+    """The nearest state without gaps that are slightly negative (see `PENETRATION`), in the metric of M."""
+    # The displacement is a constant, so that the derivatives by a start that touches are the same with and without it.
+    system, t, q, u = constant((system, t, state.q, state.u))
+    none = dict.fromkeys(system.inputs, jnp.zeros_like(t))
+    gaps, sizes = gap_sizes(system, t, q, u)
+    is_slight = (gaps < -gap_tolerances(sizes)) & (gaps >= -PENETRATION * sizes)
+
+    def step(_: Any, q: Array) -> Array:
+        return without_gaps(terms_at(system, t, q, u, none), is_slight, q)
+
+    moved = jax.lax.fori_loop(0, 3, step, q) - q
+    return State(state.q + moved, state.u, state.x, state.contacts)
 
 
 def gaps_at_start(system: System, t: Array, state: State) -> tuple[Array, Array]:
