@@ -493,6 +493,18 @@ def test_a_contact_that_closes_at_the_start_has_an_impact(kind):
     assert alone.unique
 
 
+def test_a_start_that_penetrates_slightly_is_moved_out():
+    at = [{**ROD, "radius": 0.1, "inertia": 0.004, "vy": -1.0}.get(name, 0.0) for name in NAMES]
+    system, q, u = RoundRod(*at[:12]), jnp.array(at[12:15]), jnp.array(at[15:])
+    ts, h = np.linspace(0.0, 0.3, 7), system.coordinates.index("h")
+    touching = jk.simulate(system, jk.State(q.at[h].set(0.1), u), ts)
+    with pytest.warns(UserWarning, match="gap of 'table' is -1e-06 at the start"):
+        moved = jk.simulate(system, jk.State(q.at[h].set(0.1 - 1e-6), u), ts)
+    np.testing.assert_allclose(moved.q, touching.q, rtol=0, atol=1e-13)
+    with pytest.raises(ValueError, match=r"gap of 'table' is -0\.001 at the start\. It must not"):
+        jk.simulate(system, jk.State(q.at[h].set(0.099), u), ts)
+
+
 @pytest.mark.parametrize(
     ("h", "restitution", "message"),
     [(0.2, 0.5, "no contact touches"), (0.05, 0.5, "contacts penetrate: table"), (0.1, 1.5, "not in its range")],

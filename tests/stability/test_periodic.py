@@ -422,6 +422,61 @@ def test_the_compass_gait_and_its_period_doubling_are_found():
     np.testing.assert_allclose(doubling.orbit.multipliers, expected, rtol=1e-8)
 
 
+@pytest.mark.weekly
+def test_gaits_of_two_and_four_steps_begin_at_period_doublings():
+    """Goswami, Thuilot and Espiau (1998), *A study of the passive gait of a compass-like biped robot*: near 4.4 and
+    4.9 degrees."""
+    orbit, angles = (
+        periodic(CompassGait(slope=0.0765), jk.State([-0.241, 0.38, 0.0], [1.16, 0.2]), section="heel_strike"),
+        [],
+    )
+    switch: dict = {}
+    for n, end in ((1, 0.0768), (2, 0.086), (4, 0.0865)):
+        gaits = family(orbit.system, orbit, towards={"slope": 1}, until={"slope": end}, **switch)
+        assert np.all(gaits.stable[2:-1] if n > 1 else gaits.stable[:1])
+        np.testing.assert_allclose(gaits.period[-1], 0.75 * n, rtol=0.02)
+        if n < 4:
+            (doubling,) = gaits.bifurcations
+            angles.append(float(np.rad2deg(doubling.value)))
+            orbit, switch = doubling.orbit, {"switch": "doubling"}
+    np.testing.assert_allclose(angles, [4.39090, 4.91406], atol=1e-4)
+    walk = jk.simulate(
+        gaits.orbit(-1).system, gaits.orbit(-1).state, jnp.linspace(0.0, 3.05, 3), rtol=1e-12, atol=1e-12
+    )
+    after, start = walk.jumps.after, gaits.orbit(-1).state
+    assert int(walk.jumps.count) == 4
+    np.testing.assert_allclose([*after.q[3, :2], *after.u[3]], [*start.q[:2], *start.u], rtol=1e-7)
+    assert np.abs(after.q[1, :2] - start.q[:2]).max() > 1e-3
+
+
+class Escape(Particle):
+    """x'' + 0.1 x' + x - x^2 = F sin(0.85 t)."""
+
+    amplitude: Scalar = parameter(0.1)
+
+    def force(self, t, x, v):
+        return self.amplitude * jnp.sin(0.85 * t) - x + x**2 - 0.1 * v
+
+
+@pytest.mark.slow
+def test_forced_orbits_with_twice_the_period():
+    T = 2 * np.pi / 0.85
+    orbit = periodic(Escape(), jk.State([0.05], [-0.49]), period=T, autonomous=False)
+    options = {"towards": {"amplitude": 1}, "until": {"amplitude": 0.102}}
+    (doubling,) = family(Escape(), orbit, **options).bifurcations
+    assert doubling.kind == "period doubling"
+    branch = family(doubling.orbit.system, doubling.orbit, **options, switch="doubling")
+    double = branch.orbit(-1)
+    ride = jk.simulate(double.system, double.state, np.array([0.0, T, 2 * T]), rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(double.period, 2 * T, rtol=1e-12)
+    np.testing.assert_allclose(ride["x"][2], ride["x"][0], atol=1e-8)
+    assert abs(ride["x"][1] - ride["x"][0]) > 0.1
+    with pytest.raises(ValueError, match="exist on the other side"):
+        family(doubling.orbit.system, doubling.orbit, towards={"amplitude": -1}, steps=2, switch="doubling")
+    with pytest.raises(ValueError, match="has no multiplier of -1"):
+        family(Escape(), orbit, towards={"amplitude": 1}, switch="doubling")
+
+
 def gait_of_two_steps(slope):
     guess = jk.State([-0.241, 0.398, 0.0], [1.166, 0.114])
     return periodic(CompassGait(slope=slope), guess, section="heel_strike", returns=2, period=1.5)

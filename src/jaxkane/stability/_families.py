@@ -235,7 +235,7 @@ def _with_twice_the_period(
     refuse_if(equations.jumps and equations.segments > 1, f"{label}: `switch` needs an orbit with one segment.")
     states, T, own = equations.states(z, args), equations.period(z, args), equations.period_of
     many = {"returns" if equations.jumps else "segments": 2 * (equations.returns if equations.jumps else len(states))}
-    states = states if equations.jumps else jnp.concatenate([states, states + args.advance])
+    states = states if equations.jumps else jnp.concatenate([states, states + args.advance[None]])
     period_of = None if own is None else lambda system: 2.0 * own(system)
     equations = dataclasses.replace(equations, **many, period_of=period_of)
     args = args._replace(period=2.0 * args.period, advance=2.0 * args.advance, skipped=0.5 * args.skipped)

@@ -68,7 +68,9 @@ def check_contacts(system: System, t: Component, q: Numbers, *, may_penetrate: b
             f"jaxkane.assemble(system, q, touching=({name!r},)).",
         )
         if gap < -tolerance:
-            warnings.warn(f"{text} The simulation starts from the nearest coordinates with a gap of zero.", stacklevel=2)
+            warnings.warn(
+                f"{text} The simulation starts from the nearest coordinates with a gap of zero.", stacklevel=2
+            )
 
 
 def _touching(system: System, t: np.ndarray, q: np.ndarray, i: int) -> np.ndarray:
