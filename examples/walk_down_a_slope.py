@@ -56,8 +56,10 @@ def main(out: Path) -> None:
     left.plot(np.rad2deg(ride["swing"]), ride["swing_rate"], label="swing leg")
     left.set(xlabel="angle [deg]", ylabel="rate [rad/s]", title=f"one step, {float(gait.period):.4f} s")
     left.legend()
-    slopes = np.rad2deg(np.asarray(family["slope"]))
-    right.plot(slopes, np.abs(np.asarray(family.multipliers)), ".-", color="C0")
+    slopes = np.append(np.rad2deg(np.asarray(family["slope"])), at)
+    sizes = np.abs(np.vstack([family.multipliers, doubling.orbit.multipliers]))
+    order = np.argsort(slopes)  # with the period doubling itself, where the largest size is 1
+    right.plot(slopes[order], sizes[order], ".-", color="C0")
     right.axhline(1.0, color="0.5", linewidth=0.8)
     right.axvline(at, color="C3", linestyle="--", label=f"period doubling at {at:.3f} deg")
     right.set(xlabel="slope [deg]", ylabel="size of the multipliers")

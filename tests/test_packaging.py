@@ -119,3 +119,18 @@ def test_the_docs_extra_contains_the_packages_that_the_build_needs():
     for package in ("ruff", "mkdocs>", "mkdocs-material", "mkdocstrings[python]", "nbconvert", "latex2mathml"):
         assert package in extra
     assert "jaxkane[notebooks,control,symbolic,casadi]" in extra
+
+
+def test_headings_of_the_contributing_page_that_other_files_name_exist():
+    headings = re.findall(r"^## (.+)$", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"), re.MULTILINE)
+    for name in ("pyproject.toml", "CITATION.cff"):
+        named = re.findall(r'CONTRIBUTING\.md, "([^"]+)"', (ROOT / name).read_text(encoding="utf-8"))
+        assert named and set(named) <= set(headings), name
+
+
+def test_pages_state_the_number_of_systems_in_the_catalogue():
+    numbers = {5: "five", 6: "six", 7: "seven", 8: "eight"}
+    with_contacts = sum(type(entry.example()).contacts is not jk.System.contacts for entry in jk.catalog.CATALOG.values())
+    for page in ("README.md", "CHANGELOG.md", "docs/catalogue.md"):
+        text = " ".join((ROOT / page).read_text(encoding="utf-8").split())
+        assert re.search(rf"{numbers[with_contacts]} systems with \[?contacts", text), page
