@@ -128,6 +128,16 @@ def test_headings_of_the_contributing_page_that_other_files_name_exist():
         assert named and set(named) <= set(headings), name
 
 
+def test_the_tables_of_extras_are_the_same_and_complete():
+    tables = []
+    for page in ("README.md", "docs/installation.md"):
+        rows = (ROOT / page).read_text(encoding="utf-8").partition("| extra |")[2].partition("\n\n")[0].splitlines()[2:]
+        tables.append(rows)
+        named = {name for row in rows for name in re.findall(r"`([a-z]+)`", row.split("|")[1])}
+        assert named == set(PROJECT["optional-dependencies"]), page
+    assert tables[0] == tables[1]
+
+
 def test_pages_state_the_number_of_systems_in_the_catalogue():
     numbers = {5: "five", 6: "six", 7: "seven", 8: "eight"}
     with_contacts = sum(type(entry.example()).contacts is not jk.System.contacts for entry in jk.catalog.CATALOG.values())

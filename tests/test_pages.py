@@ -164,3 +164,22 @@ def test_code_lines_fit_the_page_width():
         for block in re.findall(r"```(?:python|py)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
             wide = [line for line in block.splitlines() if len(line) > 80]
             assert not wide, f"{page.name}: {wide[0]}"
+
+
+SEARCHED = {
+    "LCP": "contact#Equations", "complementarity": "contact#Equations", "Coulomb": "contact#Equations",
+    "Newton's cradle": "contact#Newton's cradle", "compliant contact": "contact#Rigid or compliant",
+    "trajectory optimization": "optimal_control#Optimal control", "warm start": "optimal_control#Guesses",
+    "sparse": "optimal_control#Solvers", "debugging NaN": "numerics#NaN", "float32": "numerics#Floating-point",
+    "tutorial": "index#Getting started", "getting started": "index#Getting started", "memory": "caching#When programs",
+    "muscles": "sensors#First-order states",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("word", SEARCHED)
+def test_search_words_lead_to_their_section(word):
+    """The site's search reads headings and text by section."""
+    page, _, heading = SEARCHED[word].partition("#")
+    text = re.sub(r"```.*?```", "", (DOCS / f"{page}.md").read_text(encoding="utf-8"), flags=re.DOTALL)
+    section = re.search(rf"^#+ {heading}.*?(?=^#|\Z)", text, re.MULTILINE | re.DOTALL)[0]
+    assert word.lower() in " ".join(section.split()).lower()

@@ -37,7 +37,8 @@ class Contact:
     - `friction`: the coefficient mu of kinetic friction. An impact has Coulomb friction with the impulses of the whole
         impact (Moreau).
     - `static`: the coefficient of static friction. By default, that of kinetic friction.
-    - `surface`: a Point of the surface, if the surface moves. Its velocity is subtracted.
+    - `surface`: a Point of the surface, if the surface moves. Its velocity is subtracted. If it is a point of a body of
+        the system, the reaction acts on this body, at this point.
 
     **Raises:** `TypeError` and `ValueError` for arguments of a wrong type or outside their range.
     """
