@@ -328,7 +328,8 @@ def trial_folds(
                 f"`folds`: all trials have the same {folds}, {trials[0].labels[folds]!r}, so none can be left out. Use "
                 "another label."
             )
-        return list(by_label.values()), f"each {folds}: {', '.join(str(label) for label in by_label)}"
+        labels = (x if isinstance(x, str) else f"{x:g}" for x in by_label)
+        return list(by_label.values()), f"each {folds}: {', '.join(labels)}"
     number = (T if T <= 10 else 5) if folds is None else folds
     groups = [range(k, T, number) for k in range(number)] if isinstance(number, int) else number
     groups = [[int(k) for k in group] for group in groups]
