@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import re
+import runpy
 import subprocess
 import sys
 import tomllib
@@ -141,6 +142,21 @@ def test_headings_of_the_contributing_page_that_other_files_name_exist():
         named = re.findall(r'CONTRIBUTING\.md, "([^"]+)"', (ROOT / name).read_text(encoding="utf-8"))
         assert named, name
         assert set(named) <= set(headings), name
+
+
+def test_all_files_name_the_same_owner():
+    """`.ci/owner NAME` sets it."""
+    names = runpy.run_path(str(ROOT / ".ci/owner"))
+    assert len(set().union(*map(names["owners"], names["FILES"]))) == 1
+    assert all(names["owners"](path) for path in names["FILES"])
+
+
+def test_the_paper_has_the_sections_of_the_journal_and_its_references():
+    text, references = ((ROOT / "paper" / name).read_text(encoding="utf-8") for name in ("paper.md", "paper.bib"))
+    headings = re.findall(r"^# (.+)$", text, re.MULTILINE)
+    needed = {"Statement of need", "State of the field", "Research impact statement", "AI usage disclosure"}
+    assert needed <= set(headings)
+    assert set(re.findall(r"@([a-z]+\d{4}\w*)", text)) == set(re.findall(r"^@\w+\{(\w+),", references, re.MULTILINE))
 
 
 def test_the_tables_of_extras_are_the_same_and_complete():
