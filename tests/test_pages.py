@@ -20,7 +20,7 @@ from jaxkane.bicycles import PathFollower
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
-WITHOUT_CODE = ("architecture", "bicycles_fit", "first_change", "glossary")
+WITHOUT_CODE = ("architecture", "bicycles_fit", "first_change", "glossary", "other_libraries")
 AFTER_FIT = ("multiple_shooting", "process_noise", "uncertainty", "model_extensions")  # their code goes on from fit.md
 RUN = [page for page in PAGES if page.stem not in ("constraints", *WITHOUT_CODE)]  # constraints: test_documentation.py
 
