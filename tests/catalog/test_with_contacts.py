@@ -11,7 +11,8 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 
 @pytest.mark.weekly
-def test_a_rocking_block_agrees_with_housners_article():
+@pytest.mark.published
+def test_a_rocking_block_agrees_with_housners_article(published):
     """From rest at 0.25 rad. The ratio of the rates at a landing is 1 - 3/2 sin^2 alpha = 0.85."""
     times = [0.6402887800202485, 1.338581180728541, 1.8563203472495828]
     start = jk.assemble(RockingBlock(), {"angle": 0.25}, touching=("left",))
@@ -19,7 +20,9 @@ def test_a_rocking_block_agrees_with_housners_article():
     jumps = ride.jumps
     assert int(jumps.count) == 3
     np.testing.assert_allclose(jumps.t[:3], times, rtol=1e-11)
-    np.testing.assert_allclose(jumps.after.u[:3, 2], 0.85 * np.array(jumps.before.u[:3, 2]), rtol=1e-11)
+    ratios = jumps.after.u[:3, 2] / jumps.before.u[:3, 2]
+    quantity = "rates of a rocking block after a landing, relative to those before"
+    published("Housner (1963)", quantity, [0.85] * 3, ratios, 1e-11)
     np.testing.assert_allclose(jumps.impulses[0], [0.0, 0.0, 0.39402725362360147, jumps.impulses[0, 3]], atol=1e-11)
     end = [0.6066692039354292, 0.03521304161358452, 0.25908375349019, -0.07633795052670474, -0.4270593460316235]
     found = [ride[name][-1] for name in ("y", "angle", "x_dot", "y_dot", "rate")]
@@ -112,13 +115,16 @@ def test_a_wheel_rolls_over_the_edge():
 
 
 @pytest.mark.weekly
-def test_the_woodpecker_toy_has_the_published_period():
-    """The period of Leine et al. (2003) is 0.146 s. The sleeve jams in each period, so one multiplier is not zero."""
+@pytest.mark.published
+def test_the_woodpecker_toy_has_the_published_period(published):
+    """The sleeve jams in each period, so one multiplier is not zero."""
     jammed = jk.assemble(Woodpecker(), {"bird": -0.2788}, {"bird_rate": -7.4583, "climb": -0.3411}, touching=("lower",))
     ride = jk.simulate(Woodpecker(), jammed, jnp.linspace(0.0, 0.6, 601), rtol=1e-10, atol=1e-12)
     flies = np.max([ride.contacts[name] for name in ride.contact_names], axis=0) == 0
     i = np.flatnonzero(flies)[-10]
     orbit = jk.stability.periodic(Woodpecker(), jk.State(ride.q[i], ride.u[i]), period=0.146)
+    source = "Leine, Van Campen and Glocker (2003)"
+    published(source, "period of the woodpecker toy [s]", 0.146, orbit.period, 5e-4)
     np.testing.assert_allclose(orbit.period, 0.1459760651, rtol=1e-9)
     np.testing.assert_allclose(orbit.multipliers, [-0.839155653, 0.0, 0.0, 0.0], atol=1e-8)
     # In the simulation, the deviation of the period from its limit changes by the multiplier in each hop.
