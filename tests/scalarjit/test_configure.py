@@ -55,6 +55,8 @@ print(len(hits), len(misses), ride.q.dtype, np.asarray(ride.q).tobytes().hex(), 
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory):
+    if not hasattr(os, "fork"):
+        pytest.skip("Windows has no fork")
     files = [tmp_path_factory.mktemp("streams") / name for name in ("stdout", "stderr")]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
     with subprocess.Popen([sys.executable, "-c", FORKS], env=CLEAN, **pipes) as forks:
