@@ -133,7 +133,7 @@ def test_the_docs_extra_contains_the_packages_that_the_build_needs():
     extra = " ".join(PROJECT["optional-dependencies"]["docs"])
     for package in ("ruff", "mkdocs>", "mkdocs-material", "mkdocstrings[python]", "nbconvert", "latex2mathml"):
         assert package in extra
-    assert "jaxkane[notebooks,control,symbolic,casadi]" in extra
+    assert "jaxkane[notebooks,control,symbolic,casadi,collocation]" in extra
 
 
 def test_headings_of_the_contributing_page_that_other_files_name_exist():

@@ -12,6 +12,8 @@ from mechanisms import RodOnPin, Sled
 import jaxkane as jk
 from jaxkane.collocation import Problem, solve
 
+pytest.importorskip("casadi")
+
 ENDS = {"start": {"x": 0.0, "v": 0.0}, "end": {"x": 1.0, "v": 0.0}}
 
 

@@ -13,6 +13,8 @@ import jaxkane as jk
 from jaxkane.collocation import Phases, Problem, solve
 from jaxkane.stability import periodic
 
+pytest.importorskip("casadi")
+
 REST = {"x": 0.0, "v": 0.0}
 REST_TO_REST = {"start": REST, "end": {"x": 1.0, "v": 0.0}}
 

@@ -14,6 +14,8 @@ import jaxkane as jk
 from jaxkane.collocation import Phases, Problem, continuation, solve
 from jaxkane.fit.inverse.kinematics import kinematic_samples
 
+pytest.importorskip("casadi")
+
 mpl.use("Agg")
 ENDS = {"start": {"x": 0.0, "v": 0.0}, "end": {"x": 1.0, "v": 0.0}}
 SLED = Sled(drag=0.5)

@@ -11,6 +11,7 @@ import scipy.linalg
 from systems import Cart
 
 import jaxkane as jk
+from jaxkane._collocate.program import NonlinearProgram
 from jaxkane.fit import Collocation, Delay, Free, Gain, JointPrior, Offset, Trial, fit
 
 pytest.importorskip("casadi")
@@ -172,17 +173,16 @@ def test_undetermined_parameters_have_no_interval():
     assert found.status in ("undetermined", "failed")
 
 
-def test_interrupted_fit_keeps_its_iterate():
-    class Interrupting:
-        def __call__(self, program, z, monitor, **arguments):
-            def show(iteration, cost, violation):
-                if iteration == 1:
-                    os.kill(os.getpid(), signal.SIGINT)
+def test_interrupted_fit_keeps_its_iterate(monkeypatch):
+    gradient, count = NonlinearProgram.gradient, itertools.count()
 
-            monitor.show = show
-            return jk.collocation.Ipopt()(program, z, monitor, **arguments)
+    def interrupted(program, z):
+        if next(count) == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return gradient(program, z)
 
-    found = by_collocation(record(9), solver=Interrupting())
+    monkeypatch.setattr(NonlinearProgram, "gradient", interrupted)
+    found = by_collocation(record(9))
     assert found.status == "interrupted"
     assert not found.ok
     assert np.isfinite([*found.estimates.values()]).all()

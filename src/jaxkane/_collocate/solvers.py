@@ -1,8 +1,6 @@
-"""Solvers of nonlinear programs: IPOPT from the wheel of CasADi, and SciPy's trust-region method.
+"""The solver of nonlinear programs: IPOPT from the wheel of CasADi.
 
-CasADi has wheels for all platforms. `TrustConstr` needs no other package, but takes many more iterations.
-
-A solver stops where the gradient of the Lagrangian is zero. It is also zero at a maximum or a saddle point. At a
+IPOPT stops where the gradient of the Lagrangian is zero. It is also zero at a maximum or a saddle point. At a
 minimum, the Hessian H of the Lagrangian has no negative curvature along directions d with J d = 0 (J. Nocedal, S.
 Wright, Numerical Optimization, 2006, section 12.5). Here J contains the active constraints, and variables at their
 bounds are fixed. The least curvature is computed by the method of Lanczos, which only needs products with H and
@@ -13,18 +11,16 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib.util
+import importlib
 import signal
 import sys
 import threading
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import FrameType, ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 import scipy.sparse
 import scipy.sparse.csgraph
 
@@ -113,33 +109,6 @@ INTERRUPTED = "interrupted"
 NOT_FINITE = "a function or a derivative is not finite"
 
 
-class Solver(Protocol):
-    """A solver of nonlinear programs."""
-
-    def __call__(
-        self,
-        program: NonlinearProgram,
-        z: np.ndarray,
-        monitor: Monitor,
-        *,
-        is_warm: bool = False,
-        max_iterations: int = 500,
-        options: Mapping[str, Any] | None = None,
-    ) -> Solution:
-        """Solve a program.
-
-        **Arguments:**
-
-        - `program`: the nonlinear program.
-        - `z` (n,): the initial guess of the scaled variables.
-        - `monitor`: to be called with each iterate.
-        - `is_warm`: whether the guess is close to the solution.
-        - `max_iterations`: the largest number of iterations.
-        - `options`: further options by the solver's own names.
-        """
-        ...
-
-
 _IPOPT_STATUS = {
     "Solve_Succeeded": (True, "solved"),
     "Solved_To_Acceptable_Level": (True, "solved to a lower accuracy"),
@@ -173,75 +142,89 @@ def _ipopt_options(max_iterations: int, is_warm: bool, options: Mapping[str, Any
     return chosen | dict(options or {})
 
 
-@dataclasses.dataclass(frozen=True)
-class Ipopt:
-    """IPOPT with MUMPS, from the wheel of CasADi: `pip install jaxkane[collocation]`."""
+def casadi() -> ModuleType:
+    """CasADi, whose wheels contain IPOPT with the linear solver MUMPS.
 
-    def __call__(
-        self,
-        program: NonlinearProgram,
-        z: np.ndarray,
-        monitor: Monitor,
-        *,
-        is_warm: bool = False,
-        max_iterations: int = 500,
-        options: Mapping[str, Any] | None = None,
-    ) -> Solution:
-        import casadi as ca
+    **Raises:** `ImportError` if it is not installed.
+    """
+    try:
+        return importlib.import_module("casadi")
+    except ImportError as error:
+        raise ImportError('Collocation needs IPOPT, from CasADi: pip install "jaxkane[collocation]".') from error
 
-        n, m = program.n, program.m
-        x_type, g_type, number, none = (ca.Sparsity.dense(k, 1) for k in (n, m, 1, 0))
-        rows, columns = program.hessian_structure
-        order = np.lexsort((columns, rows))  # CasADi has the upper triangle
 
-        def sparsity(k: int, rows: np.ndarray, columns: np.ndarray) -> Any:
-            return ca.Sparsity.triplet(k, n, rows.tolist(), columns.tolist())
+def minimized(
+    program: NonlinearProgram,
+    z: np.ndarray,
+    *,
+    progress: bool = False,
+    is_warm: bool = False,
+    max_iterations: int = 500,
+    options: Mapping[str, Any] | None = None,
+) -> Solution:
+    """Solve a program by IPOPT.
 
-        def second(
-            x: np.ndarray, p: np.ndarray, factor: np.ndarray | None, multipliers: np.ndarray | None
-        ) -> list[Any]:
-            # CasADi passes None for zeros.
-            weight = 0.0 if factor is None else float(factor[0])
-            return [program.hessian(x, np.zeros(m) if multipliers is None else multipliers, weight)[order]]
+    **Arguments:**
 
-        f, df, g, dg = program.objective, program.gradient, program.constraints, program.jacobian
-        given, jacobian, hessian = [x_type, none], sparsity(m, *program.jacobian_structure), sparsity(n, columns, rows)
-        of_iterate = [{"x": x_type, "lam_x": x_type, "g": g_type, "lam_g": g_type, "f": number}.get(name, none)
-                      for name in map(ca.nlpsol_out, range(ca.nlpsol_n_out()))]  # fmt: skip
-        functions = [
-            _callback(ca, monitor, "functions", given, [number, g_type], lambda x, p: [f(x), g(x)]),
-            _callback(ca, monitor, "cost_gradient", given, [number, x_type], lambda x, p: [f(x), df(x)]),
-            _callback(ca, monitor, "constraint_jacobian", given, [g_type, jacobian], lambda x, p: [g(x), dg(x)]),
-            _callback(ca, monitor, "lagrangian_hessian", [*given, number, g_type], [hessian], second),
-            _callback(ca, monitor, "iteration", of_iterate, [number], lambda x, *_: [monitor(x)]),
-        ]
-        x = ca.MX.sym("x", n)
-        cost, constraints = functions[0](x, ca.MX(0, 1))
-        settings = {
-            "grad_f": functions[1],
-            "jac_g": functions[2],
-            "hess_lag": functions[3],
-            "iteration_callback": functions[4],
-            "print_time": False,
-            "no_nlp_grad": True,  # CasADi would differentiate the callback
-            "show_eval_warnings": False,
-            "ipopt": _ipopt_options(max_iterations, is_warm, options),
-        }
-        try:
-            solve = ca.nlpsol("solve", "ipopt", {"x": x, "f": cost, "g": constraints}, settings)
-        except RuntimeError as error:
-            raise ValueError(f"solve: IPOPT refuses the `options` {dict(options or {})}: {error}") from None
-        start = {"x0": z, "lbx": program.lower, "ubx": program.upper, "lbg": program.g_lower, "ubg": program.g_upper}
-        with monitor.interruptible():
-            result = solve(**start)
-        if monitor.error is not None:
-            raise monitor.error
-        found, lam_g, lam_x = (np.array(result[k], float).ravel() for k in ("x", "lam_g", "lam_x"))
-        if monitor.is_interrupted:
-            return monitor.interrupted(found, lam_g, lam_x)
-        stats = solve.stats()
-        ok, status = _IPOPT_STATUS.get(stats["return_status"], (False, stats["return_status"].replace("_", " ")))
-        return Solution(found, lam_g, lam_x, ok, status, int(stats["iter_count"]))
+    - `program`: the nonlinear program.
+    - `z` (n,): the initial guess of the scaled variables.
+    - `progress`: whether to show one line of progress.
+    - `is_warm`: whether the guess is close to the solution.
+    - `max_iterations`: the largest number of iterations.
+    - `options`: further options by IPOPT's own names.
+    """
+    ca, monitor = casadi(), Monitor(program, show_progress if progress else None)
+    n, m = program.n, program.m
+    x_type, g_type, number, none = (ca.Sparsity.dense(k, 1) for k in (n, m, 1, 0))
+    rows, columns = program.hessian_structure
+    order = np.lexsort((columns, rows))  # CasADi has the upper triangle
+
+    def sparsity(k: int, rows: np.ndarray, columns: np.ndarray) -> Any:
+        return ca.Sparsity.triplet(k, n, rows.tolist(), columns.tolist())
+
+    def second(x: np.ndarray, p: np.ndarray, factor: np.ndarray | None, multipliers: np.ndarray | None) -> list[Any]:
+        # CasADi passes None for zeros.
+        weight = 0.0 if factor is None else float(factor[0])
+        return [program.hessian(x, np.zeros(m) if multipliers is None else multipliers, weight)[order]]
+
+    f, df, g, dg = program.objective, program.gradient, program.constraints, program.jacobian
+    given, jacobian, hessian = [x_type, none], sparsity(m, *program.jacobian_structure), sparsity(n, columns, rows)
+    of_iterate = [{"x": x_type, "lam_x": x_type, "g": g_type, "lam_g": g_type, "f": number}.get(name, none)
+                  for name in map(ca.nlpsol_out, range(ca.nlpsol_n_out()))]  # fmt: skip
+    functions = [
+        _callback(ca, monitor, "functions", given, [number, g_type], lambda x, p: [f(x), g(x)]),
+        _callback(ca, monitor, "cost_gradient", given, [number, x_type], lambda x, p: [f(x), df(x)]),
+        _callback(ca, monitor, "constraint_jacobian", given, [g_type, jacobian], lambda x, p: [g(x), dg(x)]),
+        _callback(ca, monitor, "lagrangian_hessian", [*given, number, g_type], [hessian], second),
+        _callback(ca, monitor, "iteration", of_iterate, [number], lambda x, *_: [monitor(x)]),
+    ]
+    x = ca.MX.sym("x", n)
+    cost, constraints = functions[0](x, ca.MX(0, 1))
+    settings = {
+        "grad_f": functions[1],
+        "jac_g": functions[2],
+        "hess_lag": functions[3],
+        "iteration_callback": functions[4],
+        "print_time": False,
+        "no_nlp_grad": True,  # CasADi would differentiate the callback
+        "show_eval_warnings": False,
+        "ipopt": _ipopt_options(max_iterations, is_warm, options),
+    }
+    try:
+        solve = ca.nlpsol("solve", "ipopt", {"x": x, "f": cost, "g": constraints}, settings)
+    except RuntimeError as error:
+        raise ValueError(f"solve: IPOPT refuses the `options` {dict(options or {})}: {error}") from None
+    start = {"x0": z, "lbx": program.lower, "ubx": program.upper, "lbg": program.g_lower, "ubg": program.g_upper}
+    with monitor.interruptible():
+        result = solve(**start)
+    if monitor.error is not None:
+        raise monitor.error
+    found, lam_g, lam_x = (np.array(result[k], float).ravel() for k in ("x", "lam_g", "lam_x"))
+    if monitor.is_interrupted:
+        return monitor.interrupted(found, lam_g, lam_x)
+    stats = solve.stats()
+    ok, status = _IPOPT_STATUS.get(stats["return_status"], (False, stats["return_status"].replace("_", " ")))
+    return Solution(found, lam_g, lam_x, ok, status, int(stats["iter_count"]))
 
 
 def _callback(
@@ -284,97 +267,9 @@ def _callback(
     return Function()
 
 
-@dataclasses.dataclass(frozen=True)
-class TrustConstr:
-    """SciPy's `trust-constr`, an interior point method with a trust region.
-
-    It needs no other package. It takes tens of times as many iterations as IPOPT, so it suits small problems.
-    """
-
-    def __call__(
-        self,
-        program: NonlinearProgram,
-        z: np.ndarray,
-        monitor: Monitor,
-        *,
-        is_warm: bool = False,
-        max_iterations: int = 500,
-        options: Mapping[str, Any] | None = None,
-    ) -> Solution:
-        free = program.lower < program.upper  # a variable with equal bounds has no interior
-        z = np.where(free, np.clip(z, program.lower, program.upper), program.lower)
-
-        def whole(part: np.ndarray) -> np.ndarray:
-            every = z.copy()
-            every[free] = part
-            return every
-
-        def symmetric(values: np.ndarray) -> Any:
-            lower = scipy.sparse.csr_matrix((values, program.hessian_structure), (program.n, program.n))
-            return (lower + scipy.sparse.tril(lower, -1).T).tocsr()[free][:, free]
-
-        def jacobian(x: np.ndarray) -> Any:
-            values = program.jacobian(whole(x))
-            return scipy.sparse.csc_matrix((values, program.jacobian_structure), (program.m, program.n))[:, free]
-
-        none = np.zeros(program.m)
-        constraints: Any = scipy.optimize.NonlinearConstraint(
-            lambda x: program.constraints(whole(x)), program.g_lower, program.g_upper, jac=jacobian,  # type: ignore[arg-type]
-            hess=lambda x, v: symmetric(program.hessian(whole(x), v, 0.0)),
-        )  # fmt: skip
-        with monitor.interruptible():
-            result = scipy.optimize.minimize(
-                lambda x: program.objective(whole(x)),
-                z[free],
-                jac=lambda x: program.gradient(whole(x))[free],
-                hess=lambda x: symmetric(program.hessian(whole(x), none)),
-                method="trust-constr",
-                constraints=[constraints] if program.m else [],
-                bounds=list(zip(program.lower[free], program.upper[free], strict=True)),
-                callback=lambda x, _: monitor(whole(x)),
-                options={"maxiter": 10 * max_iterations, "gtol": 1e-9, "xtol": 1e-11} | dict(options or {}),
-            )
-        found = whole(result.x)
-        lam_g = np.asarray(result.v[0]) if program.m else np.zeros(0)
-        lam_x = np.zeros(program.n)
-        lam_x[free] = np.asarray(result.v[-1]) if len(result.v) > bool(program.m) else 0.0
-        if monitor.is_interrupted:
-            return monitor.interrupted(found, lam_g, lam_x)
-        feasible = program.violation(found) <= monitor.tolerance
-        ok = result.status in (1, 2) and feasible
-        words = {0: "the largest number of iterations was reached", 1: "solved", 2: "solved"}
-        status = words.get(result.status, str(result.message)) if feasible or not result.status else NOT_MET
-        return Solution(found, lam_g, lam_x, bool(ok), status, int(result.niter))
-
-
-NOT_MET = "the constraints are not met at the last iterate"
-
-
-def default_solver() -> Solver:
-    """IPOPT if CasADi is installed, else SciPy's method, with a warning once."""
-    if importlib.util.find_spec("casadi") is not None:
-        return Ipopt()
-    warnings.warn(
-        "IPOPT is not installed, so SciPy's trust-constr is used, which takes many more iterations. Run "
-        "`pip install jaxkane[collocation]`, or pass solver=jaxkane.collocation.TrustConstr().",
-        stacklevel=4,
-    )
-    return TrustConstr()
-
-
 def show_progress(iteration: int, cost: float, violation: float) -> None:
     text = f"\riteration {iteration}: cost {cost:.6g}, violation {violation:.1e}".ljust(72)
     print(text, end="", file=sys.stderr, flush=True)
-
-
-def run(solver: Solver, program: NonlinearProgram, z: np.ndarray, *, progress: bool, **arguments: Any) -> Solution:
-    """Call a solver, with one line of progress if `progress` is True."""
-    monitor = Monitor(program, show_progress if progress else None)
-    try:
-        return solver(program, z, monitor, **arguments)
-    finally:
-        if progress:
-            print(file=sys.stderr)
 
 
 NOT_A_MINIMUM = "stationary, but not a minimum: pass another guess"

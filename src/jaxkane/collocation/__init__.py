@@ -1,9 +1,6 @@
 """Optimal control by direct collocation: the least cost of a motion, its duration and the parameters of the system."""
 
 from .._collocate.functions import Now as Now
-from .._collocate.solvers import Ipopt as Ipopt
-from .._collocate.solvers import Solver as Solver
-from .._collocate.solvers import TrustConstr as TrustConstr
 from ._plan import Multipliers as Multipliers
 from ._plan import Plan as Plan
 from ._problem import Phases as Phases

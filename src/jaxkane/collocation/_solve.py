@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from .._collocate.lobatto import Lobatto, lobatto
 from .._collocate.program import NonlinearProgram
-from .._collocate.solvers import INTERRUPTED, NOT_FINITE, Solution, Solver, default_solver, refused_unless_minimum, run
+from .._collocate.solvers import INTERRUPTED, NOT_FINITE, Solution, casadi, minimized, refused_unless_minimum
 from .._collocate.transcription import Motion, Transcription, nodes_of, system_at
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
@@ -38,7 +38,6 @@ def solve(
     intervals: int = 50,
     method: str = "hermite-simpson",
     tolerance: float | None = 1e-6,
-    solver: Solver | None = None,
     options: Mapping[str, Any] | None = None,
     starts: int = 1,
     seed: int = 0,
@@ -49,7 +48,7 @@ def solve(
     """Find a motion of least cost by direct collocation.
 
     The states are polynomials in each interval of a mesh. They satisfy the equations of motion at the collocation
-    points of a Lobatto IIIA method. The solver uses exact sparse first and second derivatives.
+    points of a Lobatto IIIA method. IPOPT solves the problem with exact sparse first and second derivatives.
 
     After the solution, each interval is simulated from its own start to compute its local error. Intervals whose error
     is too large are divided. Then the problem is solved on the new mesh, from the present solution.
@@ -65,8 +64,7 @@ def solve(
     - `method`: "trapezoid" (order 2), "hermite-simpson" (order 4) or "lobatto" (order 6).
     - `tolerance`: the largest permitted local error of an interval, relative to the size of each state. None: the first
         mesh is not refined, and a plan with a local error above 1 % is not `ok`.
-    - `solver`: a `Solver`; by default `Ipopt` if CasADi is installed, else `TrustConstr`.
-    - `options`: options of the solver, by the names that the solver uses.
+    - `options`: options of IPOPT, by its own names.
     - `starts`: the number of searches. The first one starts from `guess`. For the others, random deviations are added
         to the coordinates.
     - `seed`: the seed of these deviations.
@@ -78,7 +76,9 @@ def solve(
     contains the last or best iterate.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments, and if a function is not finite at the guess.
+    `ImportError` without CasADi.
     """
+    casadi()
     phases = problem if isinstance(problem, Phases) else Phases([problem]) if isinstance(problem, Problem) else None
     if phases is None:
         raise TypeError(f"solve: the first argument must be a Problem or Phases, got {problem!r}.")
@@ -90,14 +90,9 @@ def solve(
     )
     if tolerance is not None:
         tolerance = positive_number(tolerance, "solve: `tolerance`")
-    if isinstance(solver, type) or not (solver is None or callable(solver)):
-        raise TypeError(f"solve: `solver` must be a solver, such as jaxkane.collocation.Ipopt(); got {solver!r}.")
     if not isinstance(options, Mapping | None):
-        raise TypeError(f"solve: `options` must be a dict by the names of the solver, got {options!r}.")
-    search = _Search(
-        phases, lobatto(method), tolerance, default_solver() if solver is None else solver, options, max_iterations,
-        max_intervals, progress,
-    )  # fmt: skip
+        raise TypeError(f"solve: `options` must be a dict by the names of IPOPT, got {options!r}.")
+    search = _Search(phases, lobatto(method), tolerance, options, max_iterations, max_intervals, progress)
     guesses = _guesses(problem, guess, starts, seed)
     plans = []
     for one in guesses:
@@ -220,7 +215,6 @@ class _Search:
     phases: Phases
     method: Lobatto
     tolerance: float | None
-    solver: Solver
     options: Mapping[str, Any] | None
     max_iterations: int
     max_intervals: int
@@ -302,9 +296,9 @@ class _Search:
 
     def _solved(self, transcription: Transcription, is_warm: bool) -> Solution:
         program = transcription.program
-        solution = run(
-            self.solver, program, transcription.z, progress=self.progress, is_warm=is_warm,
-            max_iterations=self.max_iterations, options=self.options,
+        solution = minimized(
+            program, transcription.z, progress=self.progress, is_warm=is_warm, max_iterations=self.max_iterations,
+            options=self.options,
         )  # fmt: skip
         return refused_unless_minimum(program, transcription.shared, solution)
 

@@ -44,10 +44,9 @@ from .._collocate.solvers import (
     INTERRUPTED,
     BandedFactors,
     Solution,
-    Solver,
-    default_solver,
+    casadi,
+    minimized,
     refused_unless_minimum,
-    run,
 )
 from .._collocate.transcription import Layout, Transcription
 from .._common.lookup import positive_number, refuse_unknown
@@ -273,7 +272,6 @@ class Collocation:
         input was recorded too, it is the sum of its record and the unknown part.
     - `within`: a dict by name of (lower, upper), for states and unknown inputs at all nodes. None means no bound.
     - `method`: "trapezoid", "hermite-simpson" or "lobatto".
-    - `solver`: a solver of `jaxkane.collocation`; by default the first one that is installed.
     - `max_iterations`: the largest number of iterations.
     """
 
@@ -281,7 +279,6 @@ class Collocation:
     unknown_inputs: Mapping[str, float] = dataclasses.field(default_factory=dict)
     within: Mapping[str, tuple[float | None, float | None]] = dataclasses.field(default_factory=dict)
     method: str = "hermite-simpson"
-    solver: Solver | None = None
     max_iterations: int = 500
 
     def __post_init__(self) -> None:
@@ -343,6 +340,7 @@ def _check_problem(problem: Problem) -> None:
 
 
 def solved(problem: Problem, how: Collocation, progress: bool) -> CollocationFit:
+    casadi()
     system, name = problem.system, type(problem.system).__name__
     refuse_unknown(how.unknown_inputs, system.inputs, f"`unknown_inputs`: {name} has no input", "it has")
     densities = {k: positive_number(v, f"`unknown_inputs` of {k!r}") for k, v in how.unknown_inputs.items()}
@@ -359,11 +357,10 @@ def solved(problem: Problem, how: Collocation, progress: bool) -> CollocationFit
     theta = np.zeros(problem.parameters.size)
     transcription = Transcription(phases, (), meshes, method, motions, theta, objectives)
     program = transcription.program
-    solver = default_solver() if how.solver is None else how.solver
     shared, local = transcription.shared_parameters, transcription.local_parameters
     if densities:  # first the motion for the initial guess of the parameters
         program = with_fixed(program, shared, transcription.z)
-    solution = run(solver, program, transcription.z, progress=progress, max_iterations=how.max_iterations)
+    solution = minimized(program, transcription.z, progress=progress, max_iterations=how.max_iterations)
     solution = refused_unless_minimum(program, transcription.shared, solution)
     if densities and solution.ok:
         point, covariance, ok = Marginal(transcription, shared, local).minimum(solution)
