@@ -127,6 +127,7 @@ def test_wrong_arguments_of_solve():
         ({"max_intervals": "a"}, "an integer"), ({"max_iterations": -1}, "an integer of at least 0"),
         ({"starts": 0}, "of at least 1"), ({"seed": "a"}, "an integer"), ({"method": "euler"}, "must be one of"),
         ({"tolerance": 0.0}, "must be positive"), ({"tolerance": "a"}, "real number"),
+        ({"max_seconds": -1.0}, "must be positive"),
         ({"options": 3}, "must be a dict"),
     ):  # fmt: skip
         with pytest.raises((ValueError, TypeError), match=message):

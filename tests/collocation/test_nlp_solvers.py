@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from mechanisms import Sled
 
+from jaxkane._collocate import solvers
 from jaxkane._collocate.program import NonlinearProgram
 from jaxkane.collocation import Problem, solve
 
@@ -70,8 +71,8 @@ def test_failure_on_a_finer_mesh_keeps_the_solution():
         Sled(stiffness=4.0), 1.0, controls=["force"], cost=lambda t, now: now["force"] ** 2,
         start={"x": 0.0, "v": 0.0}, end={"x": 1.0, "v": 0.0},
     )  # fmt: skip
-    plan = solve(problem, intervals=1, max_iterations=3)
-    assert not plan.ok
+    plan = solve(problem, intervals=1, max_iterations=1)
+    assert (plan.ok, plan.iterations) == (False, 1)  # of both meshes together
     assert plan.reason == "solved, but not on a finer mesh: the largest number of iterations was reached"
     assert (len(plan.mesh), len(plan.costs)) == (2, 1)
     assert float(plan["x"][-1]) == 1.0
@@ -98,6 +99,22 @@ def test_largest_number_of_iterations():
     again = solve(fastest(), plan, intervals=4, tolerance=None)
     assert again.ok
     assert again.duration == pytest.approx(2.0775535, abs=1e-5)
+
+
+def test_the_longest_time_keeps_the_iterate():
+    plan = solve(fastest(), intervals=4, max_seconds=1e-9, starts=2)
+    assert (plan.ok, plan.reason, plan.iterations) == (False, "the longest time was reached", 0)
+    assert len(plan.starts) == 1
+    assert np.all(np.isfinite(plan["x"]))
+
+
+def test_progress_is_shown_later_on_a_terminal_only(capsys, monkeypatch):
+    monkeypatch.setattr(solvers, "LATE", 0.0)
+    solve(fastest(), intervals=4, tolerance=None)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    solve(fastest(), intervals=4, tolerance=None)
+    assert "\riteration 3: cost " in capsys.readouterr().err
 
 
 def test_progress_is_shown_on_one_line(capsys):

@@ -188,6 +188,12 @@ def test_interrupted_fit_keeps_its_iterate(monkeypatch):
     assert np.isfinite([*found.estimates.values()]).all()
 
 
+def test_the_longest_time_of_a_fit():
+    found = by_collocation(record(9), max_seconds=1e-9)
+    assert (found.ok, found.message) == (False, "The search ended early: the longest time was reached.")
+    assert np.isfinite([*found.estimates.values()]).all()
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -198,6 +204,7 @@ def test_interrupted_fit_keeps_its_iterate(monkeypatch):
         ({"within": {"x": (1.0, 0.0)}}, "lower bound"),
         ({"intervals_per_sample": 0}, "intervals_per_sample"),
         ({"method": "euler"}, "method"),
+        ({"max_seconds": 0.0}, "max_seconds"),
         ({"free": (*NAMES, Delay("x"))}, "delay of sensor"),
         ({"free": (*NAMES, Gain("x", of="start")), "unknown": ("x_dot",)}, "does not support the .* of start x"),
         ({"free": (*NAMES, Offset("x", of="start")), "unknown": ("x_dot",)}, "does not support the .* of start x"),

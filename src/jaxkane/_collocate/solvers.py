@@ -12,9 +12,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
+import math
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import FrameType, ModuleType
 from typing import Any
@@ -36,7 +38,6 @@ class Solution:
         at an upper bound.
     - `ok`: whether the solver reports a local minimum.
     - `status`: the result in words.
-    - `iterations`: the number of iterations.
     """
 
     z: np.ndarray
@@ -44,30 +45,69 @@ class Solution:
     bound_multipliers: np.ndarray
     ok: bool
     status: str
-    iterations: int
+
+
+LATE = 5.0  # s
+
+
+class Effort:
+    """How long a search may take, and one line of its progress on stderr.
+
+    **Arguments:**
+
+    - `max_iterations`: the largest number of iterations of one search, on all its meshes together.
+    - `max_seconds`: the longest time [s] from now on, or None.
+    - `progress`: whether to show the line at once; if not, it is shown on a terminal after `LATE` seconds.
+    """
+
+    def __init__(self, max_iterations: int, max_seconds: float | None = None, progress: bool = False):
+        self.max_iterations, self.iterations, self.progress, self.is_shown = max_iterations, 0, progress, False
+        self.end = math.inf if max_seconds is None else time.monotonic() + max_seconds
+        self.text = "compiling"
+        self._timer = threading.Timer(LATE, self._late)
+
+    def __enter__(self) -> Effort:
+        if not self.progress and getattr(sys.stderr, "isatty", bool)():
+            self._timer.daemon = True
+            self._timer.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._timer.cancel()
+        if self.is_shown:
+            print(file=sys.stderr)
+
+    def _late(self) -> None:
+        self.progress = True
+        self.show(self.text)
+
+    def show(self, text: str) -> None:
+        self.text = text
+        if self.progress:
+            print(f"\r{text}".ljust(72), end="", file=sys.stderr, flush=True)
+            self.is_shown = True
+
+    @property
+    def is_over(self) -> bool:
+        return time.monotonic() > self.end
 
 
 class Monitor:
-    """Shows progress, keeps the best iterate, and stops the solver after Ctrl-C or an exception.
+    """Shows progress, keeps the best iterate, and stops IPOPT after Ctrl-C, an exception or the longest time.
 
     **Arguments:**
 
     - `program`: the nonlinear program.
-    - `show`: a function of (iteration, cost, violation), or None.
+    - `effort`: its iterations are counted, and its time is limited.
     - `tolerance`: the largest violation of a feasible iterate.
     """
 
-    def __init__(
-        self,
-        program: NonlinearProgram,
-        show: Callable[[int, float, float], None] | None = None,
-        tolerance: float = 1e-6,
-    ):
-        self.program, self.show, self.tolerance = program, show, tolerance
+    def __init__(self, program: NonlinearProgram, effort: Effort, tolerance: float = 1e-6):
+        self.program, self.effort, self.tolerance = program, effort, tolerance
         self.best: np.ndarray | None = None
         self.error: BaseException | None = None
         self.is_interrupted = False
-        self.iterations = 0
+        self.iterations = -1  # the guess is no iteration
         self._best_merit = (np.inf, np.inf)
 
     def __call__(self, z: np.ndarray) -> bool:
@@ -77,10 +117,10 @@ class Monitor:
             merit = (0.0, cost) if violation <= self.tolerance else (violation, cost)
             if merit <= self._best_merit:
                 self._best_merit, self.best = merit, z.copy()
-            if self.show is not None:
-                self.show(self.iterations, cost * self.program.f_scale, violation)
             self.iterations += 1
-        return self.is_interrupted or self.error is not None
+            count, cost = self.effort.iterations + self.iterations, cost * self.program.f_scale
+            self.effort.show(f"iteration {count}: cost {cost:.6g}, violation {violation:.1e}")
+        return self.is_interrupted or self.error is not None or self.effort.is_over
 
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:
@@ -100,12 +140,9 @@ class Monitor:
         finally:
             signal.signal(signal.SIGINT, before)
 
-    def interrupted(self, z: np.ndarray, multipliers: np.ndarray, bound_multipliers: np.ndarray) -> Solution:
-        best = z if self.best is None else self.best
-        return Solution(best, multipliers, bound_multipliers, False, INTERRUPTED, self.iterations)
-
 
 INTERRUPTED = "interrupted"
+TIME_IS_UP = "the longest time was reached"
 NOT_FINITE = "a function or a derivative is not finite"
 
 
@@ -116,14 +153,14 @@ _IPOPT_STATUS = {
     "Infeasible_Problem_Detected": (False, "the constraints contradict each other near the last iterate"),
     "Maximum_Iterations_Exceeded": (False, "the largest number of iterations was reached"),
     "Maximum_CpuTime_Exceeded": (False, "the longest CPU time was reached"),
-    "Maximum_WallTime_Exceeded": (False, "the longest time was reached"),
+    "Maximum_WallTime_Exceeded": (False, TIME_IS_UP),
     "Diverging_Iterates": (False, "the iterates diverge: the cost may have no lower bound"),
     "Search_Direction_Becomes_Too_Small": (False, "the steps became too small"),
     "Restoration_Failed": (False, "no feasible point was found near the last iterate"),
     "Error_In_Step_Computation": (False, "no step could be computed"),
     "Invalid_Number_Detected": (False, NOT_FINITE),
     "Not_Enough_Degrees_Of_Freedom": (False, "there are more equations than variables"),
-    "User_Requested_Stop": (False, INTERRUPTED),
+    "User_Requested_Stop": (False, TIME_IS_UP),
 }
 
 
@@ -156,10 +193,9 @@ def casadi() -> ModuleType:
 def minimized(
     program: NonlinearProgram,
     z: np.ndarray,
+    effort: Effort,
     *,
-    progress: bool = False,
     is_warm: bool = False,
-    max_iterations: int = 500,
     options: Mapping[str, Any] | None = None,
 ) -> Solution:
     """Solve a program by IPOPT.
@@ -168,12 +204,11 @@ def minimized(
 
     - `program`: the nonlinear program.
     - `z` (n,): the initial guess of the scaled variables.
-    - `progress`: whether to show one line of progress.
+    - `effort`: limits of iterations and time; the iterations are added to it.
     - `is_warm`: whether the guess is close to the solution.
-    - `max_iterations`: the largest number of iterations.
     - `options`: further options by IPOPT's own names.
     """
-    ca, monitor = casadi(), Monitor(program, show_progress if progress else None)
+    ca, monitor = casadi(), Monitor(program, effort)
     n, m = program.n, program.m
     x_type, g_type, number, none = (ca.Sparsity.dense(k, 1) for k in (n, m, 1, 0))
     rows, columns = program.hessian_structure
@@ -208,7 +243,7 @@ def minimized(
         "print_time": False,
         "no_nlp_grad": True,  # CasADi would differentiate the callback
         "show_eval_warnings": False,
-        "ipopt": _ipopt_options(max_iterations, is_warm, options),
+        "ipopt": _ipopt_options(effort.max_iterations - effort.iterations, is_warm, options),
     }
     try:
         solve = ca.nlpsol("solve", "ipopt", {"x": x, "f": cost, "g": constraints}, settings)
@@ -220,11 +255,14 @@ def minimized(
     if monitor.error is not None:
         raise monitor.error
     found, lam_g, lam_x = (np.array(result[k], float).ravel() for k in ("x", "lam_g", "lam_x"))
-    if monitor.is_interrupted:
-        return monitor.interrupted(found, lam_g, lam_x)
     stats = solve.stats()
     ok, status = _IPOPT_STATUS.get(stats["return_status"], (False, stats["return_status"].replace("_", " ")))
-    return Solution(found, lam_g, lam_x, ok, status, int(stats["iter_count"]))
+    if monitor.is_interrupted:
+        ok, status = False, INTERRUPTED
+    if status in (INTERRUPTED, TIME_IS_UP) and monitor.best is not None:
+        found = monitor.best
+    effort.iterations += int(stats["iter_count"])
+    return Solution(found, lam_g, lam_x, ok, status)
 
 
 def _callback(
@@ -265,11 +303,6 @@ def _callback(
             return 0
 
     return Function()
-
-
-def show_progress(iteration: int, cost: float, violation: float) -> None:
-    text = f"\riteration {iteration}: cost {cost:.6g}, violation {violation:.1e}".ljust(72)
-    print(text, end="", file=sys.stderr, flush=True)
 
 
 NOT_A_MINIMUM = "stationary, but not a minimum: pass another guess"

@@ -14,7 +14,15 @@ from jaxtyping import Array
 
 from .._collocate.lobatto import Lobatto, lobatto
 from .._collocate.program import NonlinearProgram
-from .._collocate.solvers import INTERRUPTED, NOT_FINITE, Solution, casadi, minimized, refused_unless_minimum
+from .._collocate.solvers import (
+    INTERRUPTED,
+    NOT_FINITE,
+    Effort,
+    Solution,
+    casadi,
+    minimized,
+    refused_unless_minimum,
+)
 from .._collocate.transcription import Motion, Transcription, nodes_of, system_at
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
@@ -41,7 +49,8 @@ def solve(
     options: Mapping[str, Any] | None = None,
     starts: int = 1,
     seed: int = 0,
-    max_iterations: int = 500,
+    max_iterations: int = 1000,
+    max_seconds: float | None = None,
     max_intervals: int = 2000,
     progress: bool = False,
 ) -> Plan:
@@ -68,9 +77,12 @@ def solve(
     - `starts`: the number of searches. The first one starts from `guess`. For the others, random deviations are added
         to the coordinates.
     - `seed`: the seed of these deviations.
-    - `max_iterations`: the largest number of iterations of the solver on each mesh.
+    - `max_iterations`: the largest number of iterations for each guess, on all meshes together.
+    - `max_seconds`: the longest time [s], or None. It is compared with the time after each iteration. The plan is then
+        the best one so far.
     - `max_intervals`: the largest number of intervals of a phase.
-    - `progress`: show the cost and the violation of each iteration.
+    - `progress`: show the cost and the violation of each iteration in one line on stderr. On a terminal, this line is
+        shown after 5 s in any case.
 
     **Returns:** a `Plan`. If no solution is found, `plan.ok` is False and `plan.reason` states why. The plan then
     contains the last or best iterate.
@@ -92,13 +104,16 @@ def solve(
         tolerance = positive_number(tolerance, "solve: `tolerance`")
     if not isinstance(options, Mapping | None):
         raise TypeError(f"solve: `options` must be a dict by the names of IPOPT, got {options!r}.")
-    search = _Search(phases, lobatto(method), tolerance, options, max_iterations, max_intervals, progress)
+    if max_seconds is not None:
+        max_seconds = positive_number(max_seconds, "solve: `max_seconds`")
     guesses = _guesses(problem, guess, starts, seed)
-    plans = []
-    for one in guesses:
-        plans.append(search.plan(intervals, one))
-        if plans[-1].reason == INTERRUPTED:
-            break
+    plans: list[Plan] = []
+    with Effort(max_iterations, max_seconds, progress) as effort:
+        search = _Search(phases, lobatto(method), tolerance, options, effort, max_intervals)
+        for one in guesses:
+            plans.append(search.plan(intervals, one))
+            if plans[-1].reason == INTERRUPTED or effort.is_over:
+                break
     best = min(plans, key=lambda plan: (not plan.ok, plan.violation > 1e-6, plan.cost))
     if len(guesses) == 1:
         return best
@@ -216,9 +231,8 @@ class _Search:
     method: Lobatto
     tolerance: float | None
     options: Mapping[str, Any] | None
-    max_iterations: int
+    effort: Effort
     max_intervals: int
-    progress: bool
 
     def plan(self, intervals: int, guesses: Sequence[tuple[Any, Any]]) -> Plan:
         problems = self.phases.phases
@@ -232,15 +246,14 @@ class _Search:
         motions = [_guessed(p, g, s, detour) for p, (g, detour), s in zip(problems, guesses, nodes, strict=True)]
         theta = _theta(problems[0], guesses[0][0])
         costs: list[float] = []
-        iterations, is_warm = 0, isinstance(guesses[0][0], Plan)
+        self.effort.iterations, is_warm = 0, isinstance(guesses[0][0], Plan)
         sizes = [g.scales if _is_similar(p, g) else None for p, (g, _) in zip(problems, guesses, strict=True)]
         transcription = self._transcribed(meshes, motions, theta, sizes)
         sizes, solved = transcription.sizes, None  # the solution on the mesh before, which must not be lost
         while True:
             solution = self._solved(transcription, is_warm)
-            iterations += solution.iterations
             if solved is not None and not solution.ok:
-                return self._unrefined(*solved, solution.status, costs, iterations)
+                return self._unrefined(*solved, solution.status, costs)
             program, x = transcription.program, solution.z * transcription.x_scale
             costs.append(program.objective(solution.z) * program.f_scale)
             motions, theta = transcription.motions(x), transcription.theta(x)
@@ -249,7 +262,7 @@ class _Search:
                 try:
                     errors = self._errors(transcription, x)
                 except KeyboardInterrupt:
-                    return self._unrefined(transcription, solution, None, INTERRUPTED, costs, iterations)
+                    return self._unrefined(transcription, solution, None, INTERRUPTED, costs)
             new, tolerance = None, self.tolerance
             if errors is not None and tolerance is not None and any(np.max(e) > tolerance for e in errors):
                 new = [
@@ -257,7 +270,7 @@ class _Search:
                     for mesh, e in zip(meshes, errors, strict=True)
                 ]
             if new is None or len(costs) == MAX_MESHES or max(len(m) for m in new) > self.max_intervals + 1:
-                return self._plan(transcription, solution, errors, costs, iterations, new is not None)
+                return self._plan(transcription, solution, errors, costs, new is not None)
             motions = [
                 interpolated(motion, mesh, self.method, nodes_of(finer, self.method))
                 for motion, mesh, finer in zip(motions, meshes, new, strict=True)
@@ -267,7 +280,7 @@ class _Search:
                 transcription = self._transcribed(new, motions, theta, sizes)
             except (KeyboardInterrupt, ValueError) as error:  # a function may not be finite at a new node
                 status = INTERRUPTED if isinstance(error, KeyboardInterrupt) else str(error)
-                return self._unrefined(*solved, status, costs, iterations)
+                return self._unrefined(*solved, status, costs)
             meshes, is_warm = new, True
 
     def _unrefined(
@@ -277,12 +290,11 @@ class _Search:
         errors: Sequence[np.ndarray] | None,
         status: str,
         costs: Sequence[float],
-        iterations: int,
     ) -> Plan:
         """The plan of a solution whose mesh should be finer, with the status of the finer mesh."""
         reason = status if status == INTERRUPTED else f"solved, but not on a finer mesh: {status}"
         solution = dataclasses.replace(solution, ok=False, status=reason)
-        return self._plan(transcription, solution, errors, costs, iterations, False)
+        return self._plan(transcription, solution, errors, costs, False)
 
     def _transcribed(
         self,
@@ -296,10 +308,7 @@ class _Search:
 
     def _solved(self, transcription: Transcription, is_warm: bool) -> Solution:
         program = transcription.program
-        solution = minimized(
-            program, transcription.z, progress=self.progress, is_warm=is_warm, max_iterations=self.max_iterations,
-            options=self.options,
-        )  # fmt: skip
+        solution = minimized(program, transcription.z, self.effort, is_warm=is_warm, options=self.options)
         return refused_unless_minimum(program, transcription.shared, solution)
 
     def _errors(self, transcription: Transcription, x: np.ndarray) -> list[np.ndarray]:
@@ -323,7 +332,6 @@ class _Search:
         solution: Solution,
         errors: Sequence[np.ndarray] | None,
         costs: Sequence[float],
-        iterations: int,
         is_coarse: bool,
     ) -> Plan:
         program, x = transcription.program, solution.z * transcription.x_scale
@@ -342,7 +350,7 @@ class _Search:
             "reason": reason,
             "cost": costs[-1],
             "costs": tuple(costs),
-            "iterations": iterations,
+            "iterations": self.effort.iterations,
             "violation": program.violation(solution.z),
             "dual_residual": dual_residual(program, solution),
             "estimates": dict(zip(() if parameters is None else parameters.names, map(float, values), strict=True)),

@@ -42,7 +42,9 @@ from .._collocate.lobatto import lobatto
 from .._collocate.program import NonlinearProgram
 from .._collocate.solvers import (
     INTERRUPTED,
+    TIME_IS_UP,
     BandedFactors,
+    Effort,
     Solution,
     casadi,
     minimized,
@@ -180,7 +182,7 @@ class Marginal:
         border = np.concatenate([self.shared, self.local]).astype(int)
         return Kkt(self.transcription.program, border, z, multipliers)
 
-    def minimum(self, solution: Solution) -> tuple[Point, np.ndarray, bool]:
+    def minimum(self, solution: Solution, effort: Effort) -> tuple[Point, np.ndarray, bool]:
         """The most probable parameters, by Newton's method with a trust region.
 
         The gradient and the matrix of second derivatives are differences of values.
@@ -188,6 +190,7 @@ class Marginal:
         **Arguments:**
 
         - `solution`: the most probable motion for the initial guess of the parameters.
+        - `effort`: its time is compared with the time after each step.
 
         **Returns:** the point, the covariance (p, p) of the scaled parameters, NaN if the curvature is not positive
         definite, and whether the search converged.
@@ -195,7 +198,8 @@ class Marginal:
         now = self.at(solution.z[self.shared], Point(solution.z, solution.multipliers, np.inf, None))
         radius, ok = _FIRST, False
         gradient, curvature, width = self._quadratic(now)
-        for _ in range(_STEPS):
+        for k in range(_STEPS):
+            effort.show(f"step {k} of the parameters: -2 log likelihood {now.value:.8g}")
             # the Newton step, with positive curvature, whose largest component is at most `radius`
             values, vectors = np.linalg.eigh(curvature * np.outer(width, width))
             sizes = np.maximum(np.abs(values), 1e-6 * np.max(np.abs(values), initial=1e-12))
@@ -210,7 +214,7 @@ class Marginal:
                     now, (gradient, curvature, width) = new, self._quadratic(new)
             radius = 2.0 * radius if ratio > 0.75 else 0.4 * radius if ratio < 0.25 else radius
             ok = bool(np.max(np.abs(step) / width) < 0.1)  # of a width, which is a third of a standard error
-            if ok or radius < 1e-6:
+            if ok or radius < 1e-6 or effort.is_over:
                 break
         return now, inverse(0.5 * curvature), ok
 
@@ -272,7 +276,8 @@ class Collocation:
         input was recorded too, it is the sum of its record and the unknown part.
     - `within`: a dict by name of (lower, upper), for states and unknown inputs at all nodes. None means no bound.
     - `method`: "trapezoid", "hermite-simpson" or "lobatto".
-    - `max_iterations`: the largest number of iterations.
+    - `max_iterations`: the largest number of iterations of IPOPT.
+    - `max_seconds`: the longest time [s], or None. The result is then the best one so far.
     """
 
     intervals_per_sample: int = 1
@@ -280,6 +285,7 @@ class Collocation:
     within: Mapping[str, tuple[float | None, float | None]] = dataclasses.field(default_factory=dict)
     method: str = "hermite-simpson"
     max_iterations: int = 500
+    max_seconds: float | None = None
 
     def __post_init__(self) -> None:
         n = self.intervals_per_sample
@@ -289,6 +295,8 @@ class Collocation:
             if not isinstance(getattr(self, name), Mapping):
                 raise TypeError(f"Collocation: `{name}` must be a dict by name, got {getattr(self, name)!r}.")
         lobatto(self.method)
+        if self.max_seconds is not None:
+            positive_number(self.max_seconds, "Collocation: `max_seconds`")
 
     def fit(
         self,
@@ -305,7 +313,9 @@ class Collocation:
                 raise ValueError(f"`{name}` cannot be used with `transcription=Collocation()`. {reason}. Omit it.")
         problem = Problem.with_first_steps(ProblemSpec(system, free, **options), trials)
         _check_problem(problem)
-        return solved(problem, self, progress)
+        casadi()
+        with Effort(self.max_iterations, self.max_seconds, progress) as effort:
+            return solved(problem, self, effort)
 
 
 _NOT_SUPPORTED = {
@@ -339,8 +349,7 @@ def _check_problem(problem: Problem) -> None:
             raise ValueError(f"Collocation {reason}")
 
 
-def solved(problem: Problem, how: Collocation, progress: bool) -> CollocationFit:
-    casadi()
+def solved(problem: Problem, how: Collocation, effort: Effort) -> CollocationFit:
     system, name = problem.system, type(problem.system).__name__
     refuse_unknown(how.unknown_inputs, system.inputs, f"`unknown_inputs`: {name} has no input", "it has")
     densities = {k: positive_number(v, f"`unknown_inputs` of {k!r}") for k, v in how.unknown_inputs.items()}
@@ -360,11 +369,12 @@ def solved(problem: Problem, how: Collocation, progress: bool) -> CollocationFit
     shared, local = transcription.shared_parameters, transcription.local_parameters
     if densities:  # first the motion for the initial guess of the parameters
         program = with_fixed(program, shared, transcription.z)
-    solution = minimized(program, transcription.z, progress=progress, max_iterations=how.max_iterations)
+    solution = minimized(program, transcription.z, effort)
     solution = refused_unless_minimum(program, transcription.shared, solution)
     if densities and solution.ok:
-        point, covariance, ok = Marginal(transcription, shared, local).minimum(solution)
-        status = solution.status if ok else "the largest number of steps of the parameters was reached"
+        point, covariance, ok = Marginal(transcription, shared, local).minimum(solution, effort)
+        status = "the largest number of steps of the parameters was reached"
+        status = solution.status if ok else TIME_IS_UP if effort.is_over else status
         solution = dataclasses.replace(solution, z=point.z, multipliers=point.multipliers, ok=ok, status=status)
     else:
         covariance = np.full((len(shared),) * 2, np.nan)  # if it does not exist
