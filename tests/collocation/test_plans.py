@@ -224,3 +224,21 @@ def test_refinement_stays_within_its_limits():
     assert fine.ok
     assert np.max(fine.errors) <= 1e-6
     assert float(fine["x"][-1]) == pytest.approx(np.cos(200.0), abs=1e-3)
+
+
+def test_a_guess_is_clipped_to_ends_and_bounds(plan):
+    """The energy of a shorter motion, 12 N^2 s at a mass of 1 kg; the guess does not change it."""
+    rtol = 1e-6
+    problem = Problem(Sled(), 1.0, controls=["force"], cost=effort, within={"v": (-3.0, 3.0)}, **ENDS)
+    names = lambda found: [note.partition(": ")[2] for note in found.notes]  # noqa: E731
+    for guess, clipped in (
+        (None, []), ({"x": np.linspace(0.0, 1.0, 5)}, []), ({"x": 0.5, "v": 9.0}, ["x, v"]), ({"duration": 3.0}, ["duration"]),
+        (plan, []), (plan.trajectory, []),
+    ):  # fmt: skip
+        found = solve(problem, guess, intervals=10, tolerance=None)
+        assert found.cost == pytest.approx(12.0, rel=rtol)
+        assert names(found) == clipped
+        assert all(note in repr(found) for note in found.notes)
+    assert names(solve(Problem(Sled(), 1.0, controls=["force"], cost=effort, start={"x": 0.5, "v": 0.0}), plan)) == [
+        "x"
+    ]

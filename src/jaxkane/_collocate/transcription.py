@@ -223,7 +223,8 @@ def nodes_of(mesh: np.ndarray, method: Lobatto) -> np.ndarray:
 
 
 class Transcription:
-    """The nonlinear program of problems on meshes, around a guess.
+    """The nonlinear program of problems on meshes, around a guess, which is clipped: to the values that are required at
+    both ends, and to all bounds.
 
     **Arguments:**
 
@@ -259,10 +260,12 @@ class Transcription:
             if layout.duration is not None:
                 self.x[layout.duration] = motion.duration
         self.x[self.shared_parameters] = theta
-        self.x_bounds = self._variable_bounds()
+        self.x_bounds, given = self._variable_bounds(), self.x
+        self.x = np.clip(given, *self.x_bounds)
         dynamics = [_dynamics(layout) for layout in self.layouts]
         self._check_finite_dynamics(dynamics)
         self.x_scale = self._scales(dynamics, [None] * len(phases) if sizes is None else sizes)
+        self._is_clipped = np.abs(self.x - given) > 1e-6 * self.x_scale
         builder = Builder(self.n, self.method)
         for p, (layout, block) in enumerate(zip(self.layouts, dynamics, strict=True)):
             builder.defects(p, layout, block, self.x_scale)
@@ -278,6 +281,10 @@ class Transcription:
         g_scale = builder.scales(self.x, self.x_scale)
         self.program = NonlinearProgram(*builder.arguments(), self.x_bounds, builder.bounds, self.x_scale, g_scale)
         self.program.f_scale = self._cost_scale()
+
+    def clipped(self, p: int) -> list[str]:
+        """The names of the variables of phase p whose guess was clipped."""
+        return [name for name, at in self.layouts[p].by_name.items() if self._is_clipped[at].any()]
 
     @property
     def sizes(self) -> list[np.ndarray]:

@@ -59,6 +59,7 @@ class Plan:
     - `dual_residual`: the largest scaled violation of the conditions of a minimum.
     - `unmet`: the scaled violations of constraints that are violated by more than the tolerance, by name.
     - `active`: the names of bounds and inequality constraints that are active somewhere.
+    - `notes`: remarks as sentences, such as the names of what was clipped in the guess.
     - `starts`: if there were several guesses, the cost and the result of each.
     - `phases`: the plans of all phases; empty for a single problem. With phases, the names in `multipliers`, `unmet`
         and `active` start with the phase, as in "phase 0: roll".
@@ -81,6 +82,7 @@ class Plan:
     dual_residual: float
     unmet: dict[str, float]
     active: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     starts: tuple[tuple[float, str], ...] = ()
     phases: tuple[Plan, ...] = ()
     motion: Motion = dataclasses.field(repr=False, kw_only=True)
@@ -238,7 +240,7 @@ class Plan:
             units = units_of(self.system)
             values = (f"{k} = {v:.6g} {units.get(k, '')}".strip() for k, v in self.estimates.items())
             text = f"{text}\n{wrapped(', '.join(values))}"
-        return text
+        return "\n".join([text, *self.notes])
 
 
 class Multipliers(UserDict[str, Any]):

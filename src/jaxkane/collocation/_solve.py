@@ -65,7 +65,8 @@ def solve(
     **Arguments:**
 
     - `problem`: a `Problem`, or `Phases`.
-    - `guess`: None for straight lines between the values at both ends; a `Plan`; a `Trajectory`; or a dict by name. A
+    - `guess`: None for straight lines between the values at both ends; a `Plan`; a `Trajectory`; or a dict by name. It
+        is clipped to the ends and bounds of the problem, and `plan.notes` names what was clipped. A
         value of the dict is a number, an array (n,) of equally spaced samples, or a function of time. The key
         "duration" sets the duration. If `guess` is a sequence of these, all are tried and the best solution is
         returned. For `Phases`, a sequence contains one guess for each phase.
@@ -245,10 +246,24 @@ class _Search:
         nodes = [nodes_of(mesh, self.method) for mesh in meshes]
         motions = [_guessed(p, g, s, detour) for p, (g, detour), s in zip(problems, guesses, nodes, strict=True)]
         theta = _theta(problems[0], guesses[0][0])
-        costs: list[float] = []
         self.effort.iterations, is_warm = 0, isinstance(guesses[0][0], Plan)
         sizes = [g.scales if _is_similar(p, g) else None for p, (g, _) in zip(problems, guesses, strict=True)]
         transcription = self._transcribed(meshes, motions, theta, sizes)
+        names = []
+        for p, (problem, (guess, detour), motion) in enumerate(zip(problems, guesses, motions, strict=True)):
+            clipped = [*transcription.clipped(p)]
+            if not problem.durations[0] <= motion.duration <= problem.durations[1]:
+                clipped.append("duration")
+            given = () if guess is None or detour is not None else guess if isinstance(guess, Mapping) else clipped
+            prefix = f"phase {p}: " * (len(problems) > 1)
+            names += [prefix + name for name in dict.fromkeys(clipped) if name in given]
+        plan = self._refined(transcription, meshes, is_warm)
+        note = f"the guess was clipped to the ends and bounds of the problem: {', '.join(names)}"
+        return dataclasses.replace(plan, notes=(note, *plan.notes)) if names else plan
+
+    def _refined(self, transcription: Transcription, meshes: Sequence[np.ndarray], is_warm: bool) -> Plan:
+        """The plan on a sufficiently fine mesh, from the problem on the first mesh."""
+        costs: list[float] = []
         sizes, solved = transcription.sizes, None  # the solution on the mesh before, which must not be lost
         while True:
             solution = self._solved(transcription, is_warm)
@@ -407,7 +422,7 @@ def _guessed(problem: Problem, guess: Any, s: np.ndarray, detour: np.ndarray | N
         found = found._replace(duration=min(max(guess.duration, low), high))
     else:
         found = guess_of(problem, getattr(guess, "trajectory", guess), s)
-    return found if detour is None else detoured(problem, found, detour)
+    return found if detour is None else detoured(found, detour)
 
 
 def _theta(problem: Problem, guess: Guess) -> np.ndarray:

@@ -272,9 +272,6 @@ def guessed(phase: TrialPhase, mesh: np.ndarray, method: Lobatto) -> Motion:
         if names[i] not in measured:
             steps = 0.5 * (rates[1:, i] + rates[:-1, i]) * np.diff(t)
             Y[1:, i] = Y[0, i] + np.cumsum(steps)
-    for name, (low, high) in phase.limits.items():
-        if name in names:
-            Y[:, names.index(name)] = np.clip(Y[:, names.index(name)], low, high)
     return Motion(s, phase.durations[0], Y, W)
 
 
