@@ -1,5 +1,7 @@
 """Wrong arguments and problems without solutions: one clear error each, or a status and the last iterate."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -156,6 +158,41 @@ def test_wrong_phases():
             solve(Phases([problem(end=None), problem(start=None)], [link]), intervals=2)
     with pytest.raises(ValueError, match="3 guesses for 2 phases"):
         solve(Phases([problem(end=None), problem(start=None)], [None]), [None] * 3, intervals=2)
+
+
+class Puck(jk.System):
+    """A point in a plane with two forces."""
+
+    coordinates, speeds, inputs = ("x", "y"), ("vx", "vy"), ("fx", "fy")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        point = O.moving(q["x"] * N.x + q["y"] * N.y, u["vx"] * N.x + u["vy"] * N.y)
+        return jk.Motion([jk.Body(1.0, 0.0, point, N, name="puck")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(inputs["fx"] * motion.N.x + inputs["fy"] * motion.N.y, motion["puck"])
+
+
+def test_a_path_that_fixed_ends_imply_is_dropped_there():
+    """It took 327 iterations with singular Jacobians, and has 4. The fixed ends must satisfy it."""
+    still = {"vx": 0.0, "vy": 0.0}
+    arc = Problem(
+        Puck(), 1.0, controls=["fx", "fy"], cost=lambda t, now: now["fx"] ** 2 + now["fy"] ** 2,
+        start={"x": 1.0, "y": 0.0, **still}, end={"x": 0.0, "y": 1.0, **still},
+        path=lambda t, now: {"circle": (now["x"] ** 2 + now["y"] ** 2, 1.0, 1.0)},
+    )  # fmt: skip
+    plan = solve(arc, intervals=10, tolerance=None)
+    assert plan.ok
+    assert plan.iterations < 10
+    assert plan.notes == ("dropped, because others imply it: circle at the start, circle at the end",)
+    np.testing.assert_allclose(np.hypot(plan["x"], plan["y"]), 1.0, atol=1e-9)
+    with pytest.raises(ValueError, match=r"fixed values make 'circle at the start' 1\.21, but it must be 1\."):
+        solve(dataclasses.replace(arc, start={"x": 1.1, "y": 0.0, **still}), intervals=10)
+    # The end is not fixed, but a condition implies the path there.
+    far = dataclasses.replace(arc, end=still, conditions=lambda a, b, d: {"r": jnp.hypot(b["x"], b["y"]) - 1.0})
+    plan = solve(far, intervals=10, tolerance=None, max_iterations=1)
+    assert plan.notes == ("dropped, because others imply it: circle at the start, circle at the end",)
 
 
 BICYCLE = jk.catalog.WhippleBicycle.benchmark()

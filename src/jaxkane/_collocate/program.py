@@ -181,6 +181,7 @@ class NonlinearProgram:
         # bounds (n,) and (n_g,) of the scaled variables and constraints
         self.lower, self.upper = x_bounds.lower / x_scale, x_bounds.upper / x_scale
         self.g_lower, self.g_upper = g_bounds.lower / g_scale, g_bounds.upper / g_scale
+        self.is_implied = np.zeros(self.m, bool)  # constraints that follow from the others: IPOPT does not get them
         self._blocks = list(blocks)
         sizes = [b.B * b.block.size for b in self._blocks]
         for k, w, S in zip(sizes, weights, constraints, strict=True):

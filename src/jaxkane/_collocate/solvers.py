@@ -249,7 +249,10 @@ def minimized(
         solve = ca.nlpsol("solve", "ipopt", {"x": x, "f": cost, "g": constraints}, settings)
     except RuntimeError as error:
         raise ValueError(f"solve: IPOPT refuses the `options` {dict(options or {})}: {error}") from None
-    start = {"x0": z, "lbx": program.lower, "ubx": program.upper, "lbg": program.g_lower, "ubg": program.g_upper}
+    lower, upper = (
+        np.where(program.is_implied, b, g) for b, g in ((-np.inf, program.g_lower), (np.inf, program.g_upper))
+    )
+    start = {"x0": z, "lbx": program.lower, "ubx": program.upper, "lbg": lower, "ubg": upper}
     with monitor.interruptible():
         result = solve(**start)
     if monitor.error is not None:

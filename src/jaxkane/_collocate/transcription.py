@@ -281,6 +281,7 @@ class Transcription:
         g_scale = builder.scales(self.x, self.x_scale)
         self.program = NonlinearProgram(*builder.arguments(), self.x_bounds, builder.bounds, self.x_scale, g_scale)
         self.program.f_scale = self._cost_scale()
+        self.implied = self._drop_implied()
 
     def clipped(self, p: int) -> list[str]:
         """The names of the variables of phase p whose guess was clipped."""
@@ -474,6 +475,57 @@ class Transcription:
                     f"Problem: `{row.kind}`: the derivative of {row.name!r} is zero everywhere. Return a smooth signed "
                     "number, not a truth value or a rounded one."
                 )
+
+    def _drop_implied(self) -> list[str]:
+        """Drop constraints that others imply: those of fixed values, and path equalities at the ends of a phase.
+
+        IPOPT would need hundreds of iterations: the Jacobian of all constraints is singular.
+
+        **Returns:** the names of the equalities.
+
+        **Raises:** `ValueError` if a constraint contradicts fixed values.
+        """
+        program, free = self.program, self.program.lower < self.program.upper
+        names, of_ends, others = {}, [], []
+        for row in (row for row in self.rows if row.kind != "dynamics"):
+            path = {row.rows[0]: " at the start", row.rows[-1]: " at the end"} if row.kind == "path" else {}
+            of_ends += path
+            others += [] if path else [*row.rows]
+            prefix = f"phase {row.phase}: " * (row.kind != "links" and len(self.layouts) > 1)
+            names |= {i: f"{prefix}{row.name}{path.get(i, '')}" for i in row.rows}
+        if not names:
+            return []
+        rows, columns = program.jacobian_structure
+        g, off = program.constraints(self.z), np.isin(np.arange(program.m), rows[free[columns]], invert=True)
+        off &= np.isin(np.arange(program.m), [*names])
+        for i in np.flatnonzero(off & (np.maximum(program.g_lower - g, g - program.g_upper) > 1e-6)):
+            value, low, high = (x[i] * program.g_scale[i] for x in (g, program.g_lower, program.g_upper))
+            required = f"{low:g}" if low == high else f"from {low:g} to {high:g}"
+            raise ValueError(f"Problem: fixed values make {names[i]!r} {value:.6g}, but it must be {required}.")
+        program.is_implied |= off
+        is_equality = program.g_lower == program.g_upper
+        order = [i for i in (*others, *of_ends) if is_equality[i] and not off[i]]
+        if any(i in of_ends for i in order):
+            beside = np.clip(self.z + np.random.default_rng(0).uniform(-0.1, 0.1, self.n), program.lower, program.upper)
+            both = self._dependent(self.z, order) & self._dependent(beside, order)
+            program.is_implied[[i for i in both if i in of_ends]] = True
+        return [names[i] for i in np.flatnonzero(program.is_implied & is_equality)]
+
+    def _dependent(self, z: np.ndarray, order: Sequence[int]) -> set[int]:
+        """The constraints whose gradients, without fixed variables, depend on those of the constraints before them."""
+        program, found, basis = self.program, set(), np.zeros((0, self.n))
+        J: Any = scipy.sparse.csr_matrix((program.jacobian(z), program.jacobian_structure), (program.m, program.n))
+        for i in order:
+            a = np.where(program.lower < program.upper, J[i].toarray()[0], 0.0)
+            rest = a / max(float(np.linalg.norm(a)), 1e-300)
+            for _ in range(2):
+                rest = rest - basis.T @ (basis @ rest)
+            size = float(np.linalg.norm(rest))
+            if size < 1e-8:
+                found.add(i)
+            else:
+                basis = np.concatenate([basis, rest[None] / size])
+        return found
 
     def _cost_scale(self) -> float:
         # The size of the cost at the guess, or one third of a scale away from it: at the guess it may be zero.

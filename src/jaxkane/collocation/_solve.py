@@ -258,8 +258,12 @@ class _Search:
             prefix = f"phase {p}: " * (len(problems) > 1)
             names += [prefix + name for name in dict.fromkeys(clipped) if name in given]
         plan = self._refined(transcription, meshes, is_warm)
-        note = f"the guess was clipped to the ends and bounds of the problem: {', '.join(names)}"
-        return dataclasses.replace(plan, notes=(note, *plan.notes)) if names else plan
+        clip, drop = (
+            "the guess was clipped to the ends and bounds of the problem: ",
+            "dropped, because others imply it: ",
+        )
+        notes = [words + ", ".join(x) for words, x in ((clip, names), (drop, transcription.implied)) if x]
+        return dataclasses.replace(plan, notes=(*notes, *plan.notes))
 
     def _refined(self, transcription: Transcription, meshes: Sequence[np.ndarray], is_warm: bool) -> Plan:
         """The plan on a sufficiently fine mesh, from the problem on the first mesh."""
@@ -356,6 +360,8 @@ class _Search:
             ok, reason = False, f"solved, but the local error is {worst:.1e}: pass more `intervals` or a `tolerance`"
         elif ok and is_coarse:
             ok, reason = False, f"solved, but the local error is {worst:.1e} instead of {self.tolerance:g}"
+        elif ok and program.violation(solution.z) > 1e-6:
+            ok, reason = False, f"dropped constraints are violated: {', '.join(transcription.implied)}"
         if reason == NOT_FINITE and (names := transcription.not_finite(x)):
             reason = f"{', '.join(names)} is not finite at the last iterate"
         parameters = transcription.parameters
