@@ -301,3 +301,53 @@ def test_a_switch_inside_an_interval_is_refined(method, intervals):
     assert plan.cost == plan.duration == pytest.approx(2.0, abs=1e-6)
     assert plan.active == ("force at its lower bound", "force at its upper bound")
     assert len(plan.mesh) - 1 <= 3 * intervals
+
+
+class Integrator(jk.System):
+    """The rate of a first-order state, beside a mass that does not matter."""
+
+    coordinates, speeds, inputs, states = ("place",), ("speed",), ("rate",), ("x",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["place"] * N.x, u["speed"] * N.x), N, name="mass")])
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return {"x": now["rate"]}
+
+
+def test_costates_before_on_and_after_a_singular_arc():
+    """The rate is -1 until 1 s, 0 until 1.5 s, then 1. The integral of x^2 is 3/8, the costate is (1 - t)^2, 0 and
+    -(t - 1.5)^2."""
+    atol = 2e-3
+    start = {"place": 0.0, "speed": 0.0, "x": 1.0}
+    problem = Problem(
+        Integrator(),
+        2.0,
+        controls={"rate": (-1.0, 1.0)},
+        cost=lambda t, now: now["x"] ** 2,
+        start=start,
+        end={"x": 0.5},
+    )
+    plan = solve(problem, intervals=20, tolerance=None)
+    assert plan.cost == pytest.approx(3 / 8, abs=atol)
+    t = plan.mesh
+    exact = np.maximum(1.0 - t, 0.0) ** 2 - np.maximum(t - 1.5, 0.0) ** 2
+    np.testing.assert_allclose(plan.multipliers.costate["x"], exact, atol=atol)
+
+
+@pytest.mark.slow_cases("trapezoid", "lobatto")
+@pytest.mark.parametrize(("method", "atol"), [("trapezoid", 1e-2), ("hermite-simpson", 1e-6), ("lobatto", 1e-9)])
+def test_costates_satisfy_the_adjoint_equation(method, atol):
+    """x' = v, v' = w; integral of x^2 + w^2, and v^2 at the end; p' = -2 x, q' = -p, w = -q / 2, q(2) = 2 v(2)."""
+    problem = Problem(
+        Sled(), 2.0, controls=["force"], cost=lambda t, now: now["x"] ** 2 + now["force"] ** 2,
+        final_cost=lambda t, now: now["v"] ** 2, start={"x": 1.0, "v": 0.0},
+    )  # fmt: skip
+    plan = solve(problem, intervals=16, tolerance=None, method=method)
+    A = np.array([[0, 1, 0, 0], [0, 0, 0, -0.5], [-2, 0, 0, 0], [0, 0, -1, 0]], float)  # of x, v, p, q
+    end, S = scipy.linalg.expm(2.0 * A), np.diag([0.0, 2.0])
+    rest = np.linalg.solve(end[2:, 2:] - S @ end[:2, 2:], (S @ end[:2, :2] - end[2:, :2]) @ [1.0, 0.0])
+    exact = np.array([scipy.linalg.expm(t * A) @ [1.0, 0.0, *rest] for t in plan.mesh])
+    for name, column in (("x", exact[:, 2]), ("v", exact[:, 3])):
+        np.testing.assert_allclose(plan.multipliers.costate[name], column, atol=atol)

@@ -243,12 +243,12 @@ class NonlinearProgram:
         values = self._remembered(EvaluatedBlock.values, z)
         return float(sum(w @ v.ravel() for w, v in zip(self._weights, values, strict=True)) / self.f_scale)
 
-    def gradient(self, z: np.ndarray) -> np.ndarray:
-        """The derivatives (n,) of `objective`."""
+    def gradient(self, z: np.ndarray, blocks: Sequence[int] | None = None) -> np.ndarray:
+        """The derivatives (n,) of `objective`, or of the part of it that some blocks have."""
         entries = self._remembered(EvaluatedBlock.jacobian, z)
         total = np.zeros(self.n)
-        for M, e in zip(self._gradient_maps, entries, strict=True):
-            total += M @ e.ravel()
+        for i in range(len(self._blocks)) if blocks is None else blocks:
+            total += self._gradient_maps[i] @ entries[i].ravel()
         return total * self.x_scale / self.f_scale
 
     def constraints(self, z: np.ndarray) -> np.ndarray:

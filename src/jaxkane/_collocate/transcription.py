@@ -337,6 +337,10 @@ class Transcription:
     def theta(self, x: np.ndarray) -> np.ndarray:
         return x[self.shared_parameters]
 
+    def gradient_of_integrals(self, z: np.ndarray) -> np.ndarray:
+        """The derivatives (n,) of the scaled cost without final costs, by the scaled variables."""
+        return self.program.gradient(z, [i for i, (_, label) in enumerate(self._named_blocks) if label == "cost"])
+
     def _variable_bounds(self) -> Bounds:
         lower, upper = np.full(self.n, -math.inf), np.full(self.n, math.inf)
         for layout in self.layouts:

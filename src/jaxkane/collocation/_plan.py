@@ -251,7 +251,8 @@ class Multipliers(UserDict[str, Any]):
         respect to the initial value.
     - `multipliers["condition"]`: the derivative with respect to a shift of the required value of this condition. For a
         path constraint, it is an array (K,). If a variable has the same name, use "conditions: roll" or "path: roll".
-    - `costate["roll"]` (N,): the derivative with respect to a sudden change of this state within each interval.
+    - `costate["roll"]` (N + 1,): the derivative with respect to a sudden change of this state at the ends of intervals,
+        `plan.mesh`. Where a constraint makes it jump, it is the value after the jump.
     """
 
     def __init__(self, values: Mapping[str, Any], costate: Mapping[str, np.ndarray]):

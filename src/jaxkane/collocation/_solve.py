@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from jaxtyping import Array
 
 from .._collocate.lobatto import Lobatto, lobatto
@@ -465,14 +466,36 @@ def multipliers_of(transcription: Transcription, solution: Solution, p: int) -> 
     values: dict[str, Any] = {name: by_variable[at] for name, at in layout.by_name.items()}
     if layout.duration is not None:
         values["duration"] = float(by_variable[layout.duration])
-    costate = {}
     for row in transcription.rows:
-        if row.phase == p and row.kind == "dynamics":
-            costate[row.name] = by_constraint[row.rows].sum(axis=1)
-        elif row.phase == p:
+        if row.phase == p and row.kind != "dynamics":
             name = f"{row.kind}: {row.name}" if row.name in values else row.name
             values[name] = by_constraint[row.rows] if row.rows.size > 1 else float(by_constraint[row.rows[0]])
-    return Multipliers(values, costate)
+    return Multipliers(values, costates_of(transcription, solution, p))
+
+
+def costates_of(transcription: Transcription, solution: Solution, p: int) -> dict[str, np.ndarray]:
+    """The derivatives (N + 1,) of the least cost with respect to sudden changes of each state at the ends of intervals.
+
+    The multipliers m_j of an interval are not costates. At its first node, the costate is the derivative of what the
+    interval adds to the Lagrangian by the state y_0 there, and at the end of the motion, minus that by the last state:
+
+        p = h b_0 dl/dy_0 + sum_j m_j . (-1 - h A_j0 df/dy_0)
+
+    These are the nodes of the adjoint Lobatto IIIB method (W. Hager, Runge-Kutta methods in optimal control and the
+    transformed adjoint system, Numerische Mathematik 87, 2000).
+    """
+    program, layout, z = transcription.program, transcription.layouts[p], solution.z
+    J: Any = scipy.sparse.csr_matrix((program.jacobian(z), program.jacobian_structure), (program.m, program.n))
+    rows = np.stack([row.rows for row in transcription.rows if row.phase == p and row.kind == "dynamics"], axis=-1)
+    rows, steps = rows.reshape(len(rows), -1), np.diff(layout.mesh)  # (N, (s - 1) n_y)
+    columns = layout.node(np.arange(len(rows) + 1) * layout.every)[:, : rows.shape[1] // layout.every]
+    integral = transcription.gradient_of_integrals(z)[columns]
+    shares = np.append(steps, 0.0) / (np.append(steps, 0.0) + np.append(0.0, steps))  # of the interval after a node
+    of_rows = [solution.multipliers[r] @ J[r][:, c] for r, c in zip(rows, columns)]
+    of_rows.append(solution.multipliers[rows[-1]] @ J[rows[-1]][:, columns[-1]])
+    found = shares[:, None] * integral + np.array(of_rows)
+    found[-1] = -integral[-1] - of_rows[-1]
+    return dict(zip(layout.problem.names, (found * program.f_scale / program.x_scale[columns]).T, strict=True))
 
 
 def unmet_of(transcription: Transcription, solution: Solution, p: int, tolerance: float = 1e-6) -> dict[str, float]:
