@@ -195,6 +195,25 @@ def test_a_path_that_fixed_ends_imply_is_dropped_there():
     assert plan.notes == ("dropped, because others imply it: circle at the start, circle at the end",)
 
 
+class Metered(Sled):
+    inputs = ("force", "size")
+
+
+def test_the_integral_of_an_absolute_value():
+    """Push for s, coast, brake for s, where s (3 - s) = 1. The function abs has no derivative while the sled coasts."""
+    found = solved(duration=3.0, controls={"force": (-1.0, 1.0)}, cost=lambda t, now: jnp.abs(now["force"]))
+    assert not found.ok
+    assert "`cost` contains abs" in found.notes[0]
+    plan = solve(
+        problem(
+            3.0, Metered(), controls={"force": (-1.0, 1.0), "size": (0.0, 1.0)}, cost=lambda t, now: now["size"],
+            path=lambda t, now: {"above": now["size"] - now["force"], "below": now["size"] + now["force"]},
+        ), intervals=30, tolerance=None,
+    )  # fmt: skip
+    assert plan.ok
+    assert plan.cost == pytest.approx(3.0 - 5.0**0.5, abs=1e-3)
+
+
 BICYCLE = jk.catalog.WhippleBicycle.benchmark()
 
 

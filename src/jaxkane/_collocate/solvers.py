@@ -347,7 +347,7 @@ def _has_negative_curvature(program: NonlinearProgram, border: np.ndarray, solut
         for _ in range(2):  # a single orthogonalization leaves rounding errors, which grow
             w = w - V[: k + 1].T @ (V[: k + 1] @ w)
         beside.append(float(np.linalg.norm(w)))
-        if beside[-1] < 1e-9 * max(np.abs(diagonal)):
+        if beside[-1] <= 1e-9 * max(np.abs(diagonal)):  # both are zero in a linear problem
             break
         V[k + 1] = w / beside[-1]
     _, vectors = scipy.linalg.eigh_tridiagonal(diagonal, beside[: len(diagonal) - 1])

@@ -33,6 +33,7 @@ from .functions import (
     Variables,
     bounds_of,
     constraints_of,
+    corners_of,
     named,
 )
 from .lobatto import Lobatto
@@ -333,6 +334,18 @@ class Transcription:
             elif not np.all(np.isfinite(block.jacobian(x))):
                 found.append(f"the derivative of `{label}`")
         return found
+
+    def corners(self) -> list[str]:
+        """The functions of the user that contain primitives without a derivative at some places, in words."""
+        found = {}
+        for layout in self.layouts:
+            node = jax.tree.map(lambda a: jnp.asarray(a)[0], layout.node_data(layout.s[:1]))
+            for label in ("cost", "final_cost", "path"):
+                f = getattr(layout.problem, label)
+                make = (lambda v, f: Path(v, (), f)) if label == "path" else Integrand
+                if f is not None and (names := corners_of(make(layout.variables, f), node)):
+                    found[label] = f"`{label}` contains {', '.join(names)}"
+        return [*found.values()]
 
     def theta(self, x: np.ndarray) -> np.ndarray:
         return x[self.shared_parameters]

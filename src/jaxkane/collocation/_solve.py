@@ -259,11 +259,13 @@ class _Search:
             prefix = f"phase {p}: " * (len(problems) > 1)
             names += [prefix + name for name in dict.fromkeys(clipped) if name in given]
         plan = self._refined(transcription, meshes, is_warm)
-        clip, drop = (
-            "the guess was clipped to the ends and bounds of the problem: ",
-            "dropped, because others imply it: ",
-        )
-        notes = [words + ", ".join(x) for words, x in ((clip, names), (drop, transcription.implied)) if x]
+        found = {"clipped in the guess, because of an end or a bound": names,
+                 "dropped, because others imply it": transcription.implied}  # fmt: skip
+        notes = [f"{words}: {', '.join(each)}" for words, each in found.items() if each]
+        if not plan.ok and (corners := transcription.corners()):
+            notes.append(
+                f"{', '.join(corners)}, which has no derivative at its corner: use slack controls (docs/optimal_control.md)"
+            )
         return dataclasses.replace(plan, notes=(*notes, *plan.notes))
 
     def _refined(self, transcription: Transcription, meshes: Sequence[np.ndarray], is_warm: bool) -> Plan:
