@@ -233,6 +233,51 @@ def test_redundant_boundary_conditions_are_rejected():
         Problem(rod, 1.0, controls=[], start={"y": 0.0, "x": 0.9})
 
 
+LIMITED = {"controls": {"force": (-1.0, 1.0)}}
+INFEASIBLE = {  # what is infeasible, and what the report must name
+    "short": (lambda: problem(**LIMITED), {"x at the end", "force at its upper bound (0 to 0.475 s)"}),
+    "far": (
+        lambda: problem(2.5, end=None, within={"x": (-2.0, 2.0)}, conditions=lambda a, b, d: {"far": b["x"] - 5.0}),
+        {"far", "x at its upper bound (2.5 s)"},
+    ),
+    "speed": (lambda: problem(within={"v": (-1.0, 0.9)}), {"v at its upper bound (0.025 to 0.975 s)", "x at the end"}),
+    "duration": (lambda: problem((0.5, 1.5), **LIMITED), {"duration at its upper bound"}),
+    "slow": (lambda: problem(2.5, path=lambda t, now: {"slow": 0.3 - now["v"]}), {"slow (0.375 to 2.12 s)"}),
+    "both": (
+        lambda: problem(end=None, conditions=lambda a, b, d: {"one": b["x"] - 1.0, "two": b["x"] - 2.0}), {"one", "two"}
+    ),
+    "stop": (
+        lambda: problem(2.5, start={"x": 0.0, "v": 3.0}, within={"x": (-0.1, 1.2)}, **LIMITED),
+        {"v at the start", "x at its upper bound (1.44 s)", "force at its lower bound (0 to 1.44 s)"},
+    ),
+    "control": (
+        lambda: Problem(Puck(), 1.0, controls=["fx"], start={"y": 0.0, "vy": 0.0}, end={"y": 1.0}), {"y at the end"}
+    ),
+    "phases": (
+        lambda: Phases([problem(end={"x": 0.5}, **LIMITED), problem(0.8, start=None, **LIMITED)], [None]),
+        {"link 0: x", "phase 1: x at the end"},
+    ),
+    "ball": (
+        lambda: Problem(
+            Puck(), 2.0, controls={"fx": (-9.0, 9.0), "fy": (-0.1, 0.1)}, cost=lambda t, now: now["fx"] ** 2,
+            start={"x": 0.0, "y": 0.1, "vx": 0.0, "vy": 0.0}, end={"x": 2.0, "y": 0.1},
+            path=lambda t, now: {"ball": (now["x"] - 1.0) ** 2 + now["y"] ** 2 - 0.64},
+        ),
+        {"ball", "fy at its upper bound"},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow_cases(all_but=["short", "far"])
+@pytest.mark.parametrize("name", INFEASIBLE)
+def test_the_cause_of_an_infeasible_problem(name):
+    make, causes = INFEASIBLE[name]
+    plan = solve(make(), intervals=20)
+    assert not plan.ok
+    assert all(any(text.startswith(cause) for text in plan.conflict) for cause in causes), plan.conflict
+    assert plan.conflict[0] in plan.report()
+
+
 @pytest.mark.slow
 def test_an_infeasible_problem_reports_its_violated_constraints():
     plan = solved(controls={"force": (-1.0, 1.0)})

@@ -296,3 +296,44 @@ class NonlinearProgram:
             x = z * self.x_scale
             known = self._memory[evaluate] = key, [evaluate(b, x) for b in self._blocks]
         return known[1]
+
+
+class Elastic(NonlinearProgram):
+    """Minimize how much the constraints are violated: sum of weights . (a + b), with g(z) + a - b instead of g(z).
+
+    The bounds of the variables hold. The multipliers tell which bounds and constraints cause the violation.
+
+    - `z`: the scaled variables of a program, then a (m,) >= 0 and b (m,) >= 0.
+    """
+
+    def __init__(self, program: NonlinearProgram, weights: np.ndarray):
+        self.inner, self.m, self.n, self.f_scale = program, program.m, program.n + 2 * program.m, 1.0
+        self.slope = np.concatenate([np.zeros(program.n), weights, weights])
+        self.lower = np.append(program.lower, np.zeros(2 * self.m))
+        self.upper = np.append(program.upper, np.full(2 * self.m, np.inf))
+        self.g_lower, self.g_upper, self.is_implied = program.g_lower, program.g_upper, program.is_implied
+        self.hessian_structure, every = program.hessian_structure, np.arange(self.m)
+        new = np.concatenate([every, every]), np.arange(program.n, self.n)
+        self.jacobian_structure = tuple(
+            np.append(old, x) for old, x in zip(program.jacobian_structure, new, strict=True)
+        )
+
+    def guess(self, z: np.ndarray) -> np.ndarray:
+        g = self.inner.constraints(z)
+        return np.concatenate([z, np.maximum(self.g_lower - g, 0.0), np.maximum(g - self.g_upper, 0.0)])
+
+    def objective(self, z: np.ndarray) -> float:
+        return float(self.slope @ z)
+
+    def gradient(self, z: np.ndarray, blocks: Sequence[int] | None = None) -> np.ndarray:
+        return self.slope
+
+    def constraints(self, z: np.ndarray) -> np.ndarray:
+        a, b = z[self.inner.n :].reshape(2, self.m)
+        return self.inner.constraints(z[: self.inner.n]) + a - b
+
+    def jacobian(self, z: np.ndarray) -> np.ndarray:
+        return np.concatenate([self.inner.jacobian(z[: self.inner.n]), np.ones(self.m), -np.ones(self.m)])
+
+    def hessian(self, z: np.ndarray, multipliers: np.ndarray, objective_factor: float = 1.0) -> np.ndarray:
+        return self.inner.hessian(z[: self.inner.n], multipliers, 0.0)

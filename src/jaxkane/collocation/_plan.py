@@ -58,6 +58,8 @@ class Plan:
     - `violation`: the largest scaled violation of a constraint.
     - `dual_residual`: the largest scaled violation of the conditions of a minimum.
     - `unmet`: the scaled violations of constraints that are violated by more than the tolerance, by name.
+    - `conflict`: if no motion nearby satisfies all constraints, the bounds, values at the ends and constraints that
+        cause this, with their times, the most important one first.
     - `active`: the names of bounds and inequality constraints that are active somewhere.
     - `notes`: remarks as sentences, such as the names of what was clipped in the guess.
     - `starts`: if there were several guesses, the cost and the result of each.
@@ -82,6 +84,7 @@ class Plan:
     dual_residual: float
     unmet: dict[str, float]
     active: tuple[str, ...]
+    conflict: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     starts: tuple[tuple[float, str], ...] = ()
     phases: tuple[Plan, ...] = ()
@@ -207,6 +210,8 @@ class Plan:
         if self.unmet:
             worst = sorted(self.unmet.items(), key=lambda item: -item[1])[:8]
             lines.append("not met: " + ", ".join(f"{name} (by {x:.1e})" for name, x in worst))
+        if self.conflict:
+            lines.append("in conflict near this motion: " + ", ".join(self.conflict))
         lines.append("active: " + (", ".join(self.active) or "no bounds"))
         if len(self.costs) > 1:
             lines.append(f"cost on the last two meshes: {self.costs[-2]:.10g}, {self.costs[-1]:.10g}")

@@ -14,10 +14,11 @@ import scipy.sparse
 from jaxtyping import Array
 
 from .._collocate.lobatto import Lobatto, lobatto
-from .._collocate.program import NonlinearProgram
+from .._collocate.program import Elastic, NonlinearProgram
 from .._collocate.solvers import (
     INTERRUPTED,
     NOT_FINITE,
+    TIME_IS_UP,
     Effort,
     Solution,
     casadi,
@@ -263,9 +264,8 @@ class _Search:
                  "dropped, because others imply it": transcription.implied}  # fmt: skip
         notes = [f"{words}: {', '.join(each)}" for words, each in found.items() if each]
         if not plan.ok and (corners := transcription.corners()):
-            notes.append(
-                f"{', '.join(corners)}, which has no derivative at its corner: use slack controls (docs/optimal_control.md)"
-            )
+            corners = ", ".join(corners)
+            notes.append(f"{corners}, without a derivative at the corner: use slack controls (docs/optimal_control.md)")
         return dataclasses.replace(plan, notes=(*notes, *plan.notes))
 
     def _refined(self, transcription: Transcription, meshes: Sequence[np.ndarray], is_warm: bool) -> Plan:
@@ -333,6 +333,23 @@ class _Search:
         solution = minimized(program, transcription.z, self.effort, is_warm=is_warm, options=self.options)
         return refused_unless_minimum(program, transcription.shared, solution)
 
+    def _conflict(self, transcription: Transcription, solution: Solution) -> tuple[str, ...]:
+        """The cause of an infeasible problem, from an elastic one: equations of motion are violated first."""
+        program = transcription.program
+        if (
+            solution.ok
+            or program.violation(solution.z) <= 1e-6
+            or solution.status in (INTERRUPTED, TIME_IS_UP, NOT_FINITE)
+        ):
+            return ()
+        weights = np.full(program.m, 1e3)
+        for row in transcription.rows:
+            if row.kind == "dynamics":
+                weights[row.rows] = 1.0
+        elastic = Elastic(program, weights)
+        found = minimized(elastic, elastic.guess(transcription.z), self.effort, options=self.options)
+        return conflict_of(transcription, elastic, found) if found.ok and elastic.objective(found.z) > 1e-6 else ()
+
     def _errors(self, transcription: Transcription, x: np.ndarray) -> list[np.ndarray]:
         """The error of each interval: of states, relative to their sizes, and, if the mesh may be refined, of the cost,
         relative to the whole."""
@@ -377,6 +394,7 @@ class _Search:
             "iterations": self.effort.iterations,
             "violation": program.violation(solution.z),
             "dual_residual": dual_residual(program, solution),
+            "conflict": self._conflict(transcription, solution),
             "estimates": dict(zip(() if parameters is None else parameters.names, map(float, values), strict=True)),
         }
         plans = [
@@ -457,13 +475,55 @@ def dual_residual(program: NonlinearProgram, solution: Solution) -> float:
     return float(np.max(np.abs(residual[program.lower < program.upper]), initial=0.0))
 
 
+def of_bounds(program: NonlinearProgram, solution: Solution) -> np.ndarray:
+    """The multipliers (n,) of all bounds. IPOPT omits fixed variables."""
+    fixed = program.lower >= program.upper
+    return np.where(fixed, -lagrangian_gradient(program, solution), solution.bound_multipliers)
+
+
+def conflict_of(transcription: Transcription, program: Elastic, solution: Solution) -> tuple[str, ...]:
+    """The bounds, fixed values and constraints with the largest multipliers, with their times, the largest first.
+
+    **Arguments:**
+
+    - `program`, `solution`: the elastic problem of the transcription.
+    """
+    multipliers, found = of_bounds(program, solution), {}
+
+    def add(label: str, sizes: np.ndarray, t: np.ndarray | None = None) -> None:
+        if np.max(sizes) > 0:
+            when = [] if t is None else [f"{x:.3g}" for x in t[sizes > 1e-2 * np.max(sizes)][[0, -1]]]
+            found[f"{label} ({' to '.join(dict.fromkeys(when))} s)" if when else label] = float(np.sum(sizes))
+
+    for p, layout in enumerate(transcription.layouts):
+        prefix = f"phase {p}: " * (len(transcription.layouts) > 1)
+        duration = transcription.motions(solution.z[: transcription.n] * transcription.x_scale)[p].duration
+        for name, at in layout.by_name.items():
+            fixed, x, t = program.lower[at] >= program.upper[at], multipliers[at], layout.s * duration
+            for side, sizes in (("lower", -x), ("upper", x)):
+                add(
+                    f"{prefix}{name} at its {side} bound",
+                    np.where(fixed, 0.0, np.maximum(sizes, 0.0)),
+                    t if len(at) > 1 else None,
+                )
+            for label, k in (("start", 0), ("end", -1)):
+                if fixed[k]:
+                    add(f"{prefix}{name} at the {label}", np.abs(x[[k]]))
+        for row in transcription.rows:
+            if row.phase == p and row.kind != "dynamics":
+                add(
+                    prefix * (row.kind != "links") + row.name,
+                    np.abs(solution.multipliers[row.rows]),
+                    t if row.kind == "path" else None,
+                )
+    order = sorted(found, key=lambda label: -found[label])
+    return tuple(label for label in order if found[label] > 0.1 * found[order[0]])[:8]
+
+
 def multipliers_of(transcription: Transcription, solution: Solution, p: int) -> Multipliers:
     """See `Multipliers`. The derivative of the cost with respect to a bound is minus the multiplier of the bound."""
     program, layout = transcription.program, transcription.layouts[p]
-    of_bounds = solution.bound_multipliers.copy()
-    fixed = program.lower >= program.upper
-    of_bounds[fixed] = -lagrangian_gradient(program, solution)[fixed]  # solvers omit fixed variables
-    by_variable = -of_bounds * program.f_scale / program.x_scale
+    by_variable = -of_bounds(program, solution) * program.f_scale / program.x_scale
     by_constraint = -solution.multipliers * program.f_scale / program.g_scale
     values: dict[str, Any] = {name: by_variable[at] for name, at in layout.by_name.items()}
     if layout.duration is not None:
