@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -255,17 +253,6 @@ class Link(eqx.Module):
             after = last.after(self.how)
             values = [last.event(self.how), *(first[name] - after[name] for name in self.linked)]
         return jnp.stack(values)
-
-
-def corners_of(function: Integrand | Path, node: Node) -> list[str]:
-    """The primitives in a function of the user that have no derivative at some places, such as abs.
-
-    Maps of free parameters are not those of the user, so they are left out.
-    """
-    variables = dataclasses.replace(function.variables, parameters=None)
-    x = jnp.zeros(variables.n_z + (variables.duration is None))
-    text = str(jax.make_jaxpr(dataclasses.replace(function, variables=variables))(node, x))
-    return sorted(set(re.findall(r"\] = (abs|sign|max|min|floor|ceil|round)\b", text)))
 
 
 def called(label: str, f: Callable[..., Any], *args: Any) -> Any:

@@ -182,6 +182,7 @@ class NonlinearProgram:
         self.lower, self.upper = x_bounds.lower / x_scale, x_bounds.upper / x_scale
         self.g_lower, self.g_upper = g_bounds.lower / g_scale, g_bounds.upper / g_scale
         self.is_implied = np.zeros(self.m, bool)  # constraints that follow from the others: IPOPT does not get them
+        self.slope = np.zeros(self.n)  # a linear part of the scaled cost
         self._blocks = list(blocks)
         sizes = [b.B * b.block.size for b in self._blocks]
         for k, w, S in zip(sizes, weights, constraints, strict=True):
@@ -241,7 +242,8 @@ class NonlinearProgram:
     def objective(self, z: np.ndarray) -> float:
         """The scaled cost at scaled variables."""
         values = self._remembered(EvaluatedBlock.values, z)
-        return float(sum(w @ v.ravel() for w, v in zip(self._weights, values, strict=True)) / self.f_scale)
+        f = sum(w @ v.ravel() for w, v in zip(self._weights, values, strict=True)) / self.f_scale
+        return float(f + self.slope @ z)
 
     def gradient(self, z: np.ndarray, blocks: Sequence[int] | None = None) -> np.ndarray:
         """The derivatives (n,) of `objective`, or of the part of it that some blocks have."""
@@ -249,7 +251,26 @@ class NonlinearProgram:
         total = np.zeros(self.n)
         for i in range(len(self._blocks)) if blocks is None else blocks:
             total += self._gradient_maps[i] @ entries[i].ravel()
-        return total * self.x_scale / self.f_scale
+        return total * self.x_scale / self.f_scale + self.slope
+
+    def elastic(self, weights: np.ndarray) -> NonlinearProgram:
+        """The program of the least violation: minimize weights . (a + b), with g + a - b instead of g, a >= 0, b >= 0.
+
+        The variables are those of this program, then a (n_g,) and b (n_g,). The bounds of the variables hold.
+        """
+        D, none = scipy.sparse.diags_array(self.g_scale), np.zeros(2 * self.m)
+        new = NonlinearProgram(
+            self._blocks,
+            [None] * len(self._blocks),
+            self._S,
+            scipy.sparse.hstack([self._A, D, -D]),
+            Bounds(np.append(self.lower * self.x_scale, none), np.append(self.upper * self.x_scale, none + np.inf)),
+            Bounds(self.g_lower * self.g_scale, self.g_upper * self.g_scale),
+            np.append(self.x_scale, none + 1.0),
+            self.g_scale,
+        )
+        new.slope, new.is_implied = np.concatenate([np.zeros(self.n), weights, weights]), self.is_implied
+        return new
 
     def constraints(self, z: np.ndarray) -> np.ndarray:
         """The scaled constraints (n_g,)."""
@@ -296,44 +317,3 @@ class NonlinearProgram:
             x = z * self.x_scale
             known = self._memory[evaluate] = key, [evaluate(b, x) for b in self._blocks]
         return known[1]
-
-
-class Elastic(NonlinearProgram):
-    """Minimize how much the constraints are violated: sum of weights . (a + b), with g(z) + a - b instead of g(z).
-
-    The bounds of the variables hold. The multipliers tell which bounds and constraints cause the violation.
-
-    - `z`: the scaled variables of a program, then a (m,) >= 0 and b (m,) >= 0.
-    """
-
-    def __init__(self, program: NonlinearProgram, weights: np.ndarray):
-        self.inner, self.m, self.n, self.f_scale = program, program.m, program.n + 2 * program.m, 1.0
-        self.slope = np.concatenate([np.zeros(program.n), weights, weights])
-        self.lower = np.append(program.lower, np.zeros(2 * self.m))
-        self.upper = np.append(program.upper, np.full(2 * self.m, np.inf))
-        self.g_lower, self.g_upper, self.is_implied = program.g_lower, program.g_upper, program.is_implied
-        self.hessian_structure, every = program.hessian_structure, np.arange(self.m)
-        new = np.concatenate([every, every]), np.arange(program.n, self.n)
-        self.jacobian_structure = tuple(
-            np.append(old, x) for old, x in zip(program.jacobian_structure, new, strict=True)
-        )
-
-    def guess(self, z: np.ndarray) -> np.ndarray:
-        g = self.inner.constraints(z)
-        return np.concatenate([z, np.maximum(self.g_lower - g, 0.0), np.maximum(g - self.g_upper, 0.0)])
-
-    def objective(self, z: np.ndarray) -> float:
-        return float(self.slope @ z)
-
-    def gradient(self, z: np.ndarray, blocks: Sequence[int] | None = None) -> np.ndarray:
-        return self.slope
-
-    def constraints(self, z: np.ndarray) -> np.ndarray:
-        a, b = z[self.inner.n :].reshape(2, self.m)
-        return self.inner.constraints(z[: self.inner.n]) + a - b
-
-    def jacobian(self, z: np.ndarray) -> np.ndarray:
-        return np.concatenate([self.inner.jacobian(z[: self.inner.n]), np.ones(self.m), -np.ones(self.m)])
-
-    def hessian(self, z: np.ndarray, multipliers: np.ndarray, objective_factor: float = 1.0) -> np.ndarray:
-        return self.inner.hessian(z[: self.inner.n], multipliers, 0.0)

@@ -99,11 +99,10 @@ class Monitor:
 
     - `program`: the nonlinear program.
     - `effort`: its iterations are counted, and its time is limited.
-    - `tolerance`: the largest violation of a feasible iterate.
     """
 
-    def __init__(self, program: NonlinearProgram, effort: Effort, tolerance: float = 1e-6):
-        self.program, self.effort, self.tolerance = program, effort, tolerance
+    def __init__(self, program: NonlinearProgram, effort: Effort):
+        self.program, self.effort = program, effort
         self.best: np.ndarray | None = None
         self.error: BaseException | None = None
         self.is_interrupted = False
@@ -114,7 +113,7 @@ class Monitor:
         """Record an iterate. **Returns:** whether to stop."""
         if self.error is None:
             cost, violation = self.program.objective(z), self.program.violation(z)
-            merit = (0.0, cost) if violation <= self.tolerance else (violation, cost)
+            merit = (0.0, cost) if violation <= 1e-6 else (violation, cost)
             if merit <= self._best_merit:
                 self._best_merit, self.best = merit, z.copy()
             self.iterations += 1

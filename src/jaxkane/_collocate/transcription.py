@@ -9,7 +9,9 @@ the free parameters. With F = duration * y_dot, the equations of motion in an in
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -33,7 +35,6 @@ from .functions import (
     Variables,
     bounds_of,
     constraints_of,
-    corners_of,
     named,
 )
 from .lobatto import Lobatto
@@ -336,16 +337,16 @@ class Transcription:
         return found
 
     def corners(self) -> list[str]:
-        """The functions of the user that contain primitives without a derivative at some places, in words."""
-        found = {}
-        for layout in self.layouts:
-            node = jax.tree.map(lambda a: jnp.asarray(a)[0], layout.node_data(layout.s[:1]))
-            for label in ("cost", "final_cost", "path"):
-                f = getattr(layout.problem, label)
-                make = (lambda v, f: Path(v, (), f)) if label == "path" else Integrand
-                if f is not None and (names := corners_of(make(layout.variables, f), node)):
-                    found[label] = f"`{label}` contains {', '.join(names)}"
-        return [*found.values()]
+        """The costs that contain primitives without a derivative at some places, in words."""
+        found = []
+        for label, layout in itertools.product(("cost", "final_cost"), self.layouts):
+            if f := getattr(layout.problem, label):
+                node = jax.tree.map(lambda a: jnp.asarray(a)[0], layout.node_data(layout.s[:1]))
+                variables = dataclasses.replace(layout.variables, parameters=None)  # their maps are not the user's
+                x = jnp.zeros(variables.n_z + (variables.duration is None))
+                text = str(jax.make_jaxpr(Integrand(variables, f))(node, x))
+                found += [f"`{label}` contains {name}" for name in re.findall(r"\] = (abs|sign|max|min)\b", text)]
+        return [*dict.fromkeys(found)]
 
     def theta(self, x: np.ndarray) -> np.ndarray:
         return x[self.shared_parameters]
@@ -494,13 +495,9 @@ class Transcription:
                 )
 
     def _drop_implied(self) -> list[str]:
-        """Drop constraints that others imply: those of fixed values, and path equalities at the ends of a phase.
+        """Drop constraints of fixed values, and path equalities at ends that others imply, and return the equalities.
 
-        IPOPT would need hundreds of iterations: the Jacobian of all constraints is singular.
-
-        **Returns:** the names of the equalities.
-
-        **Raises:** `ValueError` if a constraint contradicts fixed values.
+        With them the Jacobian of all constraints is singular, and IPOPT needs hundreds of iterations.
         """
         program, free = self.program, self.program.lower < self.program.upper
         names, of_ends, others = {}, [], []
@@ -522,27 +519,17 @@ class Transcription:
         program.is_implied |= off
         is_equality = program.g_lower == program.g_upper
         order = [i for i in (*others, *of_ends) if is_equality[i] and not off[i]]
-        if any(i in of_ends for i in order):
-            beside = np.clip(self.z + np.random.default_rng(0).uniform(-0.1, 0.1, self.n), program.lower, program.upper)
-            both = self._dependent(self.z, order) & self._dependent(beside, order)
-            program.is_implied[[i for i in both if i in of_ends]] = True
+        dependent = {i for i in order if i in of_ends}
+        beside = np.clip(self.z + np.random.default_rng(0).uniform(-0.1, 0.1, self.n), program.lower, program.upper)
+        for z in (self.z, beside) if dependent else ():  # gradients may depend on each other at the guess by chance
+            J: Any = scipy.sparse.csr_matrix((program.jacobian(z), (rows, columns)), (program.m, program.n))
+            A = J[order][:, free].toarray()
+            size = np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
+            A = A / size if np.all(np.isfinite(size)) else np.eye(len(A))  # beside the guess it may not be finite
+            ranks = [np.linalg.matrix_rank(A[:k], tol=1e-8) if k else 0 for k in range(len(A) + 1)]
+            dependent &= {i for i, before, after in zip(order, ranks, ranks[1:]) if before == after}
+        program.is_implied[[*dependent]] = True
         return [names[i] for i in np.flatnonzero(program.is_implied & is_equality)]
-
-    def _dependent(self, z: np.ndarray, order: Sequence[int]) -> set[int]:
-        """The constraints whose gradients, without fixed variables, depend on those of the constraints before them."""
-        program, found, basis = self.program, set(), np.zeros((0, self.n))
-        J: Any = scipy.sparse.csr_matrix((program.jacobian(z), program.jacobian_structure), (program.m, program.n))
-        for i in order:
-            a = np.where(program.lower < program.upper, J[i].toarray()[0], 0.0)
-            rest = a / max(float(np.linalg.norm(a)), 1e-300)
-            for _ in range(2):
-                rest = rest - basis.T @ (basis @ rest)
-            size = float(np.linalg.norm(rest))
-            if size < 1e-8:
-                found.add(i)
-            else:
-                basis = np.concatenate([basis, rest[None] / size])
-        return found
 
     def _cost_scale(self) -> float:
         # The size of the cost at the guess, or one third of a scale away from it: at the guess it may be zero.

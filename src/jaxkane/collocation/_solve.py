@@ -14,7 +14,7 @@ import scipy.sparse
 from jaxtyping import Array
 
 from .._collocate.lobatto import Lobatto, lobatto
-from .._collocate.program import Elastic, NonlinearProgram
+from .._collocate.program import NonlinearProgram
 from .._collocate.solvers import (
     INTERRUPTED,
     NOT_FINITE,
@@ -260,12 +260,11 @@ class _Search:
             prefix = f"phase {p}: " * (len(problems) > 1)
             names += [prefix + name for name in dict.fromkeys(clipped) if name in given]
         plan = self._refined(transcription, meshes, is_warm)
-        found = {"clipped in the guess, because of an end or a bound": names,
-                 "dropped, because others imply it": transcription.implied}  # fmt: skip
-        notes = [f"{words}: {', '.join(each)}" for words, each in found.items() if each]
+        notes = [f"clipped in the guess, because of an end or a bound: {', '.join(names)}"] if names else []
+        if transcription.implied:
+            notes.append(f"dropped, because others imply it: {', '.join(transcription.implied)}")
         if not plan.ok and (corners := transcription.corners()):
-            corners = ", ".join(corners)
-            notes.append(f"{corners}, without a derivative at the corner: use slack controls (docs/optimal_control.md)")
+            notes.append(f"{', '.join(corners)}, which has a corner: use slack controls (docs/optimal_control.md)")
         return dataclasses.replace(plan, notes=(*notes, *plan.notes))
 
     def _refined(self, transcription: Transcription, meshes: Sequence[np.ndarray], is_warm: bool) -> Plan:
@@ -346,8 +345,9 @@ class _Search:
         for row in transcription.rows:
             if row.kind == "dynamics":
                 weights[row.rows] = 1.0
-        elastic = Elastic(program, weights)
-        found = minimized(elastic, elastic.guess(transcription.z), self.effort, options=self.options)
+        elastic, g = program.elastic(weights), program.constraints(transcription.z)
+        slacks = np.maximum(program.g_lower - g, 0.0), np.maximum(g - program.g_upper, 0.0)
+        found = minimized(elastic, np.concatenate([transcription.z, *slacks]), self.effort, options=self.options)
         return conflict_of(transcription, elastic, found) if found.ok and elastic.objective(found.z) > 1e-6 else ()
 
     def _errors(self, transcription: Transcription, x: np.ndarray) -> list[np.ndarray]:
@@ -481,41 +481,27 @@ def of_bounds(program: NonlinearProgram, solution: Solution) -> np.ndarray:
     return np.where(fixed, -lagrangian_gradient(program, solution), solution.bound_multipliers)
 
 
-def conflict_of(transcription: Transcription, program: Elastic, solution: Solution) -> tuple[str, ...]:
-    """The bounds, fixed values and constraints with the largest multipliers, with their times, the largest first.
-
-    **Arguments:**
-
-    - `program`, `solution`: the elastic problem of the transcription.
-    """
+def conflict_of(transcription: Transcription, program: NonlinearProgram, solution: Solution) -> tuple[str, ...]:
+    """The bounds, fixed values and constraints with the largest multipliers in the elastic problem, and their times."""
     multipliers, found = of_bounds(program, solution), {}
+    motions = transcription.motions(solution.z[: transcription.n] * transcription.x_scale)
 
-    def add(label: str, sizes: np.ndarray, t: np.ndarray | None = None) -> None:
+    def add(label: str, sizes: np.ndarray, t: np.ndarray) -> None:
         if np.max(sizes) > 0:
-            when = [] if t is None else [f"{x:.3g}" for x in t[sizes > 1e-2 * np.max(sizes)][[0, -1]]]
-            found[f"{label} ({' to '.join(dict.fromkeys(when))} s)" if when else label] = float(np.sum(sizes))
+            when = dict.fromkeys(f"{x:.3g}" for x in t[sizes > 1e-2 * np.max(sizes)][[0, -1]]) if len(sizes) > 1 else ()
+            found[f"{label} ({' to '.join(when)} s)" if when else label] = float(np.sum(sizes))
 
-    for p, layout in enumerate(transcription.layouts):
-        prefix = f"phase {p}: " * (len(transcription.layouts) > 1)
-        duration = transcription.motions(solution.z[: transcription.n] * transcription.x_scale)[p].duration
+    for p, (layout, motion) in enumerate(zip(transcription.layouts, motions, strict=True)):
+        prefix, t = f"phase {p}: " * (len(motions) > 1), motion.s * motion.duration
         for name, at in layout.by_name.items():
-            fixed, x, t = program.lower[at] >= program.upper[at], multipliers[at], layout.s * duration
+            fixed, x = program.lower[at] >= program.upper[at], multipliers[at]
             for side, sizes in (("lower", -x), ("upper", x)):
-                add(
-                    f"{prefix}{name} at its {side} bound",
-                    np.where(fixed, 0.0, np.maximum(sizes, 0.0)),
-                    t if len(at) > 1 else None,
-                )
+                add(f"{prefix}{name} at its {side} bound", np.where(fixed, 0.0, np.maximum(sizes, 0.0)), t)
             for label, k in (("start", 0), ("end", -1)):
-                if fixed[k]:
-                    add(f"{prefix}{name} at the {label}", np.abs(x[[k]]))
+                add(f"{prefix}{name} at the {label}", np.abs(x[[k]]) * fixed[k], t)
         for row in transcription.rows:
             if row.phase == p and row.kind != "dynamics":
-                add(
-                    prefix * (row.kind != "links") + row.name,
-                    np.abs(solution.multipliers[row.rows]),
-                    t if row.kind == "path" else None,
-                )
+                add(prefix * (row.kind != "links") + row.name, np.abs(solution.multipliers[row.rows]), t)
     order = sorted(found, key=lambda label: -found[label])
     return tuple(label for label in order if found[label] > 0.1 * found[order[0]])[:8]
 
