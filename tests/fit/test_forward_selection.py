@@ -32,7 +32,7 @@ from jaxkane.fit import (
     save_report,
 )
 from jaxkane.fit.result.linearized import LinearizedProblem, score_test, solved
-from jaxkane.fit.result.statistics import serial_correlation
+from jaxkane.fit.result.statistics import predicts_as_well, serial_correlation
 from jaxkane.fit.result.studies import energy_sources
 
 TS = np.linspace(0.0, 2.0, 41)
@@ -531,3 +531,33 @@ def test_false_positives(T, noise):
         p = [score_test(rows, [0, 1], [i], degrees_of_freedom=freedom, correlation=c).p for i in (2, 3, 4)]
         taken += min(p) < 0.05 / 3
     assert taken / 300 <= 0.06 + 2 * (0.05 * 0.95 / 300) ** 0.5, taken / 300
+
+
+@pytest.mark.parametrize("n", [3, 5, 13, 39])
+def test_one_dominating_fold_does_not_hide_that_a_model_predicts_worse(n):
+    """The other model is worse in every fold, and in one fold by far."""
+    better = np.full(n, 100.0)
+    for dominating in (0.0, 1e3, 1e6):
+        other = better + 10.0
+        other[-1] += dominating
+        assert not predicts_as_well(better, other)
+    assert not predicts_as_well(np.append(better[1:], 1e4), np.append(better[1:] + 10.0, 1e6))
+    assert predicts_as_well(better, better * (1 + 1e-12))
+    assert not predicts_as_well(better, np.append(better[1:], np.inf))
+
+
+def comparisons(n, factor, heavy, rng, sets=300):
+    """The share of pairs of models that `predicts_as_well` separates, of `n` folds. One model is worse by `factor`."""
+    draw = (lambda: rng.standard_t(3, (sets, n)) / 3**0.5) if heavy else lambda: rng.standard_normal((sets, n))
+    size = 100 * np.exp(0.5 * draw())
+    pairs = zip(size * np.exp(0.2 * draw()), factor * size * np.exp(0.2 * draw()), strict=True)
+    return np.mean([not predicts_as_well(*sorted(pair, key=np.sum)) for pair in pairs])
+
+
+@pytest.mark.parametrize("heavy", [False, True])
+def test_comparison_of_held_out_costs_has_its_level_and_power(heavy):
+    """docs/uncertainty.md has the figures of 1000 pairs."""
+    rng, folds = np.random.default_rng(0), (3, 5, 13, 39)
+    assert max(comparisons(n, 1.0, heavy, rng) for n in folds) < 0.09  # 5 %, and three standard deviations
+    assert min(comparisons(n, 2.0, heavy, rng) for n in folds[1:]) > 0.9
+    assert min(comparisons(n, 20.0, heavy, rng) for n in folds) > 0.99

@@ -22,7 +22,7 @@ from ..problem.specification import Names, ProblemSpec, as_items, deviations_by_
 from ..result.diagnostics import Ranges, implausible
 from ..result.fit_result import Fit
 from ..result.linearized import LinearizedProblem, linearized_problem
-from ..result.statistics import serial_correlation
+from ..result.statistics import predicts_as_well, serial_correlation
 from ..solve.optimizers import usable
 
 Bounds = tuple[float | None, float | None]
@@ -360,8 +360,7 @@ class Alternative:
     - `names`: names of its candidates.
     - `cost`: sum of squares of its fit.
     - `held_out_cost`: sum of squares of trials that are left out in turn.
-    - `is_as_good`: whether it predicts as well as the selected model, within two standard errors of the differences by
-        fold.
+    - `is_as_good`: whether it predicts as well as the selected model (`predicts_as_well`).
     """
 
     names: tuple[str, ...]
@@ -429,12 +428,8 @@ class Model:
         return self.fit.cost if self.held_out is None else self.held_out_cost
 
     def compared_with(self, best: Model) -> Alternative:
-        is_as_good = False
-        if self.held_out is not None and best.held_out is not None:
-            difference = self.held_out - best.held_out
-            error = np.std(difference, ddof=1) * math.sqrt(len(difference))
-            rounding = 1e-9 * best.held_out_cost  # equivalent models differ only by rounding errors
-            is_as_good = bool(difference.sum() <= 2.0 * error + rounding)
+        known = self.held_out is not None and best.held_out is not None
+        is_as_good = known and predicts_as_well(best.held_out, self.held_out)
         return Alternative(tuple(c.name for c in self.terms), self.fit.cost, self.held_out_cost, is_as_good)
 
 

@@ -480,6 +480,29 @@ def wald_test(step: np.ndarray, variance: np.ndarray, degrees_of_freedom: np.nda
     return float(min(1.0, len(step) * p.min()))
 
 
+def predicts_as_well(better: np.ndarray, other: np.ndarray) -> bool:
+    """Whether a model with the held-out costs `other` (K,) of K folds predicts as well as one with lower costs in sum.
+
+    Two conditions, with the 95 % quantile q of Student's t and the standard deviation s over folds:
+
+        sum_k log(other_k / better_k) <= q s(log(other / better)) K^1/2
+        sum_k (other_k - better_k) <= min(q s(better) (2 K)^1/2, sum_k better_k)
+
+    The first is a paired test in which no fold can dominate. In a test of the differences, one very bad fold increases
+    the standard error by more than the mean. The second limits the difference by the noise of two independent sums of
+    the better model, and to a factor of two.
+    """
+    difference, K = float(np.sum(other - better)), len(better)
+    if difference <= 1e-9 * np.sum(better):  # equivalent models differ only by rounding errors
+        return True
+    if not (math.isfinite(difference) and np.min(better) > 0 and np.min(other) > 0):
+        return False
+    q, ratios = t_quantile(0.95, K - 1), np.log(other / better)
+    noise = q * np.std(better, ddof=1) * (2 * K) ** 0.5
+    is_paired = np.sum(ratios) <= q * np.std(ratios, ddof=1) * K**0.5
+    return bool(is_paired and difference <= min(noise, np.sum(better)))
+
+
 def log_likelihood(problem: Problem, cost: float) -> float:
     """-cost/2 with the normalizing constants of the densities of the measurements."""
     if problem.model.has_likelihood:
