@@ -166,7 +166,8 @@ def identified(system, recording):
         laws, system = searched(fits["zeros, lengths"][0])
         free = [*(name for name in rest if "viscous" not in name), *lengths, *zeros]
         free += map(not_negative, laws)
-        fits["air, dry friction"] = fitted(system, recording, free, simulation=Simulation(step=0.0025))
+        fits["air, dry friction"] = fitted(system, recording, free, simulation=Simulation(step=0.001))
+        assert fits["air, dry friction"][0].ok
         assert np.median(fits["air, dry friction"][1][1::2]) < 0.35 * np.median(fits["zeros, lengths"][1][1::2])
     return fits
 
