@@ -55,6 +55,29 @@ def test_predictions_ignore_later_samples_and_omit_gaps(drifting):
     assert not ((after.t > 1.15) & (after.t < 1.55)).any()
 
 
+def test_predictions_start_at_the_measured_sample(drifting):
+    """x + v h + drift h^2 / 2 from each sample, in closed form. A time without a sample is omitted."""
+    result, trial = drifting
+    short = trial.between(0.0, 2.0)
+    v = 0.2 * short.t + 0.01 * np.cos(short.t)
+    v[5] = np.nan
+    both = Trial(short.t, {**short.measured, "x_dot": v}, short.inputs, sigma=SIGMA)
+    errors = predict(result, both, AHEAD, start="measured")
+    of_x = errors[errors.channel == "x"]
+    for k in (0, 10, 15):
+        for ahead, n in zip(AHEAD, (1, 5), strict=True):
+            row = of_x[(of_x.ahead == ahead) & (np.abs(of_x.t - t[k + n]) < 0.01)]
+            expected = short.measured["x"][k] + v[k] * ahead + result.estimates["drift"] * ahead**2 / 2
+            assert row.predicted.item() == pytest.approx(expected, rel=1e-6)
+    assert len(of_x) == 6  # the fourth start, at 0.5 s, has no sample of the speed
+    with pytest.raises(ValueError, match="trial has no samples of x_dot"):
+        predict(result, short, AHEAD, start="measured")
+    with pytest.raises(ValueError, match="`past` has no effect"):
+        predict(result, both, AHEAD, past=1.0, start="measured")
+    with pytest.raises(ValueError, match="must be 'estimated' or 'measured', got 'now'"):
+        predict(result, both, AHEAD, start="now")
+
+
 @pytest.mark.weekly
 def test_predictions_of_a_filter():
     exact = Trial(t[:61], {"x": 0.1 * t[:61] ** 2}, {"push": 0.0}, sigma=SIGMA)

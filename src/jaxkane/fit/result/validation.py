@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..._common.lookup import hint, positive_number, refuse_unknown
+from ..._common.lookup import hint, positive_number, refuse, refuse_unknown
 from ..._scalarjit.compat import on_device
 from ..._system.system import System
 from ..problem.declarations import Free, leaf_names
@@ -21,6 +21,7 @@ from ..problem.model import Unknowns
 from ..problem.problem import Problem, finer
 from ..problem.specification import ProblemSpec, parameters_of, refuse_other, with_options
 from ..problem.trial import Trial, as_trials, trial_names
+from ..problem.windows import state_names
 from ..solve.fit import search, uninterrupted, with_distributions
 from ..solve.linearization import Blocks, Linearization
 from ..solve.optimizers import LeastSquares, Unsimulated, solve_nuisance
@@ -61,6 +62,16 @@ def validate(fit: Fit | System, trials: Sequence[Trial] | Trial, **options: Any)
     **Raises:** `ValueError` in the cases of `fit`, for trials that do not match the system, and if no trial can be
     simulated; `TypeError` for another type of first argument, and for options passed with a `Fit`.
     """
+    return _validated(fit, trials, options)
+
+
+def _validated(
+    fit: Fit | System, trials: Sequence[Trial] | Trial, options: Mapping[str, Any], quick: bool = False
+) -> Fit:
+    """`validate`. With `quick`, the integration steps are the finest ones of the fit, and their error is not computed.
+
+    Then the parameters are not differentiated either: for many short pieces this would take most of the time.
+    """
     if isinstance(fit, System):
         # A problem needs at least one free parameter. It is fixed below, like the others.
         spec, room, method = ProblemSpec(fit, _first_number(fit), **options), None, "given values"
@@ -74,21 +85,35 @@ def validate(fit: Fit | System, trials: Sequence[Trial] | Trial, **options: Any)
         """The problem of these trials, with the tolerances and the error models of the fit. Fixed steps are chosen for
         these trials.
         """
+        problem, x = Problem.with_first_steps(spec, trials, fit.parameters if isinstance(fit, Fit) else None), None
         if isinstance(fit, Fit):
-            problem = Problem.with_first_steps(spec, trials, fit.parameters)
-            return problem.as_fine_as(fit.problem).with_errors_of(fit.problem)
-        problem = Problem.with_first_steps(spec, trials)
-        none = problem.parameters.subset((), problem.start.parameters)
+            problem, x = problem.as_fine_as(fit.problem).with_errors_of(fit.problem), fit.point.parameters
+            if not quick:
+                return problem
+            if problem.chooses_steps:
+                finest = np.min(np.asarray(fit.problem.windows.step))
+                problem = problem.with_steps(np.minimum(problem.windows.step, finest))
+        none = problem.parameters.subset((), problem.start.parameters if x is None else x)
         return dataclasses.replace(problem, model=eqx.tree_at(lambda m: m.parameters, problem.model, none))
 
     problem, failed = posed(trials), {}
     names = trial_names(problem.trials)
     while True:
-        x = fit.point.parameters if isinstance(fit, Fit) else problem.start.parameters
+        x = fit.point.parameters if isinstance(fit, Fit) and not quick else problem.start.parameters
         lost, fits = {}, []
         for part, numbers in problem.parts(room, MOST_ADDED_SAMPLES):
             first = dataclasses.replace(part.start, parameters=x)
             try:
+                if quick:
+                    # Only the samples with weight determine the initial state.
+                    has_weight = np.any(np.asarray(part.windows.weight) > 0, axis=1)  # (W, n_t)
+                    seen = np.max(np.arange(2, has_weight.shape[1] + 2) * has_weight, axis=1)
+                    whole = np.array([n for _, _, n in part.slices])
+                    point, _ = solve_nuisance(part.shortened(np.minimum(seen, whole)), first, steps=20, rtol=1e-3)
+                    at = part.linearize(point)
+                    assert at is not None  # the initial states satisfy the constraints, as in the shortened windows
+                    fits.append(Fit(part, point, at, np.full(len(whole), np.nan), (at.cost,), "validated", method))
+                    continue
                 part = finer(part, first) if part.chooses_steps else part
                 # Gauss-Newton steps converge quadratically. After a relative decrease below 1e-4, the next one is a
                 # rounding error.
@@ -347,13 +372,14 @@ def predict(
     ahead: Sequence[float] | float,
     *,
     past: float | None = None,
+    start: str = "estimated",
 ) -> pd.DataFrame:
     """Prediction errors a given time ahead, restarted along each trial.
 
     A prediction starts at a time t. The initial state and the unknowns of the trial are estimated from the measurements
     in the `past` seconds before t. The simulation then continues from t with the measured inputs. With process noise
     the filter does both. A state that is not `unknown` starts `past` seconds before t, as in `fit`. Predictions do not
-    overlap: t advances by the longest of `ahead`.
+    overlap: t advances by the longest of `ahead`. The integration steps are the finest ones of the fit.
 
         errors = predict(fit, trials, ahead=(0.01, 0.1, 0.5))
         errors.groupby(["channel", "ahead"]).error.std()
@@ -363,31 +389,54 @@ def predict(
     - `fit`: a `Fit`, whose parameters are used.
     - `trials`: trials, preferably not those of the fit.
     - `ahead`: prediction times [s], rounded to the nearest sample.
-    - `past`: duration [s] of the measurements before t that are used. By default the window length of the fit, or
-        without windows the longest of `ahead`. If offsets or delays of each trial are unknown, choose it long enough to
+    - `past`: duration [s] of the measurements before t that are used. By default so long that with the longest of
+        `ahead` it is a window of the fit, whose compiled program is then reused, but at least half of a window. Without
+        windows it is the longest of `ahead`. If offsets or delays of each trial are unknown, choose it long enough to
         estimate them.
+    - `start`: "estimated", or "measured" to start at the sample at t. Every coordinate, independent speed and state
+        must then be a channel or in `initial`, and the unknowns of the trial have their initial guesses. A time t
+        without all these samples is omitted.
 
     **Returns:** a `pandas.DataFrame` with a row for each trial, time, channel and `ahead`. The columns are `trial`,
     `channel`, `ahead` [s], `t` [s], `measured`, `predicted`, `error` (predicted - measured, in the channel's unit) and
     `residual` (error / sigma). Gaps are left out. A prediction is NaN if the trial cannot be simulated.
 
     **Raises:** `ValueError` for times that are not positive or shorter than half a sample, for trials that are all
-    shorter than `past` plus the longest of `ahead`, and in the cases of `validate`.
+    shorter than `past` plus the longest of `ahead`, for another `start`, for `past` together with `start="measured"`,
+    for a state that is then not measured, and in the cases of `validate`.
     """
     import pandas as pd
 
     refuse_other(fit, Fit, "predict", "predict(fit(...), trials, ahead=(0.1, 0.5))")
     times = np.array([positive_number(x, "predict: `ahead` [s]") for x in np.ravel(np.asarray(ahead, float))])
     spec = fit.problem.specification
-    past = (spec.window or float(times.max())) if past is None else positive_number(past, "predict: `past`")
+    from_sample, system = start == "measured", fit.problem.system
+    states = [name for name in state_names(system) if name not in system.dependent_coordinates]
+    refuse(
+        (start not in ("estimated", "measured"), f"predict: `start` must be 'estimated' or 'measured', got {start!r}."),
+        (from_sample and past is not None, "predict: `past` has no effect with start='measured'. Omit it."),
+    )
+    given = past if past is None else positive_number(past, "predict: `past`")
     pieces, origins = [], []
     for trial in as_trials(trials):
+        own = [trial.measured.get(name, trial.initial.get(name)) for name in states]
+        unmeasured = ", ".join(name for name, x in zip(states, own, strict=True) if x is None)
+        refuse(
+            (
+                from_sample and unmeasured,
+                f"predict: {trial.name} has no samples of {unmeasured}. Pass them in `initial`, or omit "
+                "start='measured'.",
+            )
+        )
         t, dt = trial.t, float(np.median(np.diff(trial.t)))
         if times.min() < 0.5 * dt:
             raise ValueError(
                 f"predict: `ahead` = {times.min():g} s is shorter than half of the sample interval of {trial.name}, "
                 f"{dt:.3g} s. Pass a longer time."
             )
+        longest = spec.window or 2 * times.max() + dt
+        past = max(longest - times.max() - dt, longest / 2) if given is None else given
+        past = 0.0 if from_sample else past
         for now in np.arange(t[0] + past, t[-1] - times.max() + 0.5 * dt, times.max()):
             piece = trial.between(max(now - past, t[0]) - 0.25 * dt, now + times.max() + 0.5 * dt)
             # Quarters of an interval, because `now` and the times of the samples differ by rounding.
@@ -396,7 +445,12 @@ def predict(
             hidden = {name: np.where(unseen, np.nan, y) for name, y in piece.measured.items()}
             if unseen.sum() < 1 or not any(np.isfinite(y).any() for y in hidden.values()):
                 continue
-            options = {"sigma": piece.sigma, "initial": piece.initial, "labels": piece.labels}
+            initial = piece.initial
+            if from_sample:  # `initial` would take precedence over the samples
+                initial = {name: x for name, x in initial.items() if name not in piece.measured}
+                if any(np.isnan(piece.measured[name][0]) for name in states if name in piece.measured):
+                    continue
+            options = {"sigma": piece.sigma, "initial": initial, "labels": piece.labels}
             pieces.append(Trial(piece.t, hidden, piece.inputs, name=str(len(pieces)), **options))
             origins.append((trial.name, piece, int(np.argmax(unseen)) - 1))
     if not pieces:
@@ -405,8 +459,9 @@ def predict(
             "Choose a shorter `past` or `ahead`."
         )
     whole = dataclasses.replace(spec, window=None, defect_std=None)
+    whole = dataclasses.replace(whole, unknown=()) if from_sample else whole
     unwindowed = dataclasses.replace(fit, problem=dataclasses.replace(fit.problem, specification=whole))
-    fitted, rows = validate(unwindowed, pieces).fitted, []
+    fitted, rows = _validated(unwindowed, pieces, {}, quick=True).fitted, []
     for number, (name, piece, last) in enumerate(origins):
         for channel, y in piece.measured.items():
             simulated = fitted[str(number)][channel] if str(number) in fitted else np.full_like(y, np.nan)
