@@ -19,7 +19,7 @@ from ..problem.problem import Problem
 from ..problem.specification import delayed_inputs
 from ..problem.trial import DEGREE, check_records, trial_names
 from ..problem.windows import first_after, state_names
-from .statistics import FEWEST_TRIALS, LARGEST_LEVERAGE, ByTrial, ResidualTest
+from .statistics import FEWEST_TRIALS, LABEL, LARGEST_LEVERAGE, ByTrial, ResidualTest, clusters_of
 
 # By status, why a fit ended.
 STATUS = {
@@ -171,8 +171,9 @@ def _residuals(fit: Any) -> Iterator[str]:
     if channels:
         text = f"The residuals are not white noise: they are correlated in time ({', '.join(channels)})."
         unit, number = fit.clusters
+        within = f"{number} {unit}s" if not unit.startswith(LABEL) else f"{number} values of the {unit}"
         yield (
-            f"{text} Intervals account for this within each of {number} {unit}s. Formal errors do not. "
+            f"{text} Intervals account for this within each of {within}. Formal errors do not. "
             "For intervals of the estimate from another run, use `cross_validate(fit).intervals()`."
             if fit.uses_clustered_errors
             else f"{text} Errors and intervals are infinite, because there are too few trials to estimate how the "
@@ -286,7 +287,8 @@ def describe_bodies(parameters: Parameters, x: Array) -> Iterator[str]:
 def _parameters(fit: Any) -> Iterator[str]:
     """Parameters that these data do not determine well, or whose estimates are suspicious."""
     of, parameters, correlation = fit.identifiability, fit.parameters, fit.correlation
-    names, learned, cluster = parameters.names, parameters.learned, fit.clusters[0]
+    names, learned = parameters.names, parameters.learned
+    cluster = clusters_of(fit.problem, fit.linearization, by_label=False)[0]
     yield from filter(None, [of.rank_message, *of.messages])
     for (name, kind), h in zip(fit.error_kinds.items(), fit._jackknife.leverage, strict=True):
         if h > LARGEST_LEVERAGE and (cluster == "trial" or kind == "none"):

@@ -211,6 +211,8 @@ class Fit(Export, Posterior):
             ending = f"converged: {', '.join(at_bound)} rests at its bound"
         elif self.status == "converged" and not self.identifiability.ok:
             ending = "the cost has converged, but not every parameter is determined"
+        elif self.status in ("converged", "bound") and self._says_nothing:
+            ending = "the cost has converged, but the interval of every parameter is its whole range"
         notes = (*self.identifiability.messages, *diagnostics.numerical_limits(self))
         return "; ".join([ending, *(note.rstrip(".") for note in notes)])
 
@@ -218,11 +220,19 @@ class Fit(Export, Posterior):
     def ok(self) -> bool:
         """Whether the fit passes all checks.
 
-        True if it converged, every parameter is determined, the integration steps are fine enough, and the values of
-        all inputs that act are recorded.
+        True if it converged, every parameter is determined, an interval is narrower than the whole range of its
+        parameter, the integration steps are fine enough, and the values of all inputs that act are recorded.
         """
-        converged = self.status in ("converged", "bound") and self.identifiability.ok
+        converged = self.status in ("converged", "bound") and self.identifiability.ok and not self._says_nothing
         return converged and not self.too_coarse and not self._unrecorded_inputs
+
+    @property
+    def _says_nothing(self) -> bool:
+        """Whether the interval of every parameter that is not at a bound is its whole range."""
+        free = ~np.isin(self.names, self.identifiability.at_bound)
+        low, high = np.array([*self.intervals().values()]).reshape(-1, 2)[free].T
+        lowest, highest = np.asarray(self.parameters.bounds).reshape(-1, 2)[free].T
+        return bool(free.any() and np.all((low <= lowest) & (high >= highest)))
 
     @functools.cached_property
     def _unrecorded_inputs(self) -> tuple[str, ...]:
@@ -258,16 +268,35 @@ class Fit(Export, Posterior):
     def clusters(self) -> tuple[str, int]:
         """The cluster unit of the cluster-robust errors, and the number of clusters.
 
-        Residuals of different clusters are assumed to be independent. The unit is "trial", "window", or "part" (of a
-        window). ("", 0) if there are too few clusters.
+        Residuals of different clusters are assumed to be independent. The unit is "label NAME" if the label NAME of the
+        trials has at least three values, otherwise "trial", "window", or "part" (of a window). ("", 0) if there are too
+        few clusters.
         """
         return statistics.clusters_of(self.problem, self.linearization)
 
     @functools.cached_property
+    def _jackknives(self) -> tuple[statistics.Jackknife, np.ndarray]:
+        """Jackknife of the parameters in their units, NaN without clusters; by parameter, whether it ignores labels.
+
+        Trials with one value of a label may be the only ones that determine a parameter. Its clusters are then those
+        without labels. The covariances between both kinds of parameters are NaN.
+        """
+        first = self._jackknife_by(True)
+        alone = first.leverage > statistics.LARGEST_LEVERAGE
+        if not (self.clusters[0].startswith(statistics.LABEL) and alone.any()):
+            return first, np.full(len(alone), False)
+        other, both = self._jackknife_by(False), alone[:, None] & alone
+        covariance = np.where(both, other.covariance, np.where(alone[:, None] | alone, np.nan, first.covariance))
+        chosen = (np.where(alone, x, y) for x, y in zip(other[1:], first[1:], strict=True))
+        return statistics.Jackknife(covariance, *chosen), alone
+
+    @property
     def _jackknife(self) -> statistics.Jackknife:
-        """Jackknife of the parameters in their units. NaN without clusters."""
+        return self._jackknives[0]
+
+    def _jackknife_by(self, by_label: bool) -> statistics.Jackknife:
         of, p = self.identifiability, len(self.names)
-        clusters = statistics.clustered(self.problem, self.point, self.linearization, of.directions)
+        clusters = statistics.clustered(self.problem, self.point, self.linearization, of.directions, by_label)
         if clusters is None:
             return statistics.Jackknife(np.full((p, p), np.nan), np.full(p, np.nan), np.full(p, np.nan))
         combinations = np.zeros((p, len(clusters.of_priors)))
@@ -307,19 +336,40 @@ class Fit(Export, Posterior):
         False with a distribution over groups: its groups are not independent trials, and its standard deviation is
         estimated for white residuals.
         """
-        kind, n = self.clusters
-        if kind == "part" and self.autocorrelation:
+        return self._is_valid(*self.clusters)
+
+    def _is_valid(self, unit: str, n: int) -> bool:
+        """Whether clusters of this unit give errors."""
+        if unit == "part" and self.autocorrelation:
             samples = sum(n for _, _, n in self.problem.slices) / n
             if samples * statistics.effective_sample_fraction(self.autocorrelation) < statistics.FEWEST_SAMPLES:
                 return False
-        return bool(kind) and not self.parameters.distributions
+        return bool(unit) and not self.parameters.distributions
 
     @functools.cached_property
     def error_kinds(self) -> dict[str, str]:
-        """By name, the kind of `errors`: "trial", "window" or "part" if clustered, "formal", or "none" if infinite."""
-        clustered = self.uses_clustered_errors & (self._jackknife.leverage <= statistics.LARGEST_LEVERAGE)
+        """By name, the kind of `errors`: "label NAME", "trial", "window" or "part" if clustered, "formal", or "none" if
+        infinite."""
+        result, ignores_labels = self._jackknives
+        other = statistics.clusters_of(self.problem, self.linearization, by_label=False)
+        units = [other if ignored else self.clusters for ignored in ignores_labels]
         kind = "none" if self.autocorrelation else "formal"
-        return {name: self.clusters[0] if c else kind for name, c in zip(self.names, clustered, strict=True)}
+        return {
+            name: unit[0] if self._is_valid(*unit) and h <= statistics.LARGEST_LEVERAGE else kind
+            for name, unit, h in zip(self.names, units, result.leverage, strict=True)
+        }
+
+    @property
+    def scope(self) -> str:
+        """The runs for which the intervals are valid, as a sentence; "" for a validated fit."""
+        if self.status == "validated":
+            return ""
+        unit, number = self.clusters
+        if unit in self.error_kinds.values() and unit.startswith(statistics.LABEL):
+            label = unit.removeprefix(statistics.LABEL)
+            return f'Intervals by "{unit}" include the spread of the estimates between {number} values of {label}.'
+        kinds = {frozenset(trial.labels.items()) for trial in self.problem.trials}
+        return f"Intervals are for runs of {'this kind' if len(kinds) < 2 else 'these kinds'}."
 
     @property
     def errors(self) -> dict[str, float]:
@@ -493,7 +543,10 @@ class Fit(Export, Posterior):
         if (errors := self.problem.model.errors) is not None:
             bodies = [*bodies, errors.described(self.problem.channels)]
         end = f"{self.problem.cost_name} {costs_in_words(self)} by {self.method}"
-        return "\n".join([self.title, self.table(), *bodies, f"{end}: {diagnostics.STATUS[self.status]}", *self.notes])
+        scope = [self.scope] if self.scope else []
+        return "\n".join(
+            [self.title, self.table(), *scope, *bodies, f"{end}: {diagnostics.STATUS[self.status]}", *self.notes]
+        )
 
 
 def load(path: str | os.PathLike[str], problem: Problem) -> Fit:

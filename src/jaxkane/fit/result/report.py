@@ -160,7 +160,7 @@ def _sections(
     estimates = parameter_rows(fit, truth, detailed=True)
     yield _Section(
         "Parameter estimates",
-        [f"Errors and intervals are {kind}, but for those marked otherwise."],
+        [f"Errors and intervals are {kind}, but for those marked otherwise. {fit.scope}".strip()],
         table=estimates,
         figures=lambda: [_drawn(lambda axes: plot.estimates(fit, start=True, ax=axes), 8, 0.9 + 0.45 * len(fit.names))],
         stacked=True,

@@ -149,17 +149,38 @@ FEWEST_TRIALS_OF_A_TEST = 3
 # Smallest number of trials, of windows, and of independent samples per part, with which these are used as clusters. The
 # number of parameters does not matter, because `jackknife` computes leverage and degrees of freedom of each.
 FEWEST_TRIALS, FEWEST_WINDOWS, FEWEST_SAMPLES = 4, 8, 5.0
+FEWEST_KINDS = 3
+LABEL = "label "
 
 
-def clusters_of(problem: Problem, at: Linearization) -> tuple[str, int]:
+def kinds_of(problem: Problem) -> tuple[str, dict[int, int]]:
+    """The label with the fewest values of those with at least three, and by active trial the index of its value.
+
+    ("", {}) without such a label. A label counts only if all active trials have it.
+    """
+    active = np.unique(np.asarray(problem.windows.trial)[problem.active_windows]).tolist()
+    labels = {k: problem.trials[k].labels for k in active}
+    of_all = [name for name in labels[active[0]] if all(name in own for own in labels.values())] if active else []
+    values = {name: [*dict.fromkeys(own[name] for own in labels.values())] for name in of_all}
+    name = min((name for name in of_all if len(values[name]) >= FEWEST_KINDS), key=lambda x: len(values[x]), default="")
+    return name, {k: values[name].index(own[name]) for k, own in labels.items()} if name else {}
+
+
+def clusters_of(problem: Problem, at: Linearization, by_label: bool = True) -> tuple[str, int]:
     """The cluster unit, and the number of clusters.
 
-    The unit is the trial if there are enough trials, otherwise the window with free initial states, otherwise a part of
-    a window. The parts have equal numbers of samples. ("", 0) with few trials and process noise or chained windows.
+    The unit is a label if it has at least three values ("label speed"). Otherwise it is the trial if there are enough
+    trials, otherwise the window with free initial states, otherwise a part of a window. The parts have equal numbers of
+    samples. ("", 0) with few trials and process noise or chained windows.
 
     Windows and parts of one trial share its trial unknowns. They do not show differences between trials.
+
+    `by_label`: False to ignore labels.
     """
     windows, model = int(problem.active_windows.sum()), problem.model
+    label, kinds = kinds_of(problem) if by_label else ("", {})
+    if label:
+        return f"{LABEL}{label}", len({*kinds.values()})
     if problem.clusters >= FEWEST_TRIALS:
         return "trial", problem.clusters
     if model.nuisance.has_defects or model.noise is not None:
@@ -184,14 +205,16 @@ class Clusters(NamedTuple):
     of_priors: np.ndarray
 
 
-def clustered(problem: Problem, point: Unknowns, at: Linearization, directions: np.ndarray) -> Clusters | None:
+def clustered(
+    problem: Problem, point: Unknowns, at: Linearization, directions: np.ndarray, by_label: bool = True
+) -> Clusters | None:
     """The clusters of `clusters_of`. None if there are too few.
 
     Their unknowns are those that clusters share, followed by the unconstrained parameters along directions (p, k).
     Unknowns of only one cluster are eliminated: trial unknowns, and initial states of windows. Priors of shared
     unknowns belong to no cluster.
     """
-    kind, _ = clusters_of(problem, at)
+    kind, G = clusters_of(problem, at, by_label)
     if not kind:
         return None
     blocks, owner, measured = at.blocks, np.asarray(problem.windows.trial), problem.active_windows
@@ -219,6 +242,11 @@ def clustered(problem: Problem, point: Unknowns, at: Linearization, directions: 
         rows = nuisance_prior_rows(problem, point)[0]
         np.add.at(of_priors, clusters, squares(rows[:, rows.shape[1] - n :, -n - p - 1 :]))
         data, used = (data - of_priors)[:, None], np.isin(np.arange(len(data)), clusters[measured])[:, None]
+    if kind.startswith(LABEL):  # all trials with the same value are one cluster
+        trials, values = (np.array([*x]) for x in zip(*kinds_of(problem)[1].items(), strict=True))
+        sums = np.zeros((G, *data.shape[1:]))
+        np.add.at(sums, values, data[trials])
+        data, used, shared, of_priors = sums, np.full((G, 1), True), shared[:G], of_priors[:G]
     first = int(shared.max(initial=-1)) + 1
     places = np.column_stack([shared, np.tile(np.arange(first, first + k), (len(shared), 1))])
     P = np.zeros((first + k, first + k))

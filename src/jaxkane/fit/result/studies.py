@@ -29,7 +29,7 @@ from ..solve.optimizers import LeastSquares, Optimizer, solve_nuisance
 from .data import text_table
 from .diagnostics import AT_A_MINIMUM, poorly_fitted_channels, refuse_unless_at_a_minimum
 from .fit_result import Fit
-from .statistics import FEWEST_TRIALS, bootstrap_steps, clustered, t_quantile
+from .statistics import FEWEST_TRIALS, bootstrap_steps, clustered, clusters_of, t_quantile
 
 
 @dataclasses.dataclass(frozen=True)
@@ -353,7 +353,7 @@ def bootstrap(fit: Fit, *, n: int = 2000, seed: int = 0) -> Bootstrap:
             "bootstrap: the parameters were not estimated from these trials. Pass the fit that estimated them."
         )
     directions = fit.identifiability.directions
-    clusters = clustered(fit.problem, fit.point, fit.linearization, directions)
+    clusters = clustered(fit.problem, fit.point, fit.linearization, directions, by_label=False)
     if clusters is None:
         raise ValueError(
             f"bootstrap: {fit.problem.clusters} trials are too few to estimate the scatter of the estimates. Use at "
@@ -366,7 +366,9 @@ def bootstrap(fit: Fit, *, n: int = 2000, seed: int = 0) -> Bootstrap:
     # A draw without the only cluster that determines a parameter would not change its estimate and would look precise.
     values[:, np.isinf(np.array([*fit.clustered_errors.values()]))] = np.nan
     values[:, np.isin(fit.names, fit.identifiability.at_bound)] = np.nan  # the slope of the bijection vanishes there
-    return Bootstrap(dict(zip(fit.names, values.T, strict=True)), fit.clusters)
+    return Bootstrap(
+        dict(zip(fit.names, values.T, strict=True)), clusters_of(fit.problem, fit.linearization, by_label=False)
+    )
 
 
 def check_signs(fit: Fit) -> tuple[str, ...]:
