@@ -120,7 +120,7 @@ MUTATIONS = (
              "jnp.outer(moved, f) / (s * (s + r))", "jnp.outer(moved, f) / s**2",
              "estimate/test_filter.py"),
     Mutation("multipliers of collocation: those of fixed variables are zero", "collocation/_solve.py",
-             "of_bounds[fixed] = -lagrangian_gradient(program, solution)[fixed]", "of_bounds[fixed] = 0.0",
+             "np.where(fixed, -lagrangian_gradient(program, solution)", "np.where(fixed, 0.0",
              "collocation/test_known_solutions.py collocation/test_plans.py"),
     Mutation("eigenvalues: the smaller root of a block suffers from cancellation", "stability/_matrix_eigenvalues.py",
              "far = jnp.where(p < 0, p - root, p + root)", "far = p + root",
