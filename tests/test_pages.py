@@ -170,7 +170,7 @@ SEARCHED = {
     "LCP": "contact#Equations", "complementarity": "contact#Equations", "Coulomb": "contact#Equations",
     "Newton's cradle": "contact#Newton's cradle", "compliant contact": "contact#Rigid or compliant",
     "trajectory optimization": "optimal_control#Optimal control", "warm start": "optimal_control#Guesses",
-    "sparse": "optimal_control#Solvers", "debugging NaN": "numerics#NaN", "float32": "numerics#Floating-point",
+    "sparse": "optimal_control#Solver", "debugging NaN": "numerics#NaN", "float32": "numerics#Floating-point",
     "tutorial": "index#Getting started", "getting started": "index#Getting started", "memory": "caching#When programs",
     "muscles": "sensors#First-order states",
 }  # fmt: skip

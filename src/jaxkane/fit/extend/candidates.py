@@ -428,8 +428,8 @@ class Model:
         return self.fit.cost if self.held_out is None else self.held_out_cost
 
     def compared_with(self, best: Model) -> Alternative:
-        known = self.held_out is not None and best.held_out is not None
-        is_as_good = known and predicts_as_well(best.held_out, self.held_out)
+        a, b = best.held_out, self.held_out
+        is_as_good = a is not None and b is not None and predicts_as_well(a, b)
         return Alternative(tuple(c.name for c in self.terms), self.fit.cost, self.held_out_cost, is_as_good)
 
 
