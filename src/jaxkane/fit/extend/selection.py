@@ -15,6 +15,8 @@ from tqdm import tqdm
 
 from ..._common.lookup import refuse, refuse_unknown, whole_number
 from ..._scalarjit.compat import on_device
+from ..problem.model import Simulation, Unknowns
+from ..problem.problem import Problem
 from ..problem.specification import parameters_of, refuse_other
 from ..result.data import Rows, Tables, html_tables, text_tables
 from ..result.diagnostics import AT_A_MINIMUM, Ranges, implausible, plausible_of, refuse_unless_at_a_minimum
@@ -42,6 +44,13 @@ from .candidates import (
     mapped_point,
     scaled_terms,
 )
+
+STEPS = 15
+"""Largest number of steps of the fit of a candidate. It starts at the minimum of the model, and needs four to eight."""
+
+HOPELESS_P, HOPELESS_COST = 0.2, 2.0
+"""A candidate is not fitted if its score test has a larger p, or if its predicted held-out cost is larger by this
+factor. Predictions differ from the costs after a fit, but seldom by that much."""
 
 NESTED = 1e-6
 """Largest relative difference of the sum of squares at the start of a nested candidate."""
@@ -168,7 +177,7 @@ class Search:
         if self.refits is not None:
             # Plausible ones first, then by predicted cost, or for exchanges and removals by held-out cost.
             nested = sorted(
-                (item for item in fitted if item[2].nested),
+                (item for item in fitted if item[2].nested and not _is_hopeless(item[2], model, level)),
                 key=lambda x: (bool(x[2].bound_violations), x[2].held_out_cost if x[0].drop else x[2].predicted_cost),
             )[: self.refits]
             fitted = nested + [item for item in fitted if not item[2].nested] * bool(self.refits)
@@ -230,7 +239,7 @@ class Search:
         )
         start = eqx.tree_at(lambda p: p.parameters, group.point, group.point.parameters[parameters.places])
         try:
-            fit = uninterrupted(search(problem, LeastSquares(), start=start))
+            fit = self._fitted(problem, start)
             if fit.status not in AT_A_MINIMUM:
                 return dataclasses.replace(extension, reason=f"its fit has not converged ({fit.status})"), None
             kept = (c for c in model.terms if c not in move.drop)
@@ -256,6 +265,24 @@ class Search:
             held_out_cost=after.held_out_cost,
             bound_violations=tuple(after.bound_violations.values()),
         ), after
+
+    def _fitted(self, problem: Problem, start: Unknowns) -> Fit:
+        """A fit without restarts. If it is stuck, tolerances that the user did not pass are reduced.
+
+        A candidate such as dry friction has nearly discontinuous forces. With adaptive steps, the error of integration
+        then hides small changes of the cost.
+        """
+        method: Any = LeastSquares(horizons=())
+        chosen = (self.fit.problem.specification.simulation or Simulation()).chooses and not problem.has_steps
+        for tolerance in (1.0, 1e-2)[: 1 + chosen]:
+            problem = (
+                problem.with_tolerances(tolerance * np.asarray(problem.model.settings.rtol)) if chosen else problem
+            )
+            fit = uninterrupted(search(problem, method, start=start, steps=STEPS, check_steps=False))
+            if fit.status in AT_A_MINIMUM:
+                break
+            start = fit.point
+        return fit
 
     def _one_sided(self, score: Score, names: Sequence[str], group: Group) -> float:
         """The p-value, one-sided if the only tested parameter is plausible on one side of its start only."""
@@ -287,6 +314,12 @@ class Search:
         )
         reason = next((words for applies, words in reasons if applies), "")
         return dataclasses.replace(extension, reason=reason, accepted=not reason)
+
+
+def _is_hopeless(extension: Extension, model: Model, level: float) -> bool:
+    """Whether a score test or the linearized held-out cost already decides against a candidate."""
+    is_chance = extension.p >= max(level, HOPELESS_P)
+    return is_chance or extension.held_out_cost > HOPELESS_COST * model.held_out_cost
 
 
 def _order(extension: Extension) -> tuple[bool, float]:

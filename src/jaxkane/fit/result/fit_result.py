@@ -72,14 +72,22 @@ class Fit(Export, Posterior):
 
     @classmethod
     def of(
-        cls, problem: Problem, point: Unknowns, at: Linearization, history: Sequence[float], status: str, method: str
+        cls,
+        problem: Problem,
+        point: Unknowns,
+        at: Linearization,
+        history: Sequence[float],
+        status: str,
+        method: str,
+        check_steps: bool = True,
     ) -> Fit:
         """The result at a point where the problem has been linearized.
 
-        All windows are simulated once more with finer steps to estimate the integration error, except after Ctrl-C.
+        All windows are simulated once more with finer steps to estimate the integration error, except after Ctrl-C and
+        without `check_steps`.
         """
         errors = np.full(len(problem.slices), np.nan)
-        if status != "interrupted":
+        if status != "interrupted" and check_steps:
             try:
                 errors = step_errors(problem, point, at.prediction.with_deviations)
             except KeyboardInterrupt:

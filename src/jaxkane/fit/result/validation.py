@@ -112,7 +112,7 @@ def _validated(
                     point, _ = solve_nuisance(part.shortened(np.minimum(seen, whole)), first, steps=20, rtol=1e-3)
                     at = part.linearize(point)
                     assert at is not None  # the initial states satisfy the constraints, as in the shortened windows
-                    fits.append(Fit(part, point, at, np.full(len(whole), np.nan), (at.cost,), "validated", method))
+                    fits.append(Fit.of(part, point, at, (at.cost,), "validated", method, check_steps=False))
                     continue
                 part = finer(part, first) if part.chooses_steps else part
                 # Gauss-Newton steps converge quadratically. After a relative decrease below 1e-4, the next one is a
@@ -293,8 +293,9 @@ def cross_validate(fit: Fit, folds: int | str | Sequence[Sequence[int]] | None =
     with_all = fit.identifiability.given_sigma_errors
     for group in groups:
         training = fit.problem.only(set(range(T)) - set(group))
-        trained = with_distributions(search(training, LeastSquares(), start=fit.point), LeastSquares(), {})
-        trained = uninterrupted(trained)
+        run = {"check_steps": False}
+        trained = search(training, LeastSquares(), start=fit.point, **run)
+        trained = uninterrupted(with_distributions(trained, LeastSquares(), run))
         values, without = np.array([*trained.estimates.values()]), ", ".join(fit.trial_names[k] for k in group)
         # A parameter that the other trials do not determine stays at the estimate from all trials. The fold predicts
         # nothing about it and would look precise.

@@ -246,8 +246,12 @@ def search(
     checkpoint: str | os.PathLike[str] | None = None,
     callback: Callable[[Unknowns, float], None] | None = None,
     progress: bool = False,
+    check_steps: bool = True,
 ) -> Fit:
-    """One search of `minimize`, with the integration steps and the distributions over groups of the problem."""
+    """One search of `minimize`, with the integration steps and the distributions over groups of the problem.
+
+    `check_steps`: whether to estimate the integration error, which takes twice the time of a step of the search.
+    """
     steps = optimizer.steps if steps is None else steps
     start = problem.start if start is None else start
     key = {} if checkpoint is None else {"method": optimizer.name, **optimizer.checkpoint_key(problem)}
@@ -273,7 +277,7 @@ def search(
         status = "interrupted"
     finally:
         bar.close()
-    return _result(problem, optimizer, run, first, status)
+    return _result(problem, optimizer, run, first, status, check_steps)
 
 
 def _resting(result: Fit, place: int, method: Optimizer, run: dict[str, Any]) -> Fit:
@@ -396,7 +400,7 @@ def _resumed(file: Checkpoint, problem: Problem, optimizer: Optimizer, start: Un
     return _Run(now, Iterate(saved["best"], at_best.cost, at_best, state), [float(c) for c in saved["history"]])
 
 
-def _result(problem: Problem, optimizer: Optimizer, run: _Run, first: Iterate, status: str) -> Fit:
+def _result(problem: Problem, optimizer: Optimizer, run: _Run, first: Iterate, status: str, check_steps: bool) -> Fit:
     best = run.best
     at = problem.linearize(best.point) if best.at is None else best.at
     if at is None or not usable(at):  # the simulation succeeds there, but the derivatives are not finite
@@ -407,7 +411,7 @@ def _result(problem: Problem, optimizer: Optimizer, run: _Run, first: Iterate, s
         slopes = np.abs(np.asarray(problem.parameters.slopes(best.point.parameters)))
         rests = (np.count_nonzero(slopes, axis=1) <= 1) & (slopes.sum(axis=1) < 1e-3 * problem.parameters.scale)
         status = "bound" if np.any(rests) else status
-    return Fit.of(problem, best.point, at, run.history, status, optimizer.name)
+    return Fit.of(problem, best.point, at, run.history, status, optimizer.name, check_steps)
 
 
 def uninterrupted(fit: Fit) -> Any:
