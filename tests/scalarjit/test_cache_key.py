@@ -167,6 +167,10 @@ def places():
     by_attribute = lambda m: m.gravity  # noqa: E731
     own = lambda: own.gravity  # noqa: E731
     own.gravity = 9.81
+    cube = jax.custom_jvp(lambda x: x**3)
+    with_rule = lambda slope: cube.defjvps(lambda dx, y, x: slope * dx)  # noqa: E731
+    with_rule(9.81)
+    yield "rule for derivatives", lambda: cube, lambda: with_rule(1.62)
     yield "module given to a function", lambda: by_attribute(module), lambda: setattr(module, "gravity", 1.62)
     yield "module of a class", lambda: by_attribute(holder.module), lambda: setattr(module, "gravity", 1.62)
     yield "module in a list", lambda: [m.gravity for m in [module]], lambda: setattr(module, "gravity", 1.62)

@@ -94,6 +94,11 @@ def _add_words(sha: Any, *words: object) -> None:
         sha.update(b"%d:%b" % (len(data), data))  # with its length: ("ab", "c") differs from ("a", "bc")
 
 
+def _wrapped_with_rule(f: Any) -> tuple[Any, ...]:
+    """The decorated function; of `jax.custom_jvp`, also its rule."""
+    return f.__wrapped__, vars(f).get("jvp")
+
+
 class CapturedValues:
     """All places that the code of `root` uses, with their values. The constructor visits every place, records it and
     adds its value to a digest.
@@ -191,8 +196,8 @@ class CapturedValues:
             return *self.items(value), *self.attributes(value)
         if _has_attributes(value):
             return self.attributes(value)
-        if callable(wrapped := getattr(value, "__dict__", {}).get("__wrapped__")):  # `jax.jit(f)`
-            return (wrapped,)
+        if callable(getattr(value, "__dict__", {}).get("__wrapped__")):  # `jax.jit(f)`
+            return self.read(_wrapped_with_rule, value)
         return self.opaque(value)
 
     def items(self, container: Collection[Any]) -> Sequence[Any]:
@@ -220,7 +225,8 @@ class CapturedValues:
         if _is_library(f.__globals__.get("__name__") or "__main__"):
             # Follow a library's decorator to the decorated function. IPython's autoreload changes the attribute, not
             # the closure.
-            return f.__qualname__, *self.place(vars(f), "__wrapped__"), *filter(callable, inside)
+            each = [y for x in inside for y in (x if isinstance(x, tuple) else (x,))]  # rules of `custom_jvp.defjvps`
+            return f.__qualname__, *self.place(vars(f), "__wrapped__"), *filter(callable, each)
         code, *defaults = self.read(_definition_of, f)
         self.code(code)
         of_globals, imported, names = _names_of(code)

@@ -201,6 +201,10 @@ _COMPOSED: dict[str, Callable[..., np.ndarray]] = {
     "square": lambda each, number, x: each("mul", x, x),
     # in JAX 0.12, in the derivative of tanh
     "one_minus_square": lambda each, number, x: each("mul", each("sub", number(1.0), x), each("add", number(1.0), x)),
+    # in JAX 0.12, in sinc: from the coefficient of lowest degree to that of highest degree
+    "polynomial": lambda each, number, x, *cs: functools.reduce(
+        lambda y, c: each("add", each("mul", y, x), c), reversed(cs)
+    ),
     "rsqrt": lambda each, number, x: each("div", number(1.0), each("sqrt", x)),
     "clamp": lambda each, number, low, x, high: each("min", each("max", x, low), high),
 }

@@ -22,6 +22,7 @@ from .compat import (
     ShapedArray,
     Variable,
     dce_jaxpr,
+    evaluated,
     interpret,
     is_literal,
     jaxpr_as_fun,
@@ -59,12 +60,16 @@ def sum_of_products(equation: Equation, *xs: Array) -> Array:
 # (LAPACK) cannot be compiled this way, and loops would not be faster.
 _PLAIN = frozenset(
     "abs acos acosh add add_any and asin asinh atan atan2 atanh broadcast_in_dim cbrt ceil clamp concatenate "
-    "convert_element_type copy copy_p cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite jit le "
-    "log log1p logistic lt max min mul ne neg not one_minus_square or pad pow reduce_and reduce_max reduce_min "
+    "convert_element_type copy copy_p cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite jit le log "
+    "log1p logistic lt max min mul ne neg not one_minus_square or pad polynomial pow reduce_and reduce_max reduce_min "
     "reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt select_n sign sin sinh slice split sqrt square "
     "squeeze stack stop_gradient sub tan tanh transpose unstack xor".split()
 )
 LARGEST_SUM = 64  # XLA may pass larger ones to a library
+
+# The primitive of `jax.custom_jvp`. It stays one equation, so that derivatives use its own rule: softplus(800) and a
+# rule that a user defines would otherwise have the derivatives of their values.
+_CUSTOM_RULE = "custom_jvp_call"
 
 # Part of the name of each call of LAPACK by the method itself.
 BY_LAPACK = "by_lapack"
@@ -174,6 +179,8 @@ def unsupported_primitives(program: Jaxpr, is_ours: bool = False) -> Iterator[tu
     itself calls LAPACK for systems that are too large to be written out (`linear`)."""
     for equation in program.eqns:
         name, inner = equation.primitive.name, opened(equation)
+        if name == _CUSTOM_RULE:
+            inner = equation.params["call_jaxpr"]
         if inner is not None:
             yield from unsupported_primitives(inner.jaxpr, is_ours or BY_LAPACK in equation.params.get("name", ""))
         elif name == "dot_general" and is_small(equation):
@@ -263,7 +270,9 @@ def _tangent_rule(equation: Equation, differentiated: tuple[bool, ...]) -> tuple
         of_tangents = [aval for aval, d in zip(avals, differentiated, strict=True) if d]
         return program_of(tangents, *specs_of([*avals, *of_tangents])), tuple(given)
 
-    return make() if isinstance(parameters, int) else _rules.get(key, make)
+    # A custom rule is not kept, because it may refer to large arrays of the user.
+    is_kept = equation.primitive.name != _CUSTOM_RULE and not isinstance(parameters, int)
+    return _rules.get(key, make) if is_kept else make()
 
 
 def tangent_program(
@@ -424,6 +433,8 @@ def patterns(f: Callable[..., Any], specs: Sequence[Any], place: int) -> tuple[n
     **Returns:** booleans (m, n), and (n, n) for the Hessian of any weighted sum of the results.
     """
     program = cse(program_of(f, *specs))
+    if any(equation.primitive.name == _CUSTOM_RULE for equation in program.jaxpr.eqns):
+        program = cse(program_of(_with_full_patterns(program), *specs))
     n = specs[place].shape[0]
     try:
         graph, (outputs,) = graph_of(program)
@@ -434,6 +445,20 @@ def patterns(f: Callable[..., Any], specs: Sequence[Any], place: int) -> tuple[n
     first = np.array([[bool(reads[int(k)] >> i & 1) for i in range(n)] for k in outputs], bool).reshape(-1, n)
     both = np.array([[bool(second.get(i, 0) >> j & 1) for j in range(n)] for i in range(n)], bool).reshape(n, n)
     return first, both | both.T
+
+
+def _with_full_patterns(program: ClosedJaxpr) -> Callable[..., Any]:
+    """The program, whose functions with custom rules depend on all of their arguments. Such a rule may have derivatives
+    that the value does not have, for example those of a rounded number."""
+
+    def rule(equation: Equation, xs: list[Any]) -> Sequence[Any]:
+        ys = evaluated(equation, xs)
+        if equation.primitive.name != _CUSTOM_RULE:
+            return ys
+        every = jnp.exp(sum(jnp.sum(x) for x in xs if is_inexact(x)))
+        return [y * every.astype(y.dtype) if is_inexact(y) else y for y in ys]
+
+    return lambda *inputs: interpret(program, inputs, rule)
 
 
 def _propagated(graph: Graph, outputs: np.ndarray, place: int) -> tuple[dict[int, int], dict[int, int]]:
