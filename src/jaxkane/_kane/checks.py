@@ -398,7 +398,7 @@ class _Consistency:
         return consistency_quantities.numpy(self.system, self.t, q, u.astype(q.dtype), self.inputs)
 
     def _rates(self, q: np.ndarray, u: np.ndarray, quantities: Quantities) -> Quantities:
-        q_dot = np.concatenate([x.ravel() for x in _of_kind(quantities, "rate").values()])
+        q_dot = np.array([x.item() for x in _of_kind(quantities, "rate").values()], q.dtype)
         at = self.system, self.t, q, u.astype(q.dtype), self.inputs
         along = None, np.ones((1,), q.dtype), q_dot[:, None], None, None
         return jax.tree.map(lambda x: x[..., 0], consistency_quantities.numpy_jvp(at, along))

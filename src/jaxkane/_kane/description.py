@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._common.lookup import checked, refuse_any
+from .._common.lookup import checked, refuse_any, refuse_if
 from .._scalarjit.cache_key import version_of
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import (
@@ -98,7 +98,9 @@ class DescriptionEvaluator:
         return _quantities.replay(quantity, self.system, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
 
     def motion(self, t: Component, q: Row, u: Row) -> Motion:
-        return checked(self.system.motion(t, q, u), Motion, f"{self.name}.motion must return a jaxkane.Motion")
+        motion = checked(self.system.motion(t, q, u), Motion, f"{self.name}.motion must return a jaxkane.Motion")
+        refuse_if(self.n and not motion.bodies, f"{self.name} has speeds, so its Motion needs at least one Body.")
+        return motion
 
     def loads_at(self, t: Component, q: Row, u: Row, motion: Motion) -> tuple[Load, ...]:
         return flatten_loads(self.system.loads(t, q, u, motion, self.inputs), f"{self.name}.loads")

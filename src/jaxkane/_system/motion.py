@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from .._common.lookup import Kind, checked, not_there, refuse_if
 from .._scalarjit.components import Component, Triple, add, component, dot, is_zero, mul, sub
-from .kinematics import Frame, Point, Vector
+from .kinematics import Frame, Point, Vector, inertial
 from .parameters import concrete_numbers, text_of, wrapped
 
 Inertia: TypeAlias = Component | Sequence[Component] | Sequence[Sequence[Component]] | Array
@@ -309,14 +309,14 @@ class Motion:
         for label, value in (("points", points), ("frames", frames)):
             checked(value, Mapping | None, f"Motion: the {label} must be a dict by name, e.g. {{'P': P}}")
         self.bodies = _as_tuple(bodies, Body)
-        refuse_if(not self.bodies, "A Motion needs at least one Body.")
         self.residuals = _as_tuple(constraints, (Vector, float, int, jax.Array))  # may contain Vectors
         self.constraints = flatten_residuals(self.residuals, "Motion(bodies, constraints): the velocity residuals")
         self.points = dict(points or {})
         self.frames = dict(frames or {})
         self._named = self._by_name()
         self.number = motion_number()
-        self.N: Frame = self.bodies[0].center.velocity.frame.root
+        parts = [body.center.velocity for body in self.bodies] or [p.velocity for p in self.points.values()]
+        self.N: Frame = parts[0].frame.root if parts else inertial()[0]
         for name, part in (*self.points.items(), *self.frames.items()):
             part.name = name
 

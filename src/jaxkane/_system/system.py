@@ -237,8 +237,8 @@ class State(eqx.Module):
         direction of the slip.
     """
 
-    q: Float[Array, "*batch n_q"] = eqx.field(converter=to_float)
-    u: Float[Array, "*batch n_u"] = eqx.field(converter=to_float)
+    q: Float[Array, "*batch n_q"] = eqx.field(converter=to_float, default=())
+    u: Float[Array, "*batch n_u"] = eqx.field(converter=to_float, default=())
     x: Float[Array, "*batch n_x"] | None = eqx.field(converter=lambda x: x if x is None else to_float(x), default=None)
     contacts: Float[Array, "*batch m"] | None = eqx.field(
         converter=lambda x: x if x is None else to_float(x), default=None
@@ -331,7 +331,10 @@ class System(eqx.Module, metaclass=SystemMeta):
             check_parameter(f"{type(self).__name__}.{name}", getattr(self, name), info)
 
     def motion(self, t: Component, q: Numbers, u: Numbers) -> Motion:
-        """Return the `Motion` at time `t` [s], coordinates `q` and speeds `u`."""
+        """Return the `Motion` at time `t` [s], coordinates `q` and speeds `u`. Without coordinates and speeds, by default a
+        motion without bodies."""
+        if not (self.coordinates or self.speeds or self.dependent_speeds):
+            return Motion([])
         raise NotImplementedError(f"{type(self).__name__} must define motion(self, t, q, u) and return a Motion.")
 
     def q_dot(self, t: Component, q: Numbers, u: Numbers) -> Sequence[Component]:
