@@ -577,7 +577,7 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
         velocity_residuals=quantities["c"],
         configuration_sizes=np.asarray(_sizes_along(system, t, q), float) if quantities["h"].size else np.zeros(0),
         velocity_sizes=velocity_sizes,
-        condition_M=_condition_of_masses(quantities["M"]),
+        condition_M=_condition_of_masses(quantities["M"]) if quantities["M"].size else np.ones_like(ts),
         condition_C_dep=relative_condition(C, range(independent, C.shape[-1])) if C.size else np.ones_like(ts),
         name=type(system).__name__,
         reason=trajectory.reason,

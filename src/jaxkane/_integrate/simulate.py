@@ -283,8 +283,9 @@ def as_state(system: System, state: State) -> State:
         arrays.append(values)
     if state.contacts is not None:
         arrays.append(state.contacts)
-    types = {x.dtype for x in arrays if jnp.issubdtype(getattr(x, "dtype", int), jnp.floating)}
-    if len(types) > 1:  # a loop cannot carry float32 coordinates and float64 speeds
+    floats = [x for x in arrays if jnp.issubdtype(getattr(x, "dtype", int), jnp.floating)]
+    if len({x.dtype for x in floats}) > 1:  # a loop cannot carry float32 coordinates and float64 speeds
+        types = [x.dtype for x in floats if x.shape[-1]]  # an empty array has the default dtype
         arrays = [x.astype(functools.reduce(np.promote_types, types)) for x in arrays]
     contacts = None if state.contacts is None else arrays.pop()
     return State(arrays[0], arrays[1], arrays[2] if system.states else None, contacts)

@@ -62,7 +62,7 @@ def trajectories(
     **Arguments:**
 
     - `trajectory`: a `Trajectory`. All members of a batch are drawn, faintly.
-    - `names`: the quantities; names in a tuple share a panel. Default: the coordinates.
+    - `names`: the quantities; names in a tuple share a panel. Default: the coordinates, or the states of a system without any.
     - `degrees`: angles in degrees instead of radians.
     - `units`: by name. Default: those that the system declares (`System.units`), else those of usual names, e.g.
         "roll", "x", "yaw_rate" and "steer_torque".
@@ -77,7 +77,8 @@ def trajectories(
     """
     trajectory = as_trajectory(trajectory)
     groups = [
-        as_names(group, "names") for group in ([names] if isinstance(names, str) else names or trajectory.names[0])
+        as_names(group, "names")
+        for group in ([names] if isinstance(names, str) else names or trajectory.names[0] or trajectory.names[-1])
     ]
     drawn = [name for group in groups for name in group]
     units_by_name = {name: unit_of(name, dict(trajectory.units) | dict(units or {})) for name in drawn}

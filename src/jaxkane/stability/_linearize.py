@@ -31,7 +31,7 @@ from .._kane.constraint_residuals import SINGULAR_ROUNDING, configuration_residu
 from .._kane.contact.forces import has_contacts
 from .._kane.right_hand_side import MeasurementContext, has_outputs, output_names, outputs_at, rates, values_of
 from .._scalarjit.cache_key import jit
-from .._scalarjit.components import Component, Numbers, solve, stack
+from .._scalarjit.components import Component, Numbers, as_vector, solve, stack
 from .._scalarjit.nan import nan_where
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.motion import Motion
@@ -243,7 +243,7 @@ def _at_deviation(
     names, speeds = system.coordinates, (*system.speeds, *system.dependent_speeds)
     moved = dict(zip(model_names.states, x, strict=True))
     q = q + sum((moved[k] * T[:, i] for i, k in enumerate(names) if k in moved), jnp.zeros_like(q))
-    u = jnp.stack([u[i] + moved[k] if k in moved else u[i] for i, k in enumerate(system.speeds)])
+    u = as_vector([u[i] + moved[k] if k in moved else u[i] for i, k in enumerate(system.speeds)], q)
     x1 = [x1[i] + moved[k] if k in moved else x1[i] for i, k in enumerate(system.states)]
     values = inputs_by_name(system, w) | dict(zip(system.states, x1, strict=True))
     rate = rates(system, t, q, u, values)

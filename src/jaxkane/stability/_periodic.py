@@ -103,12 +103,13 @@ class Orbit(eqx.Module):
         return by_name(name, groups, {}, "this orbit")
 
     def __repr__(self) -> str:
+        names = (*self.system.coordinates, *self.system.speeds, *self.system.states)
         if not is_concrete(self.period) or np.ndim(self.period):
-            return f"Orbit({', '.join((*self.system.coordinates, *self.system.speeds))})"
+            return f"Orbit({', '.join(names)})"
         sizes = np.abs(np.asarray(self.multipliers))
         largest = f"largest multiplier {sizes[0]:.6g}" if sizes.size else "no multipliers"
         stable = "stable" if bool(self.stable) else "unstable"
-        start = ", ".join(f"{k} {float(self[k]):.6g}" for k in (*self.system.coordinates, *self.system.speeds))
+        start = ", ".join(f"{k} {float(self[k]):.6g}" for k in names)
         return (
             f"Orbit(period {float(self.period):.10g} s, {stable}, {largest}; starts at {start}; "
             f"closes to {float(self.residual):.1g})"

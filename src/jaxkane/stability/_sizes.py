@@ -119,8 +119,8 @@ def _all_sizes(system: System, t: Component, q: Coordinates, u: Speeds, values: 
     kane = KaneEquations(system, t, q, u, values)
     terms = _term_sizes(system, t, q, u, values, sizes)
     rows = [_projected(kane, terms[2], unit(kane.n, r)) for r in range(kane.n)]
-    forces, masses, rates = zip(*rows, strict=True)
-    return terms, (as_vector(forces, q), as_vector(masses, q), stack(rates).astype(q.dtype))
+    forces, masses, rates = ([row[i] for row in rows] for i in range(3))
+    return terms, (as_vector(forces, q), as_vector(masses, q), stack(rates).astype(q.dtype).reshape(kane.n, len(q)))
 
 
 @ScalarFunction
