@@ -161,7 +161,8 @@ def _partial_velocities(system: System, t: Time, q: Coordinates, u: Speeds, inpu
         for columns, j, frame in ((V, 0, body.center.velocity.frame), (W, 1, body.frame)):
             vectors = [frame.vector(*bodies[i][j]).components_in(motion.N) for bodies, _ in partials]
             columns.append(stack(vectors).astype(q.dtype).T)
-    return jnp.stack(V), jnp.stack(W)
+    V, W = (jnp.asarray(columns, q.dtype).reshape(len(motion.bodies), 3, kane.n) for columns in (V, W))
+    return V, W
 
 
 def generalized_active_forces(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -240,7 +241,7 @@ class Formulas:
         if not any(self.arguments[i].elements for i in places):
             return (jnp.zeros((n, 0), self.dtype),)
         blocks = jax.jacfwd(rates_of)([jnp.asarray(args[i]) for i in places])
-        return (jnp.concatenate([block.reshape(n, -1) for block in blocks], axis=1),)
+        return (jnp.concatenate([block.reshape(n, math.prod(block.shape[1:])) for block in blocks], axis=1),)
 
     @contextlib.contextmanager
     def _explained(self, function: str) -> Iterator[None]:

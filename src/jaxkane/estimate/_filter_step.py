@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._common.lookup import real_number, refuse_unknown
-from .._scalarjit.components import Component
+from .._scalarjit.components import Component, as_vector
 from .._system.system import State, System
 
 MODES = 3
@@ -54,7 +54,7 @@ class Disturbance(eqx.Module):
         zero = jnp.zeros_like(s)
 
         def row(names: Sequence[str]):
-            return jnp.stack([added.get(name, zero) for name in names])
+            return as_vector([added.get(name, zero) for name in names], s)
 
         x = None if state.x is None else row(self.states)
         of_inputs = {name: e for name, e in added.items() if name not in (*self.speeds, *self.states)}

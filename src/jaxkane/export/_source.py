@@ -49,6 +49,7 @@ def function_names(
     """Names of functions, after a check. Default: the usual ones that the system has."""
     if functions is None:
         needs = {"dependent_speeds": "u_dep", "input_jacobian": "inputs", "parameter_jacobian": "parameters"}
+        usual = usual if formulas.names("q") or formulas.names("u") else ()  # else first-order states only
         available = tuple(name for name in usual if name not in needs or formulas.names(needs[name]))
         return (*available, "state_rates") if formulas.system.states else available
     if isinstance(functions, str):
