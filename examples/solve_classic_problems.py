@@ -97,16 +97,9 @@ class Crane(jk.System):
 
 
 class Cubic(jk.System):
-    """No mechanism: a block at rest, and one first-order state."""
+    """No mechanism, but one first-order state."""
 
-    coordinates, speeds, states, inputs = ("place",), ("speed",), ("x",), ("f",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["place"] * N.x, u["speed"] * N.x))])
-
-    def loads(self, t, q, u, motion, inputs):
-        return ()
+    states, inputs = ("x",), ("f",)
 
     def state_rates(self, t, q, u, x, motion, now):
         return {"x": -(x["x"] ** 3) + now["f"]}
@@ -186,7 +179,7 @@ def hypersensitive() -> tuple[col.Plan, float]:
         10_000.0,
         controls=["f"],
         cost=lambda t, now: now["x"] ** 2 + now["f"] ** 2,
-        start={"place": 0.0, "speed": 0.0, "x": 1.0},
+        start={"x": 1.0},
         end={"x": 1.5},
     )
     return col.solve(problem, intervals=40), 6.7241

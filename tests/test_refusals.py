@@ -467,6 +467,7 @@ ACCEPTED = {
     r"loads\..*-not finite": "evaluated while it is traced; the status is then `INVALID`",
     r"(Body|Contact|DryFriction|sensors\.\w+)-(mass|inertia|gap|slip|image_center|x)-not finite": "as a law",
     r"sensors\.\w+-x-(additional axis|wrong length)": "the state of a batch",
+    r"Motion-bodies-empty": "a system of first-order states",
     r"Motion-(points|frames|constraints)-(?!wrong type|sequence).*": "any names and numbers",
     r"parameter-(positive|shape|default)-(wrong shape|empty)": "a batch",
     r"parameter-(positive|shape)-(wrong type|not finite|unknown name)": "see tests/system/test_system.py",

@@ -236,11 +236,34 @@ def test_free_parameter():
     assert again.estimates["mass"] == pytest.approx(24 ** (1 / 3), rel=rtol)
 
 
-class Hypersensitive(Sled):
+class Hypersensitive(jk.System):
     """v_dot = -v^3 + force."""
 
-    def loads(self, t, q, u, motion, inputs):
-        return jk.Force((inputs["force"] - u["v"] ** 3) * motion.N.x, motion["sled"])
+    states, inputs = ("v",), ("force",)
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return now["force"] - x["v"] ** 3
+
+
+class Integrator(jk.System):
+    states, inputs = ("x",), ("u",)
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return {"x": now["u"]}
+
+
+def test_controls_at_a_bound_and_in_between():
+    """u is -1 until t = 1, then 0 until t = 3/2, then 1: the integral of x^2 is 1/3 + 1/24 = 3/8. A jump of the control
+    takes one interval. With an interval more or less, the cost changes by its third power."""
+    problem = Problem(
+        Integrator(), 2.0, controls={"u": (-1.0, 1.0)}, cost=lambda t, now: now["x"] ** 2, start={"x": 1.0},
+        end={"x": 0.5},
+    )  # fmt: skip
+    plan = solve(problem, intervals=24, tolerance=None)
+    assert plan.ok
+    assert plan.cost == pytest.approx(3 / 8, abs=2e-5)
+    assert plan.at([0.5, 1.25, 1.75])["u"] == pytest.approx([-1.0, 0.0, 1.0], abs=0.02)
+    assert plan.active == ("u at its lower bound", "u at its upper bound")
 
 
 @pytest.mark.weekly

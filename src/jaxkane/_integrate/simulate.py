@@ -249,9 +249,10 @@ def checked_state(system: System, state: object) -> State:
     parts.append(("contacts", state.contacts, ("the contacts",) * layout_of(system).memory_size))
     for label, value, names in parts:
         if value is not None and value.shape != (len(names),):
+            listed = ", ".join(dict.fromkeys(names)) or "no names"
             raise ValueError(
-                f"{name}: state.{label} must have the shape ({len(names)},) for {', '.join(dict.fromkeys(names))}; got "
-                f"{value.shape}." + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
+                f"{name}: state.{label} must have the shape ({len(names)},) for {listed}; got {value.shape}."
+                + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
             )
         if label != "contacts" and value is not None and is_concrete(value) and not np.all(np.isfinite(value)):
             i = int(np.argmin(np.isfinite(value)))

@@ -92,13 +92,12 @@ def is_numeric(value: object) -> bool:
 
 def check_is_system(system: System) -> None:
     """**Raises:** `TypeError` if the argument is not an instance of `System`. `ValueError` without coordinates or
-    speeds, except for a system of first-order states only."""
+    speeds, unless it has first-order states only."""
     remedy = f" Create one with {system.__name__}(...)." if isinstance(system, type) else ""
     checked(system, System, "The first argument must be an instance of a System", remedy)
-    speeds = (*system.speeds, *system.dependent_speeds)
-    has_states_only = system.states and not (system.coordinates or speeds)
-    for what, names in (("coordinates", system.coordinates), ("speeds", speeds)):
-        refuse_if(not names and not has_states_only, f"{type(system).__name__} has no {what}. Name them in its class: {what} = (...).")
+    groups = {"coordinates": system.coordinates, "speeds": (*system.speeds, *system.dependent_speeds)}
+    for what, names in groups.items() if any(groups.values()) or not system.states else ():
+        refuse_if(not names, f"{type(system).__name__} has no {what}. Name them in its class: {what} = (...).")
 
 
 def has_multipliers(system: System) -> bool:

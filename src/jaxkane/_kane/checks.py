@@ -163,7 +163,8 @@ def bodies_are_possible(system: System, t: Component, q: Numbers) -> Bool:
 def _bodies_are_possible(system: System, t: Component, q: Numbers) -> Bool:
     bodies = _masses_and_inertias.__wrapped__(system, t, q)
     rows = [(mass, [(x, y, z) for x, y, z in I]) for mass, I in bodies]
-    return functools.reduce(operator.and_, [is_possible(mass, I, system.check_inertia) for mass, I in rows], jnp.array(True))
+    each = (is_possible(mass, I, system.check_inertia) for mass, I in rows)
+    return functools.reduce(operator.and_, each, jnp.array(True))
 
 
 # -- contradictions in a system

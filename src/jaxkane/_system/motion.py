@@ -284,7 +284,7 @@ class Motion:
 
     **Arguments:**
 
-    - `bodies`: a list of all Bodies.
+    - `bodies`: a list of all Bodies. It may be empty in a system without speeds.
     - `constraints`: velocity residuals [m/s or rad/s], which are zero and affine in the speeds. A Vector is three
         residuals.
     - `points`: a dict of named points, for `loads`, animations and `motion["P"]`.
@@ -315,8 +315,9 @@ class Motion:
         self.frames = dict(frames or {})
         self._named = self._by_name()
         self.number = motion_number()
-        parts = [body.center.velocity for body in self.bodies] or [p.velocity for p in self.points.values()]
-        self.N: Frame = parts[0].frame.root if parts else inertial()[0]
+        velocities = [body.center.velocity for body in self.bodies] + [P.velocity for P in self.points.values()]
+        frames = [*(v.frame for v in velocities), *self.frames.values(), inertial()[0]]
+        self.N: Frame = frames[0].root
         for name, part in (*self.points.items(), *self.frames.items()):
             part.name = name
 

@@ -231,7 +231,8 @@ class State(eqx.Module):
 
     - `q`: coordinates (n_q,) [rad, m].
     - `u`: independent speeds (n_u,) [rad/s, m/s].
-    - `x`: first-order states (n_x,), or None if there are none.
+    - `x`: first-order states (n_x,), or None if there are none. `State(x=...)` is the state of a system that has no
+        coordinates and speeds.
     - `contacts`: the contact states, or None. A simulation that starts without them finds them from the gaps and the
         velocities. They contain, contact by contact in alphabetical order, 0 (open), 1 (slides) or 2 (sticks) and the
         direction of the slip.
@@ -284,7 +285,8 @@ class Measurements(Mapping[str, Component]):
 class System(eqx.Module, metaclass=SystemMeta):
     """The base class of mechanisms. Its array fields are the parameters of the mechanism.
 
-    A subclass names its coordinates and speeds and defines `motion`. If required, it also defines `loads`, `q_dot`,
+    A subclass names its coordinates and speeds and defines `motion`. A system of first-order states only needs `states`
+    and `state_rates` instead. If required, it also defines `loads`, `q_dot`,
     `configuration_constraints`, `events`, `state_rates` (first-order states) and `outputs` (sensors). In these methods,
     `u` contains all speeds: first the independent, then the dependent, then the auxiliary speeds. `q`, `u` and `x` can
     be indexed by number or by name: `q[0]`, `q["roll"]`.
@@ -331,8 +333,10 @@ class System(eqx.Module, metaclass=SystemMeta):
             check_parameter(f"{type(self).__name__}.{name}", getattr(self, name), info)
 
     def motion(self, t: Component, q: Numbers, u: Numbers) -> Motion:
-        """Return the `Motion` at time `t` [s], coordinates `q` and speeds `u`. Without coordinates and speeds, by default a
-        motion without bodies."""
+        """Return the `Motion` at time `t` [s], coordinates `q` and speeds `u`.
+
+        A system of first-order states only needs no motion: by default, its motion has no bodies.
+        """
         if not (self.coordinates or self.speeds or self.dependent_speeds):
             return Motion([])
         raise NotImplementedError(f"{type(self).__name__} must define motion(self, t, q, u) and return a Motion.")

@@ -62,7 +62,8 @@ def trajectories(
     **Arguments:**
 
     - `trajectory`: a `Trajectory`. All members of a batch are drawn, faintly.
-    - `names`: the quantities; names in a tuple share a panel. Default: the coordinates, or the states of a system without any.
+    - `names`: the quantities; names in a tuple share a panel. Default: the coordinates, or the
+        first-order states if there are no coordinates.
     - `degrees`: angles in degrees instead of radians.
     - `units`: by name. Default: those that the system declares (`System.units`), else those of usual names, e.g.
         "roll", "x", "yaw_rate" and "steer_torque".

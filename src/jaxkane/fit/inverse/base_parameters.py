@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from ..._common.lookup import positive_number, refuse_unknown
+from ..._common.lookup import positive_number, refuse_if, refuse_unknown
 from ..._kane.consistent_state import assemble
 from ..._kane.constraint_residuals import has_configuration_constraints
 from ..._kane.regressor import Bodies
@@ -226,6 +226,7 @@ def states_for(spec: RegressorSpec) -> KinematicSamples:
     The speeds are scaled if the unit of time differs by a factor of thousands from the time scale of the system.
     Otherwise the columns of gravity would be negligible, or all other columns.
     """
+    refuse_if(not spec.system.speeds, f"{type(spec.system).__name__} has no speeds, so it has no equations of motion.")
     states = random_states(spec.system, 10 + 3 * -(-len(spec.names) // len(spec.system.speeds)))
     values = np.asarray(spec.values(jnp.asarray(states.t[0]), jnp.asarray(states.q[0])))
     still, no_input = np.zeros_like(states.u), {name: 0.0 * x for name, x in states.inputs.items()}
