@@ -45,7 +45,7 @@ def seconds(name: str, call: str) -> float:
 
 
 class Box(jk.System):
-    """A box of 1 kg. One or more of its lower corners have a contact with the floor."""
+    """A box of 1 kg. One or more of its corners have a contact with the floor, the lower ones first."""
 
     corners: int = eqx.field(static=True, default=1)
     coordinates, speeds = ("x", "y", "z", "a", "b", "c"), ("vx", "vy", "vz", "wx", "wy", "wz")
@@ -57,8 +57,8 @@ class Box(jk.System):
         N, O = jk.inertial()
         B = N.rotate_sequence("3-1-2", q["a":"c"], angular_velocity=u["wx":"wz"], name="B")
         G = O.moving(N.vector(*q["x":"z"]), N.vector(*u["vx":"vz"]))
-        places = [(0.3, 0.2), (0.3, -0.2), (-0.3, 0.2), (-0.3, -0.2)][: self.corners]
-        points = {f"{i}": G.fixed(x * B.x + y * B.y - 0.1 * B.z) for i, (x, y) in enumerate(places)}
+        places = [(x, y, z) for z in (-0.1, 0.1) for x in (0.3, -0.3) for y in (0.2, -0.2)][: self.corners]
+        points = {f"{i}": G.fixed(x * B.x + y * B.y + z * B.z) for i, (x, y, z) in enumerate(places)}
         return jk.Motion([jk.Body(1.0, (0.02, 0.03, 0.04), G, B, name="box")], points=points)
 
     def loads(self, t, q, u, motion, inputs):

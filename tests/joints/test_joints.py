@@ -582,8 +582,8 @@ def test_the_number_of_stops_is_limited():
     limits = "the limits of q0, q1, q2, q3, q4"
     with pytest.raises(ValueError, match=rf"10 contacts, which are {limits}. At most 8 .* fewer joints"):
         mechanism(pendulums(5, stops=(-1.0, 1.0)))
-    with pytest.raises(ValueError, match=r"6 contacts, .* At most 4 .* fewer joints"):
-        mechanism(pendulums(2, stops=(-1.0, 1.0), friction=0.1))
+    with pytest.raises(ValueError, match=r"9 contacts, .* At most 6 .* fewer joints"):
+        mechanism(pendulums(3, stops=(-1.0, 1.0), friction=0.1))
 
 
 # Chains of many links: columns of M and f by transposition

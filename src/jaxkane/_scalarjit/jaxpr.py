@@ -33,7 +33,7 @@ from .compat import (
 )
 from .graph import COMPARISONS, LOGIC, Graph, NotScalarError, applied, as_constants, graph_of, needed
 
-_LONGEST, _LARGEST = 64, 4096  # of the sum; number of products
+_LONGEST, _LARGEST = 64, 16384  # of the sum; number of products
 
 
 def is_small(equation: Equation) -> bool:

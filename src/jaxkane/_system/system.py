@@ -420,8 +420,8 @@ class System(eqx.Module, metaclass=SystemMeta):
             def contacts(self, t, q, u, motion):
                 return {"floor": jk.Contact(motion["foot"], motion.N.y, friction=self.friction)}
 
-        The simulation finds touch-down, impact, rest, slip, stick and lift-off. At most four contacts
-        are possible, or eight if none has friction.
+        The simulation finds touch-down, impact, rest, slip, stick and lift-off. At most eight contacts
+        are possible, or six in a plane with friction.
         """
         return {}
 

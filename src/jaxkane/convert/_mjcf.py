@@ -57,7 +57,7 @@ def from_mjcf(
     - `strict`: raise an exception for unsupported elements, instead of omitting them with a warning.
     - `stops`: names of hinges and sliders whose limits become contacts without restitution, `NAME lower` and
         `NAME upper`, with the parameters `lower.NAME`, `upper.NAME`. True: all that have a range. A system has at
-        most four contacts, or eight without friction. Name the joints that reach their limits.
+        most eight contacts, or six with friction of joints. Name the joints that reach their limits.
     - `friction`: names of hinges and sliders whose `frictionloss` becomes dry friction, the contact `NAME friction`
         with the parameter `friction.NAME`. True: all that have friction.
     - `dependent`: hinges and sliders that are solved for in closed loops, as in `jaxkane.joints.mechanism`.

@@ -382,7 +382,7 @@ def _check_names(structure: Structure) -> None:
 def _check_stops(structure: Structure) -> None:
     stops = [joint.name for joint in structure.joints for has in joint.has_stops if has]
     rough = [joint.name for joint in structure.joints if joint.has_friction]
-    if len(stops) + len(rough) > (most := most_contacts(bool(rough))):
+    if len(stops) + len(rough) > (most := most_contacts(bool(rough), False)):
         kinds = (("the limits of", stops, "stops"), ("the dry friction of", rough, "friction"))
         parts = [f"{what} {', '.join(dict.fromkeys(names))}" for what, names, _ in kinds if names]
         options = [f"`{option}`" for _, names, option in kinds if names]

@@ -111,7 +111,7 @@ def layout_of(system: System) -> ContactLayout:
     """The `ContactLayout` of a system. The first call traces its contacts.
 
     **Raises:** `TypeError` or `ValueError` if `contacts` does not return a dict of contacts by name; `ValueError` for
-    more than four contacts (eight without friction), and for too many speeds.
+    more than eight contacts (six in a plane with friction), and for too many speeds.
     """
     if not has_contacts(system) and not has_multipliers(system):
         return NO_CONTACTS
@@ -142,14 +142,14 @@ def _traced_layout(system: System, t: Component, q: Array, u: Array) -> Any:
     contacts, names, own = [*by_name.values()], ", ".join(by_name), cast(Any, system)
     is_bearing = tuple(isinstance(x, DryFriction) for x in contacts)
     has_friction = tuple(isinstance(x, DryFriction) or not is_zero(component(x.friction)) for x in contacts)
-    refuse_if(
-        len(contacts) > most_contacts(any(has_friction)),
-        f"{kane.name} has {len(contacts)} contacts: {names}. At most {most_contacts(True)} are possible, or "
-        f"{most_contacts(False)} if none has friction. Use `jaxkane.loads.plane_contact` for more, or MuJoCo.",
-    )
     has_point = tuple(isinstance(x, Contact) and x.point is not None for x in contacts)
     planes = tuple(_plane(x, motion.N) if has else 2 for x, has in zip(contacts, has_point, strict=True))
     in_space = any(f and p is None for f, p in zip(has_friction, planes, strict=True))
+    refuse_if(
+        len(contacts) > (most := most_contacts(any(has_friction), in_space)),
+        f"{kane.name} has {len(contacts)} contacts: {names}. At most {most} are possible. Use "
+        "`jaxkane.loads.plane_contact` for more, or MuJoCo.",
+    )
     n_residuals = len(own.multiplier_residuals(*at)) if has_multipliers(system) else 0
     layout = ContactLayout(
         tuple(by_name), has_friction, is_bearing, in_space, planes, has_point, n_residuals=n_residuals

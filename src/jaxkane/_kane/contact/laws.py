@@ -38,9 +38,10 @@ from ..scaling import RowBasis
 OPEN, SLIDES, STICKS = 0, 1, 2
 
 
-def most_contacts(have_friction: bool) -> int:
-    """The contact forces of a motion are part of a program of scalars, which would be too long for more contacts."""
-    return 4 if have_friction else 8
+def most_contacts(have_friction: bool, in_space: bool) -> int:
+    """The contact forces of a motion are part of a program of scalars, which would be too long for more contacts. In a
+    plane with friction, all combinations of their states are tried."""
+    return 6 if have_friction and not in_space else 8
 
 
 class ContactImpact(NamedTuple):
