@@ -254,7 +254,8 @@ class Integrator(jk.System):
 
 def test_controls_at_a_bound_and_in_between():
     """u is -1 until t = 1, then 0 until t = 3/2, then 1: the integral of x^2 is 1/3 + 1/24 = 3/8. A jump of the control
-    takes one interval. With an interval more or less, the cost changes by its third power."""
+    takes one interval. With an interval more or less, the cost changes by its third power. The costate is (1 - t)^2, 0
+    and -(t - 1.5)^2."""
     problem = Problem(
         Integrator(), 2.0, controls={"u": (-1.0, 1.0)}, cost=lambda t, now: now["x"] ** 2, start={"x": 1.0},
         end={"x": 0.5},
@@ -264,6 +265,9 @@ def test_controls_at_a_bound_and_in_between():
     assert plan.cost == pytest.approx(3 / 8, abs=2e-5)
     assert plan.at([0.5, 1.25, 1.75])["u"] == pytest.approx([-1.0, 0.0, 1.0], abs=0.02)
     assert plan.active == ("u at its lower bound", "u at its upper bound")
+    t = plan.mesh
+    exact = np.maximum(1.0 - t, 0.0) ** 2 - np.maximum(t - 1.5, 0.0) ** 2
+    np.testing.assert_allclose(plan.multipliers.costate["x"], exact, atol=2e-3)
 
 
 @pytest.mark.weekly
@@ -324,39 +328,6 @@ def test_a_switch_inside_an_interval_is_refined(method, intervals):
     assert plan.cost == plan.duration == pytest.approx(2.0, abs=1e-6)
     assert plan.active == ("force at its lower bound", "force at its upper bound")
     assert len(plan.mesh) - 1 <= 3 * intervals
-
-
-class Integrator(jk.System):
-    """The rate of a first-order state, beside a mass that does not matter."""
-
-    coordinates, speeds, inputs, states = ("place",), ("speed",), ("rate",), ("x",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["place"] * N.x, u["speed"] * N.x), N, name="mass")])
-
-    def state_rates(self, t, q, u, x, motion, now):
-        return {"x": now["rate"]}
-
-
-def test_costates_before_on_and_after_a_singular_arc():
-    """The rate is -1 until 1 s, 0 until 1.5 s, then 1. The integral of x^2 is 3/8, the costate is (1 - t)^2, 0 and
-    -(t - 1.5)^2."""
-    atol = 2e-3
-    start = {"place": 0.0, "speed": 0.0, "x": 1.0}
-    problem = Problem(
-        Integrator(),
-        2.0,
-        controls={"rate": (-1.0, 1.0)},
-        cost=lambda t, now: now["x"] ** 2,
-        start=start,
-        end={"x": 0.5},
-    )
-    plan = solve(problem, intervals=20, tolerance=None)
-    assert plan.cost == pytest.approx(3 / 8, abs=atol)
-    t = plan.mesh
-    exact = np.maximum(1.0 - t, 0.0) ** 2 - np.maximum(t - 1.5, 0.0) ** 2
-    np.testing.assert_allclose(plan.multipliers.costate["x"], exact, atol=atol)
 
 
 @pytest.mark.slow_cases("trapezoid", "lobatto")

@@ -343,7 +343,7 @@ def from_urdf(
         other links remain as points. False: each link keeps its own parameters.
     - `stops`: names of hinges and sliders whose limits become contacts without restitution. The contacts are named
         `NAME lower` and `NAME upper`, and their parameters are `lower.NAME` and `upper.NAME`. True: all joints with a
-        range. A system has at most eight contacts, or six with friction of joints. Name the joints that reach their limits.
+        range. At most eight contacts are possible, or six with friction of joints. Name those that reach their limits.
     - `friction`: names of hinges and sliders whose friction becomes dry friction. The contact is named `NAME friction`,
         and its parameter is `friction.NAME`. True: all joints with friction.
     - `gravity` (3,): the acceleration of gravity in the inertial frame [m/s^2].
