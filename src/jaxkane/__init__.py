@@ -25,6 +25,7 @@ if _typing.TYPE_CHECKING:  # the same names as below, for type checkers and the 
     from . import plot as plot
     from . import rotations as rotations
     from . import sensors as sensors
+    from . import shapes as shapes
     from . import stability as stability
     from . import sweep as sweep
     from . import symbolic as symbolic
@@ -87,7 +88,7 @@ if _typing.TYPE_CHECKING:  # the same names as below, for type checkers and the 
     from ._system.system import System as System
 
 _PACKAGES = """
-bicycles catalog collocation convert data estimate export fit joints loads plot rotations sensors stability sweep
+bicycles catalog collocation convert data estimate export fit joints loads plot rotations sensors shapes stability sweep
 symbolic
 """.split()
 _NAMES = {

@@ -51,10 +51,11 @@ def animate(
         jk.animate(bicycle, trajectory).save("ride.html")    # a page that does not load anything
         jk.animate(bicycle, trajectory, speed=0.5).save("ride.gif")
 
-    Bicycles have their own figure. For any other system, each body is drawn as the uniform solid with its mass and
-    inertia, and points with constant distances are joined by lines. A body without mass is drawn as its frame. Springs
-    of `jaxkane.loads` are zigzags, dampers and actuators are lines. Pass `figure` for another drawing. Orbit the view
-    with the mouse or a finger, zoom with the wheel, and use keys to play, slow down and step; "?" lists them.
+    Bicycles have their own figure. For any other system, each body is drawn as its `shape`, or as the uniform solid
+    with its mass and inertia, and points with constant distances are joined by lines. A body without mass and shape is
+    drawn as its frame. Springs of `jaxkane.loads` are zigzags, dampers and actuators are lines. Pass `figure` for
+    another drawing. Orbit the view with the mouse or a finger, zoom with the wheel, and use keys to play, slow down and
+    step; "?" lists them.
 
     **Arguments:**
 
@@ -111,6 +112,7 @@ def _scene(
         points=motion.points[frames],
         frames=motion.frames[frames],
         ends=motion.ends[frames],
+        shapes=[x[frames] for x in motion.shapes],
     )
     build = Builder(sampled.orientation, sampled.place, turned[frames], scale or 1.0)
     if figure is None:
@@ -329,6 +331,9 @@ class _Painter:
         elif shape.kind == "pairs":
             for pair in zip(at[::2], at[1::2]):
                 draw.line(pair, color, width=width)
+        elif shape.kind == "ball":
+            (a, b), r = at[0], np.linalg.norm(np.subtract(at[1:], at[0])) / np.sqrt(2.0)
+            draw.ellipse((a - r, b - r, a + r, b + r), self.color(shape.color, shape.fill), color, width=width)
         else:
             (a, b), r = at[0], shape.width * _FINE * 0.8
             box = (a - r, b - r, a + r, b + r)

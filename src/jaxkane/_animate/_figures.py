@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -173,6 +173,8 @@ class Record(eqx.Module):
     - `points` (n_t, p, 3): including the origin. `frames` (n_t, f, 3, 3): as `orientation`.
     - `forces` (n_t, l, 3): on mass centres, for the direction of gravity.
     - `ends` (n_t, s, 2, 3): of the springs, dampers and actuators between two points, which are `links`.
+    - `shapes`: of each shape that a body declares, `center` and `sizes` (n_t, 3 + n_sizes).
+    - `shape_styles`: of each of these, the number of the body, the kind and the colour.
     """
 
     t: Any
@@ -185,11 +187,13 @@ class Record(eqx.Module):
     frames: Any
     forces: Any
     ends: Any
+    shapes: list[Any]
     elements: list[Element]
     bodies: tuple[str, ...] = eqx.field(static=True)
     body_numbers: tuple[int, ...] = eqx.field(static=True)
     point_names: tuple[str, ...] = eqx.field(static=True)
     links: tuple[str, ...] = eqx.field(static=True)
+    shape_styles: tuple[tuple[int, str, str | None], ...] = eqx.field(static=True)
 
 
 def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Record:
@@ -234,6 +238,7 @@ def _record_at(system: System, figure: Figure | None, t: Array, q: Coordinates, 
     forces = [load.vector for load in loads if isinstance(load, Force) and load.point in centers]
     links = [load for load in loads if isinstance(load, ElementForce)]
     links = [link for link in links if link.point.has_position and link.other.has_position]
+    shapes = [(k, shape) for k, body in enumerate(bodies) for shape in body.shapes]
     sketch = Sketch(motion)
     if figure is not None:
         figure(system, motion, sketch)
@@ -258,11 +263,13 @@ def _record_at(system: System, figure: Figure | None, t: Array, q: Coordinates, 
         frames=rotations(list(motion.frames.values())),
         forces=table([row(force) for force in forces], 3),
         ends=table([jnp.stack([row(end.position) for end in (link.point, link.other)]) for link in links], 2, 3),
+        shapes=[stack([[*shape.center, *shape.sizes]])[0].astype(dtype) for _, shape in shapes],
         elements=sketch.elements,
         bodies=tuple(b.name for b in bodies),
         body_numbers=tuple(placed),
         point_names=tuple(points),
         links=tuple(link.kind for link in links),
+        shape_styles=tuple((k, shape.kind, shape.color) for k, shape in shapes),
     )
 
 
@@ -344,11 +351,12 @@ def figure_of(system: object) -> Figure | None:
 
 
 def bodies_and_points(motion: Record, build: Builder) -> None:
-    """Each body as the uniform solid with its mass and inertia; points with constant distances are joined.
+    """Each body as its shapes or its uniform solid; points with constant distances are joined.
 
-    A body without mass is drawn as its frame. Springs are zigzags; dampers and actuators are lines.
+    A body without mass and shapes is drawn as its frame. Springs are zigzags; dampers and actuators are lines.
     """
     color = {k: CYCLE[k % len(CYCLE)] for k in range(len(motion.bodies))}
+    color |= {body: "grey" for body, _, _ in motion.shape_styles if motion.mass[body] == 0}
     joined, drawn = _links(motion, build), []
     for i in sorted(range(len(motion.links)), key=lambda i: motion.links[i] != "spring"):
         same = [np.abs(motion.ends[:, i] - x).max() for x in drawn]
@@ -357,8 +365,13 @@ def bodies_and_points(motion: Record, build: Builder) -> None:
             build.moving(motion.ends[:, i])
             build.shape("spring" if motion.links[i] == "spring" else "line", "grey", 2, width=1.5)
     marks = {}
+    with_shapes = {body for body, _, _ in motion.shape_styles}
+    for number, (body, _, _) in enumerate(motion.shape_styles):
+        _shape(motion, build, number, color[body])
     for k in color:
-        if motion.mass[k] > 0:
+        if k in with_shapes:
+            marks[k] = ("center", 5.0) if motion.mass[k] > 0 else ("dot", 3.0)
+        elif motion.mass[k] > 0:
             is_solid = _solid(build, k, color[k], motion.inertia[k] / motion.mass[k])
             marks[k] = "center", 5.0 if is_solid else 9.0
         else:
@@ -396,44 +409,76 @@ def _solid(build: Builder, body: int, color: str, inertia: np.ndarray) -> bool:
     if np.sqrt(largest) <= build.tolerance:
         return False
     axial = [k for k in range(3) if abs(moments[k - 1] - moments[k - 2]) <= 1e-6 * largest]
-
-    def add(x: np.ndarray, **style):
-        build.local(np.asarray(x) @ axes.T, body)
-        build.shape(style.pop("kind", "line"), color, len(x), **style)
-
+    kind, k = "sphere", 2
     if len(axial) == 3:
-        radius = np.sqrt(2.5 * largest)
-        for k in range(3):
-            add(np.roll(_ring(radius, 0.0), k, axis=1), closed=True, fill=0.06)
+        halves = np.full(3, np.sqrt(2.5 * largest))
     elif axial:
-        k = axial[0]
+        k = axial[0]  # the axis of symmetry becomes the third axis of the solid
         radius = np.sqrt(2.0 * moments[k])
         half = 0.5 * np.sqrt(max(12.0 * (moments[k - 1] - radius**2 / 4.0), 0.0))
-
-        def turn(x: np.ndarray) -> np.ndarray:  # the third axis of a ring becomes the axis of symmetry
-            return np.roll(x, k + 1, axis=1)
-
-        if radius < 0.02 * half:
-            add(turn(np.array([[0.0, 0.0, -half], [0.0, 0.0, half]])), width=4.0)
-            return True
-        for z in (-half, half):
-            add(turn(_ring(radius, z)), closed=True, fill=0.12)
-        sides = np.stack([_ring(radius, -half)[::4], _ring(radius, half)[::4]], axis=1).reshape(-1, 3)
-        add(turn(sides), kind="pairs", width=0.8)
-        # a diameter on each end shows the rotation
-        add(turn(np.array([[-radius, 0.0, half], [radius, 0.0, half], [radius, 0, -half], [-radius, 0, -half]])))
+        kind, halves = "cylinder" if radius >= 0.02 * half else "rod", np.array([radius, radius, half])
     else:
-        box = np.sqrt(np.maximum(1.5 * (moments.sum() - 2.0 * moments), 0.0))  # half the edges
-        square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-        for k in range(3):
-            for side in (-1.0, 1.0):
-                face = np.roll(np.c_[square, np.full(4, side)], k + 1, axis=1)
-                add(face * box, closed=True, fill=0.08)
+        kind, halves = "box", np.sqrt(np.maximum(1.5 * (moments.sum() - 2.0 * moments), 0.0))
+    for x, style in _SOLIDS[kind]:
+        build.local(x * halves @ np.roll(axes.T, 2 - k, axis=0), body)
+        build.shape(color=color, count=len(x), **style)
     return True
 
 
-def _ring(radius: float, z: float) -> np.ndarray:
-    return np.stack([radius * np.cos(_AROUND), radius * np.sin(_AROUND), np.full_like(_AROUND, z)], axis=1)
+def _shape(motion: Record, build: Builder, number: int, color: str) -> None:
+    """A shape that a body declares."""
+    body, kind, own_color = motion.shape_styles[number]
+    numbers = motion.shapes[number]  # (F, 3 + n_sizes)
+    center, sizes = numbers[:, :3], numbers[:, 3:]
+    if kind == "box":
+        halves = sizes.reshape(-1, 3, 3)
+    elif kind == "sphere":
+        halves = sizes[..., None] * np.eye(3)
+    else:
+        along = sizes[:, -3:]
+        across = np.cross(along, np.eye(3)[np.abs(along[0]).argmin()])
+        across = np.stack([across, np.cross(along, across)], axis=1)
+        size = np.linalg.norm(across, axis=-1, keepdims=True)
+        halves = sizes[:, :1, None] * across / np.where(size > 0, size, 1.0)
+        halves = np.concatenate([halves, 0.5 * along[:, None]], axis=1)
+    for unit, style in (*_BALL, *_SOLIDS[kind]) if kind == "sphere" else _SOLIDS[kind]:
+        x = center[:, None] + unit @ halves
+        if np.ptp(x, axis=0).max() <= build.tolerance:
+            build.local(x[0], body)
+        else:  # its numbers depend on the coordinates
+            build.moving(motion.place[:, body, None] + x @ motion.orientation[:, body].swapaxes(1, 2))
+        build.shape(color=own_color or color, count=len(unit), **style)
+
+
+def _ring(z: float) -> np.ndarray:
+    return np.stack([np.cos(_AROUND), np.sin(_AROUND), np.full_like(_AROUND, z)], axis=1)
+
+
+def _faces() -> Iterator[np.ndarray]:
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    for k in range(3):
+        for side in (-1.0, 1.0):
+            yield np.roll(np.c_[square, np.full(4, side)], k + 1, axis=1)
+
+
+_SIDES = np.stack([_ring(-1.0)[::4], _ring(1.0)[::4]], axis=1).reshape(-1, 3)
+_DIAMETERS = np.array([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 0.0, -1.0]])  # show the rotation
+_AXIS = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+_LINE: dict[str, Any] = {"kind": "line"}
+_SOLIDS: dict[str, list[tuple[np.ndarray, dict[str, Any]]]] = {
+    "sphere": [(np.roll(_ring(0.0), k, axis=1), _LINE | {"closed": True, "fill": 0.06}) for k in range(3)],
+    "box": [(face, _LINE | {"closed": True, "fill": 0.08}) for face in _faces()],
+    "cylinder": [
+        *((_ring(z), _LINE | {"closed": True, "fill": 0.12}) for z in (-1.0, 1.0)),
+        (_SIDES, {"kind": "pairs", "width": 0.8}),
+        (_DIAMETERS, _LINE),
+    ],
+    "rod": [(_AXIS, _LINE | {"width": 4.0})],
+    "line": [(_AXIS, _LINE | {"width": 2.0})],
+}
+"""The lines (n, 3) of solids between -1 and 1, and their styles."""
+_BALL = [(np.concatenate([np.zeros((1, 3)), np.eye(3)]), {"kind": "ball", "fill": 0.3})]
+"""The outline of a sphere: the centre and three points on the surface, in orthogonal directions."""
 
 
 def _links(motion: Record, build: Builder) -> bool:

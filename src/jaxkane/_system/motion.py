@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from .._common.lookup import Kind, checked, not_there, refuse_if
 from .._scalarjit.components import Component, Triple, add, component, dot, is_zero, mul, sub
+from ..shapes import Shape, as_shapes
 from .kinematics import Frame, Point, Vector, inertial
 from .parameters import concrete_numbers, text_of, wrapped
 
@@ -42,12 +43,14 @@ class Body:
     - `about`: a Point that is fixed in `frame`, if `inertia` is about this point. The parallel axis theorem gives the
         central inertia, I - m (r.r 1 - r r). If the inertia is about one axis only, (0.0, 0.0, J), only this moment
         changes.
+    - `shape`: what animations draw for the body, one of `jaxkane.shapes` or a list of these. Default: the uniform solid
+        with its mass and inertia. A body of mass 0.0 in the inertial frame carries the shapes of the ground.
 
     **Raises:** `ValueError` for an inertia of another shape, and for an inertia without a frame. `TypeError` for
     arguments of a wrong type.
     """
 
-    __slots__ = ("about", "angular_velocity", "center", "frame", "inertia", "is_particle", "mass", "name")
+    __slots__ = ("about", "angular_velocity", "center", "frame", "inertia", "is_particle", "mass", "name", "shapes")
 
     def __init__(
         self,
@@ -58,6 +61,7 @@ class Body:
         angular_velocity: Vector | None = None,
         name: str = UNNAMED,
         about: Point | None = None,
+        shape: Shape | Sequence[Shape] = (),
     ):
         for label, value, kind in (
             (f"the mass centre of {name!r} is a Point", center, Point),
@@ -80,6 +84,7 @@ class Body:
         self.frame = center.velocity.frame.root if frame is None else frame
         self.angular_velocity = self.frame.angular_velocity if angular_velocity is None else angular_velocity
         self.name = name
+        self.shapes = as_shapes(shape, name)
         self.about = about
         if about is not None:
             given = self.inertia

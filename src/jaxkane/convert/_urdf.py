@@ -1,6 +1,6 @@
 """URDF files as mechanisms of joints: links and joints of the file, with Python's reader of XML, and the mechanism.
 
-The format is that of the ROS wiki (urdf/XML). Shapes, materials and sensors are not read, so files of meshes need not
+The format is that of the ROS wiki (urdf/XML). Meshes, materials and sensors are not read, so files of meshes need not
 exist.
 """
 
@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .. import rotations
+from .. import rotations, shapes
 from .._common.lookup import not_there, refuse_any, refuse_if
 from .._scalarjit.components import ComponentsLike
 from ..joints import Coupling, Joint, Link, Mechanism, ball, free, hinge, mechanism, planar, slide
@@ -78,6 +78,7 @@ class UrdfFile(NamedTuple):
     - `name`: of the robot.
     - `root`: the name of its root link.
     - `links`: by name, None for a link without inertia.
+    - `shapes`: of the links, by name: boxes, cylinders and spheres among their <visual>.
     - `joints`: parents before their children, branch by branch.
     - `balance`: whether the file asks for balanced inertias (`balanceinertia` of MuJoCo's extension).
     - `left_out`: elements that affect the motion and are not read.
@@ -86,6 +87,7 @@ class UrdfFile(NamedTuple):
     name: str
     root: str
     links: dict[str, Inertial | None]
+    shapes: dict[str, list[shapes.Shape]]
     joints: list[FileJoint]
     balance: bool
     left_out: list[str]
@@ -106,10 +108,11 @@ def read_urdf(text: str) -> UrdfFile:
         refuse_any(unnamed[:1], f"{name}: one of the {kinds} has no name:", "")
         check_distinct(name, kinds, [x.get("name", "") for x in elements])
     inertials = {without_dots(x.get("name", "")): _inertial(x, f"{name}, link {x.get('name')!r}") for x in links}
+    drawn = {without_dots(x.get("name", "")): list(_shapes(x, f"{name}, link {x.get('name')!r}")) for x in links}
     read = [_joint(x, f"{name}, joint {x.get('name')!r}") for x in joints]
     root = _root(name, list(inertials), read)
     is_balanced = any(x.get("balanceinertia") == "true" for x in robot.findall("mujoco/compiler"))
-    return UrdfFile(name, root, inertials, _in_order(name, root, read), is_balanced, _left_out(robot))
+    return UrdfFile(name, root, inertials, drawn, _in_order(name, root, read), is_balanced, _left_out(robot))
 
 
 def _robot(text: str) -> Element:
@@ -147,6 +150,23 @@ def _inertial(link: Element, label: str) -> Inertial | None:
             I[i, j] = I[j, i] = _number(tensor, f"i{a}{b}", label, None if a == b else 0.0)
     center, R = _placement(inertial, label)
     return Inertial(m, center, _turned(I, R)) if m or I.any() else None
+
+
+def _shapes(link: Element, label: str) -> Iterator[shapes.Shape]:
+    for visual in link.findall("visual"):
+        solid = next((x for kind in ("sphere", "box", "cylinder") for x in visual.findall(f"geometry/{kind}")), None)
+        if solid is None:
+            continue
+        position, R = _placement(visual, label)
+        if solid.tag == "box":
+            size = _numbers(solid, "size", label, (0.0, 0.0, 0.0))
+            yield shapes.box(size.tolist(), position.tolist(), R.T.tolist())
+        elif solid.tag == "sphere":
+            yield shapes.sphere(_number(solid, "radius", label), position.tolist())
+        else:
+            half = 0.5 * _number(solid, "length", label) * R[:, 2]
+            ends = (position - half).tolist(), (position + half).tolist()
+            yield shapes.cylinder(_number(solid, "radius", label), *ends)
 
 
 def _turned(I: np.ndarray, R: np.ndarray) -> np.ndarray:
@@ -328,7 +348,8 @@ def from_urdf(
         dog = jk.convert.from_urdf("dog.urdf", floating=True)
 
     Revolute, continuous, prismatic, fixed, floating and planar joints are supported. A link without an `inertial` has
-    no mass, even if it has shapes. `mimic` becomes a coupling. `package://` paths and meshes are not read.
+    no mass, even if it has shapes. `mimic` becomes a coupling. `package://` paths and meshes are not read. Animations
+    draw boxes, cylinders and spheres of `visual`.
 
     **Arguments:**
 
@@ -430,11 +451,11 @@ class _UrdfReader:
         carriers = {joint.child: joint for joint in self.file.joints}
         links = []
         for link in (self.file.root, *carriers):
-            own: dict[str, Any] = {}
+            own: dict[str, Any] = {"shape": self.file.shapes[link]}
             if link in bodies:
                 inertial = bodies[link][1]
                 I = _without_rounding(matrices[link], np.trace(matrices[link]))
-                own = {"mass": inertial.mass, "center": inertial.center.tolist(), "inertia": I.tolist()}
+                own |= {"mass": inertial.mass, "center": inertial.center.tolist(), "inertia": I.tolist()}
             if link in carriers:
                 links.append(self._link(carriers[link], own))
             elif link != "world":

@@ -15,6 +15,7 @@ from .._kane.contact.laws import most_contacts
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, ComponentsLike
 from ..rotations import Matrix
+from ..shapes import Shape, as_shapes
 from ._joints import Hinge, Joint, JointType, Slide, components, exact, exact_numbers, is_structural_zero
 from ._loops import with_dependent
 from ._mechanism import (
@@ -52,6 +53,8 @@ class Link:
     - `mass` [kg], `center` [m]: mass and mass centre. A link without a mass is a frame that carries others.
         A mass of zero is permitted if the link has moments of inertia.
     - `inertia` [kg m^2]: about the mass centre, along the link's axes: three principal moments, or a (3, 3) matrix.
+    - `shape`: what animations draw, one of `jaxkane.shapes` or a list of these, with exact numbers. A link with shapes
+        and without a mass becomes a body of mass zero.
 
     Numbers become parameters: `mass.forearm`, `center.forearm.z`, `inertia.forearm.xx`, `position.forearm.z`. A zero
     that is written as a number is not a parameter but part of the structure, and costs nothing. Write `jnp.zeros(())`
@@ -66,6 +69,7 @@ class Link:
     mass: Component | None = None
     center: ComponentsLike = (0.0, 0.0, 0.0)
     inertia: ComponentsLike | Sequence[ComponentsLike] = (0.0, 0.0, 0.0)
+    shape: Shape | Sequence[Shape] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -282,9 +286,14 @@ def _link(link: Link, values: dict[str, Any]) -> LinkStructure:
         if not (moments and is_structural_zero(link.mass)):  # a gimbal may have moments of inertia only
             values[f"mass.{link.name}"] = link.mass
         values |= components(f"center.{link.name}", link.center) | moments
-    return LinkStructure(
-        link.name, link.parent, _matrix(link.orientation, link.name), tuple(types), link.mass is not None
-    )
+    shapes = tuple(_exact(shape, link.name) for shape in as_shapes(link.shape, link.name))
+    orientation = _matrix(link.orientation, link.name)
+    return LinkStructure(link.name, link.parent, orientation, tuple(types), link.mass is not None, shapes)
+
+
+def _exact(shape: Shape, name: str) -> Shape:
+    x, y, z, *sizes = exact_numbers([*shape.center, *shape.sizes], f"A shape of {name!r}").tolist()
+    return shape._replace(center=(x, y, z), sizes=tuple(sizes))
 
 
 def _moments(link: Link) -> dict[str, Any]:

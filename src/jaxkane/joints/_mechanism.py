@@ -20,6 +20,7 @@ from .._scalarjit.components import (
     Scalar,
     Triple,
     add,
+    add3,
     component,
     dot,
     is_exact,
@@ -34,6 +35,7 @@ from .._system.motion import Body, Force, GroupedResiduals, Motion, SomeComponen
 from .._system.parameters import parameter, parameter_info
 from .._system.system import NamedVector, System
 from ..rotations import Matrix
+from ..shapes import Shape
 from ._joints import JointKinematics, JointType
 
 Named = Mapping[str, Component] | NamedVector
@@ -47,6 +49,7 @@ class LinkStructure(NamedTuple):
     orientation: Matrix | None
     joints: tuple[JointType, ...]
     has_mass: bool
+    shapes: tuple[Shape, ...] = ()  # from the link's origin
 
 
 class SiteStructure(NamedTuple):
@@ -246,8 +249,12 @@ class Mechanism(System):
         for link in self.structure.links:
             F, P = carried[link.name]
             if link.has_mass:
-                G = _moved(P, F, _triple(self, f"center.{link.name}"))
-                bodies.append(Body(_read(self, f"mass.{link.name}"), _inertia(self, link.name), G, F, name=link.name))
+                center = _triple(self, f"center.{link.name}")
+                m, I, G = _read(self, f"mass.{link.name}"), _inertia(self, link.name), _moved(P, F, center)
+                shapes = [s._replace(center=add3(s.center, scale3(-1.0, center))) for s in link.shapes]
+                bodies.append(Body(m, I, G, F, name=link.name, shape=shapes))
+            elif link.shapes:
+                bodies.append(Body(0.0, 0.0, P, F, name=link.name, shape=link.shapes))
             else:
                 points[link.name] = P.fixed(F.vector(0.0, 0.0, 0.0))
         for joint in self.structure.joints:
