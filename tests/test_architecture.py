@@ -17,8 +17,8 @@ SOURCE = Path(jk.__file__).parent
 
 # The layers, from the lowest to the highest. A module imports from lower layers and from its own.
 LAYERS = """
-_version _common _scalarjit rotations shapes _system loads sensors _kane joints convert _integrate catalog sweep plot estimate
-_collocate fit collocation data stability bicycles symbolic export _animate __main__
+_version _common _scalarjit rotations shapes _system loads sensors _kane joints convert _integrate catalog sweep plot
+estimate _collocate fit collocation data stability bicycles symbolic export _animate __main__
 """.split()
 
 

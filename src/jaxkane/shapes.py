@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from ._common.lookup import checked
-from ._scalarjit.components import ZERO3, Component, ComponentsLike, Triple, add, components, mul, sub
+from ._scalarjit.components import ZERO3, Component, ComponentsLike, Triple, add, component, components, mul, sub
 
 __all__ = ["Shape", "box", "cylinder", "line", "sphere"]
 
@@ -84,7 +84,7 @@ def as_shapes(shapes: Shape | Sequence[Shape], label: str) -> tuple[Shape, ...]:
 
 
 def _shape(kind: str, center: ComponentsLike, sizes: Sequence[Any], color: str | None) -> Shape:
-    numbers = components(sizes, len(sizes), f"The sizes of a {kind} must be numbers [m]")
+    numbers = tuple(component(size, f"A size of a {kind} [m]") for size in sizes)
     checked(color, str | None, f"The colour of a {kind} must be a string")
     x, y, z = components(center, 3, _POSITION)
     return Shape(kind, (x, y, z), numbers, color)

@@ -243,6 +243,121 @@ def test_springs_dampers_and_bodies_without_inertia_are_drawn(tmp_path):
     animation.save(tmp_path / "spring.gif", size=(200, 160), seconds=0.2)
 
 
+class Bob(jk.System):
+    """A particle on a string from a rail. The particle has no frame, so the string is a line that moves."""
+
+    radius: jk.Scalar = jk.parameter(0.2)
+    has_shapes = True
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        bob = O.fixed(-0.5 * N.rotate(3, q["angle"], u["rate"]).y)
+        string = jk.shapes.line((0, 0, 0), O.position_from(bob).components_in(N), color="grey")
+        rail = jk.shapes.cylinder(0.01, (-1, 0, 0), (1, 0, 0))
+        shape = [jk.shapes.sphere(self.radius), string] if self.has_shapes else ()
+        ground = jk.Body(0.0, 0.0, O, N, name="ground", shape=rail)
+        return jk.Motion([jk.Body(1.0, 0.0, bob, name="bob", shape=shape), *([ground] if self.has_shapes else [])])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+
+class WithoutShapes(Bob):
+    has_shapes = False
+
+
+def ends_of(scene, t, shape):
+    x, _ = scene.at(t)
+    return x[0, shape.first : shape.first + shape.count]
+
+
+def test_declared_shapes_are_drawn_instead_of_solids_and_frames(tmp_path):
+    """1e-12, with N.y up, which is the page's z. A GIF shows the ball with its radius, within a pixel."""
+    t = np.linspace(0.0, 1.0, 21)
+    animation = jk.animate(Bob(radius=0.3), moved(Bob(), t, np.sin(3.0 * t)[:, None], np.zeros((21, 1))))
+    scene = animation.scene
+    (ball,), bob = shapes(animation, "ball"), 0.5 * np.array([np.sin(np.sin(3 * t[4])), 0, -np.cos(np.sin(3 * t[4]))])
+    center, *surface = ends_of(scene, t[4], ball)
+    np.testing.assert_allclose(center, bob, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(surface - bob, axis=1), 0.3, rtol=1e-12)
+    string = next(s for s in shapes(animation, "line") if s.count == 2)
+    np.testing.assert_allclose(ends_of(scene, t[4], string), [bob, np.zeros(3)], atol=1e-12)
+    (sides,) = shapes(animation, "pairs")
+    np.testing.assert_allclose(np.ptp(ends_of(scene, t[4], sides), axis=0), [2.0, 0.02, 0.02], atol=1e-12)
+    assert {s.color for s in scene.shapes} == {"gold", "grey"}  # the ground is grey, and has no axes
+    with Image.open(animation.save(tmp_path / "bob.gif", size=(300, 300), seconds=0.05)) as image:
+        seen = np.asarray(image.convert("RGB")).astype(int)
+    across = np.flatnonzero((seen[..., 0] - seen[..., 2] > 20).any(axis=0))
+    assert np.ptp(across) == pytest.approx(300 * 0.6 / scene.view.span, abs=3)
+
+
+@pytest.mark.slow
+def test_shapes_do_not_change_the_equations_of_motion():
+    source = jk.export.numpy(Bob())
+    assert source.replace("Bob", "WithoutShapes") == jk.export.numpy(WithoutShapes())
+
+
+def test_shapes_of_a_urdf_are_drawn():
+    """1e-12: a base without mass, an arm with its mass centre at 0.3 m, and a mesh, which is omitted."""
+    place = '<origin xyz="0 0 {}" rpy="0 {} 0"/>'.format
+    visual = "<visual>{}<geometry><{}/></geometry></visual>".format
+    inertial = '<inertial><origin xyz="0 0 0.3"/><mass value="2"/><inertia ixx="0.1" iyy="0.1" izz="0.1"/></inertial>'
+    arm = visual(place(0.3, np.pi / 2), 'cylinder radius="0.05" length="0.6"') + visual(
+        place(0.6, 0), 'sphere radius="0.1"'
+    )
+    arm += visual("", 'mesh filename="package://none.dae"')
+    text = f"""<robot name="r"><link name="base">{visual(place(-0.1, 0), 'box size="0.4 0.5 0.2"')}</link>
+     <link name="arm">{inertial}{arm}</link>
+     <joint name="j" type="revolute"><parent link="base"/><child link="arm"/>{place(0.05, 0)}<axis xyz="0 1 0"/></joint>
+     </robot>"""
+    system, t = jk.convert.from_urdf(text), np.linspace(0.0, 1.0, 21)
+    animation = jk.animate(system, moved(system, t, t[:, None], np.zeros((21, 1))))
+    scene, turned = animation.scene, Rotation.from_euler("y", t[7])
+    assert {s.label for s in scene.shapes} == {"", "base", "arm"}
+    faces = [ends_of(scene, t[7], s) for s in shapes(animation, "line") if s.fill == 0.08]
+    np.testing.assert_allclose(np.ptp(np.concatenate(faces), axis=0), [0.4, 0.5, 0.2], atol=1e-12)
+    np.testing.assert_allclose(np.mean(faces, axis=(0, 1)), [0.0, 0.0, -0.1], atol=1e-12)
+    (sides,) = shapes(animation, "pairs")
+    in_arm = turned.inv().apply(ends_of(scene, t[7], sides) - [0.0, 0.0, 0.05])
+    np.testing.assert_allclose(
+        [in_arm.min(axis=0), in_arm.max(axis=0)], [[-0.3, -0.05, 0.25], [0.3, 0.05, 0.35]], atol=1e-7
+    )
+    (ball,) = shapes(animation, "ball")
+    center, *surface = turned.inv().apply(ends_of(scene, t[7], ball) - [0.0, 0.0, 0.05])
+    np.testing.assert_allclose(center, [0.0, 0.0, 0.6], atol=1e-7)
+    np.testing.assert_allclose(np.linalg.norm(surface - center, axis=1), 0.1, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_shapes_of_an_mjcf_file_are_drawn():
+    pytest.importorskip("mujoco")
+    geoms = """<geom type="box" size=".1 .2 .3" pos="1 0 0" euler="0 0 90"/><geom type="capsule" fromto="0 0 0 0 .5 0"
+     size=".02"/><geom size=".4" group="3"/><geom size=".3" pos="0 0 1"/>"""
+    body = f'<body name="a" pos="0 0 2"><joint axis="0 0 1"/>{geoms}</body>'
+    options = '<option><flag contact="disable"/></option>'
+    system = jk.convert.from_mjcf(f"<mujoco>{options}<worldbody>{body}</worldbody></mujoco>")
+    t = np.linspace(0.0, 1.0, 11)
+    animation = jk.animate(system, moved(system, t, 0.0 * t[:, None], np.zeros((11, 1))))
+    faces = np.concatenate([ends_of(animation.scene, 0.0, s) for s in shapes(animation, "line") if s.fill == 0.08])
+    np.testing.assert_allclose([faces.min(0), faces.max(0)], [[0.8, -0.1, 1.7], [1.2, 0.1, 2.3]], atol=1e-6)
+    (sides,), (ball,) = shapes(animation, "pairs"), shapes(animation, "ball")
+    np.testing.assert_allclose(np.ptp(ends_of(animation.scene, 0.0, sides), axis=0), [0.04, 0.5, 0.04], atol=1e-6)
+    np.testing.assert_allclose(ends_of(animation.scene, 0.0, ball)[0], [0.0, 0.0, 3.0], atol=1e-6)
+
+
+def test_invalid_shapes_are_rejected():
+    N, O = jk.inertial()
+    with pytest.raises(TypeError, match=r"ball: `shape` must be a shape such as jk.shapes.sphere\(0.1\)"):
+        jk.Body(1.0, 0.0, O, N, name="ball", shape=0.1)
+    with pytest.raises(ValueError, match="edges of a box must be three lengths"):
+        jk.shapes.box((1.0, 2.0))
+    with pytest.raises(ValueError, match="position of a shape must be three numbers"):
+        jk.shapes.sphere(0.1, (0.0, 1.0))
+    with pytest.raises(TypeError, match="A size of a sphere .* must be one number"):
+        jk.shapes.sphere("0.1")
+
+
 @pytest.fixture(scope="module")
 def page():
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, browser.Page(folder) as page:
