@@ -51,11 +51,10 @@ def animate(
         jk.animate(bicycle, trajectory).save("ride.html")    # a page that does not load anything
         jk.animate(bicycle, trajectory, speed=0.5).save("ride.gif")
 
-    Bicycles have their own figure. For any other system, each body is drawn as its `shape`, or as the uniform solid
-    with its mass and inertia, and points with constant distances are joined by lines. A body without mass and shape is
-    drawn as its frame. Springs of `jaxkane.loads` are zigzags, dampers and actuators are lines. Pass `figure` for
-    another drawing. Orbit the view with the mouse or a finger, zoom with the wheel, and use keys to play, slow down and
-    step; "?" lists them.
+    Bicycles have their own figure. In any other system, a body is drawn as its `shape`, or as the uniform solid with
+    its mass and inertia, or as its frame if it has no mass. Points with constant distances are joined by lines. Springs
+    of `jaxkane.loads` are zigzags, dampers and actuators are lines. Pass `figure` for another drawing. Orbit the view
+    with the mouse or a finger, zoom with the wheel, and use keys to play, slow down and step; "?" lists them.
 
     **Arguments:**
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -173,7 +173,7 @@ class Record(eqx.Module):
     - `points` (n_t, p, 3): including the origin. `frames` (n_t, f, 3, 3): as `orientation`.
     - `forces` (n_t, l, 3): on mass centres, for the direction of gravity.
     - `ends` (n_t, s, 2, 3): of the springs, dampers and actuators between two points, which are `links`.
-    - `shapes`: of each shape that a body declares, `center` and `sizes` (n_t, 3 + n_sizes).
+    - `shapes`: of each shape that a body declares, `center` and `halves` (n_t, 12).
     - `shape_styles`: of each of these, the number of the body, the kind and the colour.
     """
 
@@ -263,7 +263,7 @@ def _record_at(system: System, figure: Figure | None, t: Array, q: Coordinates, 
         frames=rotations(list(motion.frames.values())),
         forces=table([row(force) for force in forces], 3),
         ends=table([jnp.stack([row(end.position) for end in (link.point, link.other)]) for link in links], 2, 3),
-        shapes=[stack([[*shape.center, *shape.sizes]])[0].astype(dtype) for _, shape in shapes],
+        shapes=[stack([[*shape.center, *shape.halves]])[0].astype(dtype) for _, shape in shapes],
         elements=sketch.elements,
         bodies=tuple(b.name for b in bodies),
         body_numbers=tuple(placed),
@@ -356,7 +356,6 @@ def bodies_and_points(motion: Record, build: Builder) -> None:
     A body without mass and shapes is drawn as its frame. Springs are zigzags; dampers and actuators are lines.
     """
     color = {k: CYCLE[k % len(CYCLE)] for k in range(len(motion.bodies))}
-    color |= {body: "grey" for body, _, _ in motion.shape_styles if motion.mass[body] == 0}
     joined, drawn = _links(motion, build), []
     for i in sorted(range(len(motion.links)), key=lambda i: motion.links[i] != "spring"):
         same = [np.abs(motion.ends[:, i] - x).max() for x in drawn]
@@ -365,18 +364,18 @@ def bodies_and_points(motion: Record, build: Builder) -> None:
             build.moving(motion.ends[:, i])
             build.shape("spring" if motion.links[i] == "spring" else "line", "grey", 2, width=1.5)
     marks = {}
-    with_shapes = {body for body, _, _ in motion.shape_styles}
-    for number, (body, _, _) in enumerate(motion.shape_styles):
-        _shape(motion, build, number, color[body])
     for k in color:
-        if k in with_shapes:
-            marks[k] = ("center", 5.0) if motion.mass[k] > 0 else ("dot", 3.0)
-        elif motion.mass[k] > 0:
-            is_solid = _solid(build, k, color[k], motion.inertia[k] / motion.mass[k])
+        shapes = [number for number, (body, _, _) in enumerate(motion.shape_styles) if body == k]
+        color[k] = "grey" if shapes and motion.mass[k] == 0 else color[k]
+        for number in shapes:
+            _shape(motion, build, number, color[k])
+        if motion.mass[k] > 0:
+            is_solid = shapes or _solid(build, k, color[k], motion.inertia[k] / motion.mass[k])
             marks[k] = "center", 5.0 if is_solid else 9.0
         else:
             # The axes of the body's frame, a tenth of the scene long
-            for axis_color, axis in zip(("red", "green", "blue"), 0.1 * build.scale * np.eye(3), strict=True):
+            axes = () if shapes else zip(("red", "green", "blue"), 0.1 * build.scale * np.eye(3), strict=True)
+            for axis_color, axis in axes:
                 build.local(np.array([np.zeros(3), axis]), k)
                 build.shape("line", axis_color, 2, width=2.0)
             marks[k] = "dot", 3.0
@@ -409,7 +408,7 @@ def _solid(build: Builder, body: int, color: str, inertia: np.ndarray) -> bool:
     if np.sqrt(largest) <= build.tolerance:
         return False
     axial = [k for k in range(3) if abs(moments[k - 1] - moments[k - 2]) <= 1e-6 * largest]
-    kind, k = "sphere", 2
+    kind, k = "rings", 2
     if len(axial) == 3:
         halves = np.full(3, np.sqrt(2.5 * largest))
     elif axial:
@@ -428,21 +427,9 @@ def _solid(build: Builder, body: int, color: str, inertia: np.ndarray) -> bool:
 def _shape(motion: Record, build: Builder, number: int, color: str) -> None:
     """A shape that a body declares."""
     body, kind, own_color = motion.shape_styles[number]
-    numbers = motion.shapes[number]  # (F, 3 + n_sizes)
-    center, sizes = numbers[:, :3], numbers[:, 3:]
-    if kind == "box":
-        halves = sizes.reshape(-1, 3, 3)
-    elif kind == "sphere":
-        halves = sizes[..., None] * np.eye(3)
-    else:
-        along = sizes[:, -3:]
-        across = np.cross(along, np.eye(3)[np.abs(along[0]).argmin()])
-        across = np.stack([across, np.cross(along, across)], axis=1)
-        size = np.linalg.norm(across, axis=-1, keepdims=True)
-        halves = sizes[:, :1, None] * across / np.where(size > 0, size, 1.0)
-        halves = np.concatenate([halves, 0.5 * along[:, None]], axis=1)
-    for unit, style in (*_BALL, *_SOLIDS[kind]) if kind == "sphere" else _SOLIDS[kind]:
-        x = center[:, None] + unit @ halves
+    center, *halves = np.moveaxis(motion.shapes[number].reshape(-1, 4, 3), 1, 0)
+    for unit, style in _SOLIDS[kind]:
+        x = center[:, None] + unit @ np.stack(halves, axis=1)
         if np.ptp(x, axis=0).max() <= build.tolerance:
             build.local(x[0], body)
         else:  # its numbers depend on the coordinates
@@ -454,31 +441,24 @@ def _ring(z: float) -> np.ndarray:
     return np.stack([np.cos(_AROUND), np.sin(_AROUND), np.full_like(_AROUND, z)], axis=1)
 
 
-def _faces() -> Iterator[np.ndarray]:
-    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    for k in range(3):
-        for side in (-1.0, 1.0):
-            yield np.roll(np.c_[square, np.full(4, side)], k + 1, axis=1)
-
-
+_SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 _SIDES = np.stack([_ring(-1.0)[::4], _ring(1.0)[::4]], axis=1).reshape(-1, 3)
 _DIAMETERS = np.array([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 0.0, -1.0]])  # show the rotation
 _AXIS = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
-_LINE: dict[str, Any] = {"kind": "line"}
+_CLOSED: dict[str, Any] = {"kind": "line", "closed": True}
+_RINGS = [(np.roll(_ring(0.0), k, axis=1), _CLOSED | {"fill": 0.06}) for k in range(3)]
+_FACES = [np.roll(np.c_[_SQUARE, np.full(4, side)], k + 1, axis=1) for k in range(3) for side in (-1.0, 1.0)]
+_ENDS = [(_ring(z), _CLOSED | {"fill": 0.12}) for z in (-1.0, 1.0)]
 _SOLIDS: dict[str, list[tuple[np.ndarray, dict[str, Any]]]] = {
-    "sphere": [(np.roll(_ring(0.0), k, axis=1), _LINE | {"closed": True, "fill": 0.06}) for k in range(3)],
-    "box": [(face, _LINE | {"closed": True, "fill": 0.08}) for face in _faces()],
-    "cylinder": [
-        *((_ring(z), _LINE | {"closed": True, "fill": 0.12}) for z in (-1.0, 1.0)),
-        (_SIDES, {"kind": "pairs", "width": 0.8}),
-        (_DIAMETERS, _LINE),
-    ],
-    "rod": [(_AXIS, _LINE | {"width": 4.0})],
-    "line": [(_AXIS, _LINE | {"width": 2.0})],
+    "rings": _RINGS,
+    "box": [(face, _CLOSED | {"fill": 0.08}) for face in _FACES],
+    "cylinder": [*_ENDS, (_SIDES, {"kind": "pairs", "width": 0.8}), (_DIAMETERS, {"kind": "line"})],
+    "rod": [(_AXIS, {"kind": "line", "width": 4.0})],
+    "line": [(_AXIS, {"kind": "line", "width": 2.0})],
+    # the outline: the centre and three points on the surface, in orthogonal directions
+    "sphere": [(np.eye(4, 3, -1), {"kind": "ball", "fill": 0.3}), *_RINGS],
 }
 """The lines (n, 3) of solids between -1 and 1, and their styles."""
-_BALL = [(np.concatenate([np.zeros((1, 3)), np.eye(3)]), {"kind": "ball", "fill": 0.3})]
-"""The outline of a sphere: the centre and three points on the surface, in orthogonal directions."""
 
 
 def _links(motion: Record, build: Builder) -> bool:

@@ -69,9 +69,9 @@ def from_mjcf(
     **Returns:** a `jaxkane.joints.Mechanism` with the names of the file. Its coordinates are `qpos`, except for the
     order of the Euler parameters, which are scalar-last here. Its speeds are `qvel`, its inputs `ctrl`. A dot in a name
     becomes an underscore. An actuator or a site whose name is already used gets the suffix `_input` or `_site`. Masses
-    and inertias are those that MuJoCo compiles, also from geoms and meshes. Animations draw spheres, boxes, cylinders
-    and capsules (as cylinders) of the groups 0 to 2. `poses` has the coordinates `qpos0` and
-    those of the key frames, from which `jk.assemble(system, system.poses["qpos0"])` starts.
+    and inertias are those that MuJoCo compiles, also from geoms and meshes. `poses` has the coordinates `qpos0` and
+    those of the key frames, from which `jk.assemble(system, system.poses["qpos0"])` starts. Animations draw the
+    spheres, boxes, cylinders and capsules (as cylinders) of the groups 0 to 2.
 
     **Raises:** `ImportError` without MuJoCo; `ValueError` for a file that MuJoCo cannot read, one without a moving
     body, two names that differ only by a dot, `stops` without a limit, too many contacts, and with `strict` for
@@ -220,19 +220,16 @@ class _ModelReader:
         )
 
     def _shapes(self, i: int) -> Iterator[shapes.Shape]:
-        m, kinds = self.m, self.kinds.mjtGeom
-        for g in range(int(m.body_geomadr[i]), int(m.body_geomadr[i]) + int(m.body_geomnum[i])):
-            if m.geom_group[g] > 2:  # MuJoCo's viewer does not show these, which are mostly copies for collisions
-                continue
-            kind, size, position = m.geom_type[g], m.geom_size[g], m.geom_pos[g]
-            axes = np.array(rotations.euler_parameters_matrix(_euler(m.geom_quat[g])))  # in rows
-            if kind == int(kinds.mjGEOM_SPHERE):
-                yield shapes.sphere(float(size[0]), _floats(position))
-            elif kind == int(kinds.mjGEOM_BOX):
-                yield shapes.box(_floats(2.0 * size), _floats(position), axes.tolist())
-            elif kind in (int(kinds.mjGEOM_CYLINDER), int(kinds.mjGEOM_CAPSULE)):
-                ends = (_floats(position + sign * size[1] * axes[2]) for sign in (-1.0, 1.0))
-                yield shapes.cylinder(float(size[0]), *ends)
+        m, start = self.m, int(self.m.body_geomadr[i])
+        kinds = {"sphere": "sphere", "box": "box", "cylinder": "cylinder", "capsule": "cylinder"}
+        for g in range(start, start + int(m.body_geomnum[i])):
+            # MuJoCo's viewer does not show the groups above 2, which are mostly copies for collisions.
+            kind = kinds.get(self.kinds.mjtGeom(int(m.geom_type[g])).name.removeprefix("mjGEOM_").lower())
+            if kind and m.geom_group[g] <= 2:
+                radius, half, _ = halves = _floats(m.geom_size[g])
+                sizes = {"box": [[2.0 * x for x in halves]], "cylinder": [radius, 2.0 * half], "sphere": [radius]}[kind]
+                axes = rotations.euler_parameters_matrix(_euler(m.geom_quat[g]))
+                yield getattr(shapes, kind)(*sizes, _floats(m.geom_pos[g]), axes)
 
     def _joint(self, j: int) -> Joint:
         m, kind, name = self.m, self.m.jnt_type[j], self.joints[j]

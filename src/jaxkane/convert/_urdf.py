@@ -81,7 +81,7 @@ class UrdfFile(NamedTuple):
     - `shapes`: of the links, by name: boxes, cylinders and spheres among their <visual>.
     - `joints`: parents before their children, branch by branch.
     - `balance`: whether the file asks for balanced inertias (`balanceinertia` of MuJoCo's extension).
-    - `left_out`: elements that affect the motion and are not read.
+    - `left_out`: elements that affect the motion and are not read, and shapes with errors.
     """
 
     name: str
@@ -108,11 +108,12 @@ def read_urdf(text: str) -> UrdfFile:
         refuse_any(unnamed[:1], f"{name}: one of the {kinds} has no name:", "")
         check_distinct(name, kinds, [x.get("name", "") for x in elements])
     inertials = {without_dots(x.get("name", "")): _inertial(x, f"{name}, link {x.get('name')!r}") for x in links}
-    drawn = {without_dots(x.get("name", "")): list(_shapes(x, f"{name}, link {x.get('name')!r}")) for x in links}
+    left_out = _left_out(robot)
+    drawn = {without_dots(x.get("name", "")): [*_shapes(x, f"link {x.get('name')!r}", left_out)] for x in links}
     read = [_joint(x, f"{name}, joint {x.get('name')!r}") for x in joints]
     root = _root(name, list(inertials), read)
     is_balanced = any(x.get("balanceinertia") == "true" for x in robot.findall("mujoco/compiler"))
-    return UrdfFile(name, root, inertials, drawn, _in_order(name, root, read), is_balanced, _left_out(robot))
+    return UrdfFile(name, root, inertials, drawn, _in_order(name, root, read), is_balanced, left_out)
 
 
 def _robot(text: str) -> Element:
@@ -152,21 +153,20 @@ def _inertial(link: Element, label: str) -> Inertial | None:
     return Inertial(m, center, _turned(I, R)) if m or I.any() else None
 
 
-def _shapes(link: Element, label: str) -> Iterator[shapes.Shape]:
+_SIZES = {"sphere": {"radius": 1}, "box": {"size": 3}, "cylinder": {"radius": 1, "length": 1}}
+"""For each primitive geometry the number of values of its attributes."""
+
+
+def _shapes(link: Element, label: str, left_out: list[str]) -> Iterator[shapes.Shape]:
     for visual in link.findall("visual"):
-        solid = next((x for kind in ("sphere", "box", "cylinder") for x in visual.findall(f"geometry/{kind}")), None)
-        if solid is None:
-            continue
-        position, R = _placement(visual, label)
-        if solid.tag == "box":
-            size = _numbers(solid, "size", label, (0.0, 0.0, 0.0))
-            yield shapes.box(size.tolist(), position.tolist(), R.T.tolist())
-        elif solid.tag == "sphere":
-            yield shapes.sphere(_number(solid, "radius", label), position.tolist())
-        else:
-            half = 0.5 * _number(solid, "length", label) * R[:, 2]
-            ends = (position - half).tolist(), (position + half).tolist()
-            yield shapes.cylinder(_number(solid, "radius", label), *ends)
+        for x in [x for x in visual.findall("geometry/*") if x.tag in _SIZES]:
+            try:
+                sizes = [y for name, n in _SIZES[x.tag].items() for y in _read(x.get(name, ""), n, x, name, label)]
+                position, R = _placement(visual, label)
+            except ValueError as error:  # which does not affect the motion
+                left_out.append(f"a shape: {error}")
+            else:
+                yield getattr(shapes, x.tag)(*([sizes] if x.tag == "box" else sizes), position, R.T)
 
 
 def _turned(I: np.ndarray, R: np.ndarray) -> np.ndarray:

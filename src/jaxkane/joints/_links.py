@@ -292,8 +292,8 @@ def _link(link: Link, values: dict[str, Any]) -> LinkStructure:
 
 
 def _exact(shape: Shape, name: str) -> Shape:
-    x, y, z, *sizes = exact_numbers([*shape.center, *shape.sizes], f"A shape of {name!r}").tolist()
-    return shape._replace(center=(x, y, z), sizes=tuple(sizes))
+    x, y, z, *halves = exact_numbers([*shape.center, *shape.halves], f"A shape of {name!r}").tolist()
+    return shape._replace(center=(x, y, z), halves=tuple(halves))
 
 
 def _moments(link: Link) -> dict[str, Any]:
