@@ -75,6 +75,7 @@ MODULES = {
     "joints": "joints",
     "loads": "elements",
     "rotations": "describing",
+    "shapes": "pictures",
     "sensors": "sensors",
     "sweep": "sweeps",
     "plot": "pictures",

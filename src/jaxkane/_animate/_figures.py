@@ -173,8 +173,7 @@ class Record(eqx.Module):
     - `points` (n_t, p, 3): including the origin. `frames` (n_t, f, 3, 3): as `orientation`.
     - `forces` (n_t, l, 3): on mass centres, for the direction of gravity.
     - `ends` (n_t, s, 2, 3): of the springs, dampers and actuators between two points, which are `links`.
-    - `shapes`: of each shape that a body declares, `center` and `halves` (n_t, 12).
-    - `shape_styles`: of each of these, the number of the body, the kind and the colour.
+    - `shapes`: `center` and `halves` (n_t, 12) of each declared shape; `shape_styles`: its body's number, kind, colour.
     """
 
     t: Any
