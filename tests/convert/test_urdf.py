@@ -327,3 +327,20 @@ def test_a_urdf_file_is_read_and_its_names_are_converted(tmp_path):
         jk.convert.from_urdf(path)
     with pytest.raises(ValueError, match="'world' is the ground: omit floating=True"):
         jk.convert.from_urdf(ONE.replace('"base"', '"world"'), floating=True)
+
+
+def test_a_shape_with_an_error_is_omitted_with_a_warning():
+    visual = '<visual><geometry><cylinder radius="0.1"/></geometry></visual>'
+    text = ONE.replace('<link name="base"/>', f'<link name="base">{visual}</link>')
+    with pytest.warns(UserWarning, match=r"a shape: link 'base': <cylinder length=\"\"> must be a finite number"):
+        system = jk.convert.from_urdf(text)
+    assert len(system.left_out) == 1
+
+
+def test_the_numbers_of_a_links_shape_must_be_exact():
+    def mass_of(radius):
+        link = jk.joints.Link("a", joints=jk.joints.hinge("j", (0, 1, 0)), mass=1.0, shape=jk.shapes.sphere(radius))
+        return jk.joints.mechanism([link]).mass["a"]
+
+    with pytest.raises(TypeError, match="A shape of 'a' is part of the structure and must be concrete"):
+        jax.grad(mass_of)(0.1)

@@ -272,10 +272,20 @@ def ends_of(scene, t, shape):
     return x[0, shape.first : shape.first + shape.count]
 
 
-def test_declared_shapes_are_drawn_instead_of_solids_and_frames(tmp_path):
-    """1e-12, with N.y up, which is the page's z. A GIF shows the ball with its radius, within a pixel."""
+@pytest.fixture(scope="module")
+def bob_on_a_string():
     t = np.linspace(0.0, 1.0, 21)
-    animation = jk.animate(Bob(radius=0.3), moved(Bob(), t, np.sin(3.0 * t)[:, None], np.zeros((21, 1))))
+    return jk.animate(Bob(radius=0.3), moved(Bob(), t, np.sin(3.0 * t)[:, None], np.zeros((21, 1))))
+
+
+def width_of_ball(pixels):
+    """The ball is the only part that is gold or orange."""
+    return np.ptp(np.flatnonzero((pixels[..., 0] - pixels[..., 2] > 20).any(axis=0)))
+
+
+def test_declared_shapes_are_drawn_instead_of_solids_and_frames(bob_on_a_string, tmp_path):
+    """1e-12, with N.y up, which is the page's z. A GIF shows the ball with its radius, within 3 pixels."""
+    animation, t = bob_on_a_string, bob_on_a_string.scene.t
     scene = animation.scene
     (ball,), bob = shapes(animation, "ball"), 0.5 * np.array([np.sin(np.sin(3 * t[4])), 0, -np.cos(np.sin(3 * t[4]))])
     center, *surface = ends_of(scene, t[4], ball)
@@ -288,8 +298,7 @@ def test_declared_shapes_are_drawn_instead_of_solids_and_frames(tmp_path):
     assert {s.color for s in scene.shapes} == {"gold", "grey"}  # the ground is grey, and has no axes
     with Image.open(animation.save(tmp_path / "bob.gif", size=(300, 300), seconds=0.05)) as image:
         seen = np.asarray(image.convert("RGB")).astype(int)
-    across = np.flatnonzero((seen[..., 0] - seen[..., 2] > 20).any(axis=0))
-    assert np.ptp(across) == pytest.approx(300 * 0.6 / scene.view.span, abs=3)
+    assert width_of_ball(seen) == pytest.approx(300 * 0.6 / scene.view.span, abs=3)
 
 
 @pytest.mark.slow
@@ -382,6 +391,19 @@ def test_a_browser_draws_the_animation_on_light_and_dark_pages(weaving, page, tm
     assert tuple(seen[60, 450]) == paper
     for color in (ink, (240, 171, 69) if dark else (179, 107, 0)):  # wheels, frame
         assert (np.abs(seen - color).max(axis=-1) < 12).sum() > 300
+    assert page.errors == []
+
+
+@needs_a_browser
+def test_a_browser_draws_a_ball_with_its_radius(bob_on_a_string, page, tmp_path):
+    """Within 3 pixels. Without tracks, which have the colour of the ball."""
+    page.show(bob_on_a_string.save(tmp_path / "bob.html"))
+    page.wait(LOOKED)
+    page.key("t")
+    page.value("(() => { const v = canvas.viewer; v.state.playing = false; v.state.time = 0; v.draw(); })()")
+    size = min(page.value("[canvas.clientWidth, canvas.clientHeight]"))
+    expected = size * 0.6 / bob_on_a_string.scene.view.span
+    assert width_of_ball(pixels(page, tmp_path)) == pytest.approx(expected, abs=3)
     assert page.errors == []
 
 
