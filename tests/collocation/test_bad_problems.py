@@ -182,9 +182,10 @@ def test_a_path_that_fixed_ends_imply_is_dropped_there():
         start={"x": 1.0, "y": 0.0, **still}, end={"x": 0.0, "y": 1.0, **still},
         path=lambda t, now: {"circle": (now["x"] ** 2 + now["y"] ** 2, 1.0, 1.0)},
     )  # fmt: skip
-    plan = solve(arc, intervals=10, tolerance=None)
+    plan = solve(arc, intervals=10, tolerance=None, method="lobatto")
     assert plan.ok
     assert plan.iterations < 10
+    assert plan.cost == pytest.approx(41.3707, abs=1e-2)
     assert plan.notes == ("dropped, because others imply it: circle at the start, circle at the end",)
     np.testing.assert_allclose(np.hypot(plan["x"], plan["y"]), 1.0, atol=1e-9)
     with pytest.raises(ValueError, match=r"fixed values make 'circle at the start' 1\.21, but it must be 1\."):
@@ -193,6 +194,27 @@ def test_a_path_that_fixed_ends_imply_is_dropped_there():
     far = dataclasses.replace(arc, end=still, conditions=lambda a, b, d: {"r": jnp.hypot(b["x"], b["y"]) - 1.0})
     plan = solve(far, intervals=10, tolerance=None, max_iterations=1)
     assert plan.notes == ("dropped, because others imply it: circle at the start, circle at the end",)
+
+
+def test_a_path_equality_of_coordinates_alone_needs_another_method():
+    """The puck of above, and its cost on a fine mesh. With its position prescribed, "hermite-simpson" finds 42.67."""
+    still = {"vx": 0.0, "vy": 0.0}
+
+    def arc(path):
+        return Problem(
+            Puck(), 1.0, controls=["fx", "fy"], cost=lambda t, now: now["fx"] ** 2 + now["fy"] ** 2,
+            start={"x": 1.0, "y": 0.0, **still}, end={"x": 0.0, "y": 1.0, **still}, path=path,
+        )  # fmt: skip
+
+    plan = solve(arc(lambda t, now: {"circle": (now["x"] ** 2 + now["y"] ** 2, 1.0, 1.0)}), intervals=10)
+    assert not plan.ok
+    assert len(plan.costs) == 1
+    assert "circle" in plan.reason
+    assert "method='lobatto'" in plan.reason
+    rate = arc(lambda t, now: {"circle": (now["x"] * now["vx"] + now["y"] * now["vy"], 0.0, 0.0)})
+    plan = solve(rate, intervals=10, tolerance=None)
+    assert plan.ok
+    assert plan.cost == pytest.approx(41.3707, abs=1e-2)
 
 
 class Metered(Sled):

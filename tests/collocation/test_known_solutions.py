@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.optimize
 from mechanisms import Sled
 
 import jaxkane as jk
@@ -345,3 +346,66 @@ def test_costates_satisfy_the_adjoint_equation(method, atol):
     exact = np.array([scipy.linalg.expm(t * A) @ [1.0, 0.0, *rest] for t in plan.mesh])
     for name, column in (("x", exact[:, 2]), ("v", exact[:, 3])):
         np.testing.assert_allclose(plan.multipliers.costate[name], column, atol=atol)
+
+
+class Motor(Sled):
+    """The current pulls the sled. It is an algebraic variable, because its inductance is neglected."""
+
+    inputs = ("voltage", "current")
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(2.0 * inputs["current"] * motion.N.x, motion["sled"])
+
+
+@pytest.mark.slow_cases("trapezoid", "lobatto")
+@pytest.mark.parametrize(("method", "rtol"), [("trapezoid", 1e-2), ("hermite-simpson", 2e-6), ("lobatto", 1e-7)])
+def test_an_algebraic_variable_is_a_control_with_an_equation(method, rtol):
+    """voltage = 0.5 current + 2 v, so v' = -8 v + 4 voltage. The least energy of the voltage is x' G^-1 x with the
+    Gramian G. A constant voltage d in the circuit pushes the sled by -4 d."""
+    A, B, end = np.array([[0.0, 1.0], [0.0, -8.0]]), np.array([[0.0], [4.0]]), np.array([1.0, 0.0])
+    F = scipy.linalg.expm(np.block([[-A, B @ B.T], [np.zeros((2, 2)), A.T]]))
+    lagrange = np.linalg.solve(F[2:, 2:].T @ F[:2, 2:], end)
+    problem = Problem(
+        Motor(), 1.0, controls=["voltage", "current"], cost=lambda t, now: now["voltage"] ** 2, **REST_TO_REST,
+        path=lambda t, now: {"circuit": (now["voltage"] - 0.5 * now["current"] - 2.0 * now["v"], 0.0, 0.0)},
+    )  # fmt: skip
+    plan = solve(problem, intervals=20, tolerance=None, method=method)
+    assert plan.ok
+    assert not plan.notes
+    assert plan.cost == pytest.approx(end @ lagrange, rel=rtol)
+    costates = scipy.linalg.expm(np.block([[A.T, -2.0 * lagrange[:, None]], [np.zeros((1, 3))]]))[:2, 2]  # integrals
+    assert plan.multipliers["circuit"].sum() == pytest.approx(-4.0 * costates[1], rel=1e-6)
+    assert float(plan["current"][0]) == pytest.approx(2.0 * float(plan["voltage"][0]), rel=1e-6)
+
+
+class Tide(Sled):
+    """A current that depends on the time of the day."""
+
+    launch: jk.Scalar = jk.parameter(1.0)
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force((inputs["force"] + 2.0 * jnp.sin(t + self.launch)) * motion.N.x, motion["sled"])
+
+
+@pytest.mark.slow
+def test_a_free_start_time_and_duration():
+    """The least energy for given times is d' G^-1 d, where d is the end minus that without a force, and G the Gramian
+    of the double integrator."""
+    rtol = 1e-5
+
+    def least(times):
+        launch, T = times
+        speed = 2.0 * (np.cos(launch) - np.cos(launch + T))
+        place = 2.0 * (T * np.cos(launch) - np.sin(launch + T) + np.sin(launch))
+        d, G = np.array([-speed, 1.0 - place]), np.array([[T, T**2 / 2], [T**2 / 2, T**3 / 3]])
+        return d @ np.linalg.solve(G, d) + 0.5 * T
+
+    exact = scipy.optimize.minimize(least, [1.0, 2.0], tol=1e-12)
+    problem = Problem(
+        Tide(), (0.5, 4.0), controls=["force"], cost=lambda t, now: now["force"] ** 2 + 0.5, **REST_TO_REST,
+        free=[jk.fit.Free("launch", bounds=(0.0, 7.0))],
+    )  # fmt: skip
+    plan = solve(problem, intervals=20, tolerance=None)
+    assert plan.ok
+    assert plan.cost == pytest.approx(exact.fun, rel=rtol)
+    assert (plan.estimates["launch"], plan.duration) == pytest.approx((exact.x[0], exact.x[1]), rel=rtol)

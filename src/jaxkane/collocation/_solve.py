@@ -284,7 +284,7 @@ class _Search:
                     errors = self._errors(transcription, x)
                 except KeyboardInterrupt:
                     return self._unrefined(transcription, solution, None, INTERRUPTED, costs)
-            new, tolerance = None, self.tolerance
+            new, tolerance = None, None if transcription.unresolved else self.tolerance  # no mesh would help
             if errors is not None and tolerance is not None and any(np.max(e) > tolerance for e in errors):
                 new = [
                     refined(mesh, e, tolerance, self.method.order) if np.max(e) > tolerance else mesh
@@ -376,7 +376,10 @@ class _Search:
         program, x = transcription.program, solution.z * transcription.x_scale
         ok, reason = solution.ok, solution.status
         worst = max((float(np.max(e)) for e in errors or ()), default=0.0)
-        if ok and self.tolerance is None and worst > COARSE:
+        if ok and transcription.unresolved:
+            names, hint = ", ".join(transcription.unresolved), "prescribe its rate, or pass method='lobatto'"
+            ok, reason = False, f"solved, but the path equality of {names} may have wrong forces: {hint}"
+        elif ok and self.tolerance is None and worst > COARSE:
             ok, reason = False, f"solved, but the local error is {worst:.1e}: pass more `intervals` or a `tolerance`"
         elif ok and is_coarse:
             ok, reason = False, f"solved, but the local error is {worst:.1e} instead of {self.tolerance:g}"
