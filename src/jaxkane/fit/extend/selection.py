@@ -44,9 +44,6 @@ from .candidates import (
     scaled_terms,
 )
 
-STEPS = 15
-"""Largest number of steps of the fit of a candidate. It starts at the minimum of the model, and needs four to eight."""
-
 HOPELESS_P, HOPELESS_COST = 0.2, 1.1
 """A candidate is not fitted if its score test has a larger p, or if its predicted held-out cost is larger by this
 factor. In a search for the friction of a double pendulum, predicted held-out costs were right within 1 %."""
@@ -242,7 +239,7 @@ class Search:
         start = eqx.tree_at(lambda p: p.parameters, group.point, group.point.parameters[parameters.places])
         try:
             method = LeastSquares(horizons=())  # without restarts, because the start is near the minimum
-            fit = uninterrupted(search(problem, method, start=start, steps=STEPS, check_steps=False))
+            fit = uninterrupted(search(problem, method, start=start, check_steps=False))
             if fit.status not in AT_A_MINIMUM:
                 return dataclasses.replace(extension, reason=f"its fit has not converged ({fit.status})"), None
             kept = (c for c in model.terms if c not in move.drop)
@@ -303,6 +300,8 @@ class Search:
 
 def _is_hopeless(extension: Extension, model: Model, level: float) -> bool:
     """Whether a score test or the linearized held-out cost already decides against a candidate."""
+    if model.at_bound:  # only a fit can take a parameter off its bound
+        return False
     is_chance = extension.p >= max(level, HOPELESS_P)
     return is_chance or extension.held_out_cost > HOPELESS_COST * model.held_out_cost
 
