@@ -469,7 +469,7 @@ def forward_selection(
     - `depth`: largest number of candidates that are selected.
     - `beam`: number of models that are extended in each round. With 1, only the best model is extended.
     - `refits`: number of nested candidates that are fitted in each round, and of exchanges and of pairs. None for all,
-        0 for none.
+        0 for none. Candidates whose score test or predicted held-out cost is hopeless are not among them.
     - `level`: significance level of the test, between 0 and 1.
     - `plausible`: by name, (lower, upper), or a relative deviation from the start such as 0.2. By default
         `Candidate.plausible`, three standard deviations of a prior, or the range between two bounds without its ends.

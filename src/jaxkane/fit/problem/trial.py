@@ -40,7 +40,8 @@ class Trial:
         Euler parameters that are all given, measured or in `unknown` are normalized.
     - `name`: the name in messages, tables and plots.
     - `labels`: by name, text or numbers that group trials: `labels={"rider": "anna", "speed": 4.0}`. In
-        cross-validation, `folds="speed"` leaves out the trials with the same speed together.
+        cross-validation, `folds="speed"` leaves out the trials with the same speed together. Intervals of a fit are
+        clustered by a label with at least three values, if there is one.
 
     **Raises:** `ValueError` that names the trial and the channel, for wrong shapes, text, times that do not increase,
     a channel without `sigma`, or a trial without a finite measurement.
