@@ -293,7 +293,7 @@ def cross_validate(fit: Fit, folds: int | str | Sequence[Sequence[int]] | None =
     with_all = fit.identifiability.given_sigma_errors
     for group in groups:
         training = fit.problem.only(set(range(T)) - set(group))
-        run = {"check_steps": False}
+        run: dict[str, Any] = {"check_steps": False}
         trained = search(training, LeastSquares(), start=fit.point, **run)
         trained = uninterrupted(with_distributions(trained, LeastSquares(), run))
         values, without = np.array([*trained.estimates.values()]), ", ".join(fit.trial_names[k] for k in group)
