@@ -67,8 +67,8 @@ _PLAIN = frozenset(
 )
 LARGEST_SUM = 64  # XLA may pass larger ones to a library
 
-# The primitive of `jax.custom_jvp`. It stays one equation, so that derivatives use its own rule: softplus(800) and a
-# rule that a user defines would otherwise have the derivatives of their values.
+# The primitive of `jax.custom_jvp`. It stays one equation, so that derivatives use its own rule. The derivative of the
+# value is another one for rules of users, and for `jnp.logaddexp` of equal arguments it is 0 instead of 1/2.
 _CUSTOM_RULE = "custom_jvp_call"
 
 # Part of the name of each call of LAPACK by the method itself.

@@ -321,8 +321,8 @@ class Motion:
         self._named = self._by_name()
         self.number = motion_number()
         velocities = [body.center.velocity for body in self.bodies] + [P.velocity for P in self.points.values()]
-        frames = [*(v.frame for v in velocities), *self.frames.values(), inertial()[0]]
-        self.N: Frame = frames[0].root
+        starts = [*(v.frame for v in velocities), *self.frames.values(), inertial()[0]]
+        self.N: Frame = starts[0].root
         for name, part in (*self.points.items(), *self.frames.items()):
             part.name = name
 
