@@ -73,7 +73,7 @@ def test_failure_on_a_finer_mesh_keeps_the_solution():
     )  # fmt: skip
     plan = solve(problem, intervals=1, max_iterations=1)
     assert (plan.ok, plan.iterations) == (False, 1)  # of both meshes together
-    assert plan.reason == "solved, but not on a finer mesh: the largest number of iterations was reached"
+    assert plan.reason == "solved, but not on a finer mesh: the largest number of iterations was reached: pass this plan as the guess"
     assert (len(plan.mesh), len(plan.costs)) == (2, 1)
     assert float(plan["x"][-1]) == 1.0
     assert np.max(plan.errors) > 1e-6
@@ -94,7 +94,7 @@ def test_largest_number_of_iterations():
     plan = solve(fastest(), intervals=4, max_iterations=3)
     assert not plan.ok
     assert plan.iterations == 3
-    assert plan.reason == "the largest number of iterations was reached"
+    assert plan.reason == "the largest number of iterations was reached: pass this plan as the guess"
     assert plan.unmet
     again = solve(fastest(), plan, intervals=4, tolerance=None)
     assert again.ok
