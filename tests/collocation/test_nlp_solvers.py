@@ -94,7 +94,7 @@ def test_largest_number_of_iterations():
     plan = solve(fastest(), intervals=4, max_iterations=3)
     assert not plan.ok
     assert plan.iterations == 3
-    assert plan.reason == "the largest number of iterations was reached: pass this plan as the guess"
+    assert plan.reason == "the largest number of iterations was reached"
     assert plan.unmet
     again = solve(fastest(), plan, intervals=4, tolerance=None)
     assert again.ok

@@ -150,7 +150,7 @@ _IPOPT_STATUS = {
     "Solved_To_Acceptable_Level": (True, "solved to a lower accuracy"),
     "Feasible_Point_Found": (True, "solved"),
     "Infeasible_Problem_Detected": (False, "the constraints contradict each other near the last iterate"),
-    "Maximum_Iterations_Exceeded": (False, "the largest number of iterations was reached: pass this plan as the guess"),
+    "Maximum_Iterations_Exceeded": (False, "the largest number of iterations was reached"),
     "Maximum_CpuTime_Exceeded": (False, "the longest CPU time was reached"),
     "Maximum_WallTime_Exceeded": (False, TIME_IS_UP),
     "Diverging_Iterates": (False, "the iterates diverge: the cost may have no lower bound"),

@@ -313,7 +313,7 @@ class _Search:
         costs: Sequence[float],
     ) -> Plan:
         """The plan of a solution whose mesh should be finer, with the status of the finer mesh."""
-        reason = status if status == INTERRUPTED else f"solved, but not on a finer mesh: {status}"
+        reason = status if status == INTERRUPTED else f"solved, but not on a finer mesh: {status}; pass more `intervals`"
         solution = dataclasses.replace(solution, ok=False, status=reason)
         return self._plan(transcription, solution, errors, costs, False)
 
