@@ -313,7 +313,8 @@ class _Search:
         costs: Sequence[float],
     ) -> Plan:
         """The plan of a solution whose mesh should be finer, with the status of the finer mesh."""
-        reason = status if status == INTERRUPTED else f"solved, but not on a finer mesh: {status}; pass more `intervals`"
+        hint = "pass more `intervals`"
+        reason = status if status == INTERRUPTED else f"solved, but not on a finer mesh: {status}; {hint}"
         solution = dataclasses.replace(solution, ok=False, status=reason)
         return self._plan(transcription, solution, errors, costs, False)
 
