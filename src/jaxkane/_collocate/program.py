@@ -11,6 +11,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -106,6 +107,26 @@ class EvaluatedBlock:
         rows[: self.B] = weights
         entries = _hessian(self.block.function, self.pattern, self.data, x[self.columns], rows)
         return np.asarray(entries)[: self.B]
+
+    def along(self, x: np.ndarray, weights: np.ndarray, tangents: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives along p changes of the arrays of the function: of the values (B, p, m), and of the gradient
+        (B, p, n) of the values weighted by `weights` (B, m). `tangents`: the arrays with a leading axis p."""
+        found = _along(self.block.function, tangents, self.data, x[self.columns], padded(weights))
+        return tuple(np.asarray(a)[: self.B] for a in found)  # type: ignore[return-value]
+
+
+@jit
+def _along(function: BlockFunction, tangents: Any, data: PyTree[Array], X: Array, weights: Array) -> Any:
+    arrays, rest = eqx.partition(function, eqx.is_inexact_array)
+
+    def entries(data: PyTree[Array], x: Array, w: Array) -> Any:
+        def both(arrays: Any) -> tuple[Array, Array]:
+            values, pullback = jax.vjp(lambda x: eqx.combine(arrays, rest)(data, x), x)
+            return values, pullback(w)[0]
+
+        return jax.vmap(lambda tangent: jax.jvp(both, (arrays,), (tangent,))[1])(tangents)
+
+    return jax.vmap(entries)(data, X, weights)
 
 
 @jit
@@ -293,6 +314,25 @@ class NonlinearProgram:
             weights = S.T @ factors + (objective_factor / self.f_scale) * w
             parts.append(b.hessian(x, weights.reshape(b.B, b.block.size)).ravel())
         return self._hessian_map @ np.concatenate([*parts, []])
+
+    def along(self, z: np.ndarray, multipliers: np.ndarray, tangents: Sequence[Any]) -> tuple[np.ndarray, ...]:
+        """Derivatives along p changes of the arrays of the functions, whose tangents are given for each block: of the
+        Lagrangian, objective + multipliers . constraints, (p,), of its gradient (p, n), and of the constraints (p, m).
+        """
+        x, factors, parts = z * self.x_scale, multipliers / self.g_scale, []
+        for b, S, w, tangent in zip(self._blocks, self._S, self._weights, tangents, strict=True):
+            weights = S.T @ factors + w / self.f_scale
+            values, slopes = b.along(x, weights.reshape(b.B, b.block.size), tangent)
+            rows = np.moveaxis(values, 1, 0).reshape(values.shape[1], -1)
+            columns = b.columns[: b.B].ravel()
+            gradient = [np.bincount(columns, s.ravel(), minlength=self.n) for s in np.moveaxis(slopes, 1, 0)]
+            parts.append((rows @ weights, np.array(gradient) * self.x_scale, (S @ rows.T).T / self.g_scale))
+        return tuple(sum(part) for part in zip(*parts, strict=True))
+
+    @property
+    def functions(self) -> list[Any]:
+        """The functions of the blocks."""
+        return [b.block.function for b in self._blocks]
 
     def in_jax(self, z: Array) -> tuple[Array, Array]:
         """The scaled cost and constraints as one function of JAX, for tests of the derivatives."""

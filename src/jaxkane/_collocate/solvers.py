@@ -19,12 +19,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import FrameType, ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 import scipy.sparse.csgraph
+import scipy.sparse.linalg
 
 from .program import NonlinearProgram, Sparse
 
@@ -329,11 +330,8 @@ def _has_negative_curvature(program: NonlinearProgram, border: np.ndarray, solut
     z, g = solution.z, program.constraints(solution.z)
     free = ~_at_bound(z, program.lower, program.upper, solution.bound_multipliers)
     active = _at_bound(g, program.g_lower, program.g_upper, solution.multipliers)
-    rows, columns = program.hessian_structure
-    lower = scipy.sparse.csr_matrix((program.hessian(z, solution.multipliers), (rows, columns)), (program.n,) * 2)
-    H: Any = (lower + scipy.sparse.tril(lower, -1).T).tocsr()[free][:, free]
-    J: Any = scipy.sparse.csr_matrix((program.jacobian(z), program.jacobian_structure), (program.m, program.n))
-    is_border = np.isin(np.arange(program.n), border)[free]
+    H, J = _second_and_first(program, solution)
+    H, is_border = H[free][:, free], np.isin(np.arange(program.n), border)[free]
     project = _Projection(J[active][:, free], is_border)
     v = project(project(np.random.default_rng(0).normal(size=int(free.sum()))))
     if not np.linalg.norm(v) > 1e-3:  # the constraints determine all variables
@@ -358,6 +356,74 @@ def _has_negative_curvature(program: NonlinearProgram, border: np.ndarray, solut
 
 
 _STEPS = 80  # of the method of Lanczos
+
+
+def _second_and_first(program: NonlinearProgram, solution: Solution) -> tuple[Sparse, Sparse]:
+    """The Hessian (n, n) of the Lagrangian and the Jacobian (n_g, n) of the constraints."""
+    rows, columns = program.hessian_structure
+    entries = program.hessian(solution.z, solution.multipliers)
+    lower = scipy.sparse.csr_matrix((entries, (rows, columns)), (program.n,) * 2)
+    J = scipy.sparse.csr_matrix((program.jacobian(solution.z), program.jacobian_structure), (program.m, program.n))
+    return (lower + scipy.sparse.tril(lower, -1).T).tocsr(), J
+
+
+class Response(NamedTuple):
+    """How a solution changes with the constants of its program (implicit function theorem).
+
+    - `z` (p, n): the derivatives of the scaled variables.
+    - `undetermined`: the variables that have no unique derivative, because the KKT matrix is singular.
+    - `weak_variables`, `weak_rows`: the bounds and constraints that are active with a multiplier of zero. The
+        derivatives to both sides differ there.
+    - `unmet_rows`: equations between fixed values that a change of the constants violates.
+    """
+
+    z: np.ndarray
+    undetermined: np.ndarray
+    weak_variables: np.ndarray
+    weak_rows: np.ndarray
+    unmet_rows: np.ndarray
+
+
+def response(program: NonlinearProgram, solution: Solution, gradient: np.ndarray, g: np.ndarray) -> Response:
+    """**Arguments:** `gradient` (p, n), `g` (p, m): the derivatives by p constants of the gradient of the Lagrangian and
+    of the constraints, at fixed variables and multipliers."""
+    z, values, m = solution.z, program.constraints(solution.z), solution.multipliers
+    fixed, weak_variables = _strictly_active(z, program.lower, program.upper, solution.bound_multipliers)
+    active, weak_rows = _strictly_active(values, program.g_lower, program.g_upper, m)
+    free, active, weak_rows = ~fixed, active & ~program.is_implied, weak_rows & ~program.is_implied
+    H, J = _second_and_first(program, solution)
+    K: Any = scipy.sparse.bmat([[H[free][:, free], J[active][:, free].T], [J[active][:, free], None]], format="csr")
+    scale, n = np.ones(K.shape[0]), int(free.sum())
+    for _ in range(5):  # towards rows and columns with a largest entry of one
+        size = np.abs(K).max(axis=1).toarray().ravel() if K.nnz else scale
+        D = scipy.sparse.diags_array(1.0 / np.sqrt(np.where(size > 0, size, 1.0)))
+        scale, K = D @ scale, (D @ K @ D).tocsr()
+    # A small shift, because the factors of a singular matrix show which variables are not determined.
+    shift = scipy.sparse.diags_array(np.where(np.arange(len(scale)) < n, 1e-14, -1e-14))
+    factors = scipy.sparse.linalg.splu((K + shift).tocsc())
+    null = factors.solve(factors.solve(np.random.default_rng(0).normal(size=len(scale))))
+    growth = np.linalg.norm(factors.solve(null)) / np.linalg.norm(null)  # 1 / the least singular value, about
+    right = -scale[:, None] * np.concatenate([gradient[:, free], g[:, active]], axis=1).T
+    step = factors.solve(right)
+    step += factors.solve(right - K @ step)  # without the shift
+    dz, undetermined = np.zeros_like(gradient), np.zeros(program.n, bool)
+    dz[:, free] = (scale[:, None] * step)[:n].T
+    shares = np.abs(scale * null)[:n]
+    undetermined[free] = (shares > 0.5 * np.max(shares, initial=0.0)) & (growth > 1e12)
+    left = dz @ J.T + g
+    unmet = np.max(np.abs(left), axis=0) > 1e-6 * np.maximum(np.max(np.abs(g), axis=0), 1e-3)
+    return Response(
+        dz, undetermined, weak_variables, weak_rows, unmet & program.is_implied & (program.g_lower == program.g_upper)
+    )
+
+
+def _strictly_active(
+    x: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    # Whether numbers are at a bound, and whether this is not decided. In an interior point method, the product of
+    # distance and multiplier is at most 1e-10, the last parameter of the barrier.
+    distance, size, is_fixed = np.minimum(x - lower, upper - x), np.abs(multipliers), lower >= upper
+    return is_fixed | (size > distance), ~is_fixed & (np.maximum(size, distance) < 3e-5)
 
 
 def _at_bound(x: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: np.ndarray) -> np.ndarray:

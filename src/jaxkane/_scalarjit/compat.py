@@ -315,3 +315,25 @@ def filter_jit_uncached(f: Callable[..., Any]) -> Callable[..., Any]:
     with contextlib.suppress(ImportError, AttributeError):
         importlib.import_module("equinox._jit")._filter_jit_cache.delete(f)
     return jitted
+
+
+def without_tangents(tree: Any) -> Any:
+    """The arrays of a tree without the derivatives of `jax.jacfwd`, `jvp`, `grad`; numbers that `jit` or `vmap` trace remain.
+
+    JAX calls the rule of a `custom_jvp` with the numbers below one derivative.
+    """
+    found: list[Any] = []
+
+    @jax.custom_jvp
+    def seen(x: Any) -> Any:
+        found.append(x)
+        return x
+
+    @seen.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        return seen(*primals), tangents[0]
+
+    leaves, structure = jax.tree.flatten(tree)
+    for leaf in leaves:
+        seen(leaf)
+    return jax.tree.unflatten(structure, found)

@@ -16,7 +16,8 @@ from jaxtyping import Array, Float
 
 from .._collocate.lobatto import Lobatto
 from .._collocate.program import padded
-from .._collocate.transcription import Motion
+from .._collocate.solvers import Solution
+from .._collocate.transcription import Motion, Transcription
 from .._integrate.events import Status
 from .._integrate.inputs import InputState, Signals, inputs_at
 from .._integrate.simulate import simulate
@@ -25,12 +26,13 @@ from .._kane.api import _dependent_speeds
 from .._kane.constraint_residuals import configuration_residual
 from .._kane.right_hand_side import outputs_at, values_of, vector_field
 from .._scalarjit.cache_key import jit
-from .._scalarjit.compat import on_device
+from .._scalarjit.compat import Tracer, on_device
 from .._scalarjit.components import Component, Numbers
 from .._system.parameters import wrapped
 from .._system.system import State, System, has_outputs, names_of, units_of, unpacked
 from ._mesh import ControlPolynomial, coefficients_of, interpolated, place_in_mesh, with_controls, without_events
 from ._problem import Problem
+from ._sensitivities import Sensitivity, derivatives_of, sensitivities_of, tangent_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,6 +93,7 @@ class Plan:
     motion: Motion = dataclasses.field(repr=False, kw_only=True)
     method: Lobatto = dataclasses.field(repr=False, kw_only=True)
     scales: np.ndarray = dataclasses.field(repr=False, kw_only=True)
+    solved: tuple[Transcription, Solution] = dataclasses.field(repr=False, kw_only=True)
 
     @property
     def _whole(self) -> Trajectory:
@@ -195,6 +198,26 @@ class Plan:
             raise ValueError(f"Plan.deviation: the simulation must have the {len(self.motion.Y)} times of plan.t.")
         every = len(self.method.c) - 1
         return float(np.max(np.abs(Y - self.motion.Y)[::every] / self.scales[: Y.shape[1]]))
+
+    def sensitivities(self, free: Any) -> dict[str, Sensitivity]:
+        """The derivatives of the least cost and of the optimal motion by parameters of the mechanism.
+
+            plan.sensitivities(["rope", "load"])["rope"].cost
+
+        The mesh, the values at both ends, bounds and inputs do not change with the parameters. With phases, all phases
+        whose system has the parameter change together, and names start with the phase, as in "phase 0: roll".
+
+        **Arguments:**
+
+        - `free`: the parameters, as in `Problem`. They must not be free in the problem.
+
+        **Returns:** a `Sensitivity` for each parameter by name.
+
+        **Raises:** `ValueError` if the plan is not `ok`, and for unknown parameters.
+        """
+        if not self.ok:
+            raise ValueError(f"Plan.sensitivities: the plan is not `ok`, so it is no minimum: {self.reason}.")
+        return sensitivities_of(*self.solved, free)
 
     def _refuse_phases(self, what: str) -> None:
         if self.phases:
@@ -337,15 +360,16 @@ def _drift(system: System, t: Array, q: Array) -> Array:
 
 def trajectory_of(system: System, problem: Problem, motion: Motion) -> Trajectory:
     """A motion as a `Trajectory` at its nodes."""
-    t = motion.s * motion.duration
-    controls = tuple(problem.bounds_of_controls)
-    along = _along(system, problem.signals, controls, *(padded(a) for a in (t, motion.Y, motion.W)))
-    q, u, x, u_dep, inputs, outputs = jax.tree.map(lambda a: on_device(np.asarray(a)[: len(t)]), along)
-    count = jnp.asarray(0)
-    ends = (on_device(np.asarray(a)[-1]) for a in ((q, u, x) if system.states else (q, u)))
+    t, is_traced = motion.s * motion.duration, isinstance(motion.Y, Tracer)
+    controls, own = tuple(problem.bounds_of_controls), (t, motion.Y, motion.W)
+    along = _along(system, problem.signals, controls, *(own if is_traced else map(padded, own)))
+    known = jax.tree.map(lambda a: a if is_traced else on_device(np.asarray(a)[: len(t)]), along)
+    q, u, x, u_dep, inputs, outputs = known
+    count, t = jnp.asarray(0), jnp.asarray(t) if is_traced else on_device(t)
+    ends = (a[-1] if is_traced else on_device(np.asarray(a)[-1]) for a in ((q, u, x) if system.states else (q, u)))
     return Trajectory(
-        t=on_device(t), q=q, u=u, u_dep=u_dep, x=x, inputs=inputs, outputs=outputs,
-        status=jnp.asarray(int(Status.COMPLETED)), t_end=on_device(t[-1]),
+        t=t, q=q, u=u, u_dep=u_dep, x=x, inputs=inputs, outputs=outputs,
+        status=jnp.asarray(int(Status.COMPLETED)), t_end=t[-1],
         stats={"steps": count, "accepted": count, "rejected": count}, names=names_of(system), events=(),
         adjoint="none", units=tuple(units_of(system).items()), end=State(*ends),
     )  # fmt: skip
@@ -364,3 +388,46 @@ def _along(system: System, signals: Signals, controls: tuple[str, ...], ts: Arra
         return state.q, state.u, x, u_dep, inputs, outputs
 
     return jax.vmap(at)(ts, Y, W)
+
+
+def differentiable(problem: Problem, plan: Plan) -> Plan:
+    """The plan of `problem.concrete` with the derivatives by the traced numbers in the system of `problem`.
+
+    The cost, duration, estimates, system and trajectory have derivatives. The multipliers have none and are left out.
+    """
+    if not plan.ok:
+        raise ValueError(f"solve: the derivatives of a plan that is not `ok` do not exist: {plan.reason}.")
+    transcription, solution = plan.solved
+    leaves = jax.tree.leaves(problem.system)
+    directions = [[(i, k, 1.0)] for i, x in enumerate(leaves) if isinstance(x, Tracer) for k in range(np.size(x))]
+    with jax.ensure_compile_time_eval():
+        tangent = tangent_of(plan.solved[0].layouts[0].problem.system, directions)
+        cost, x, reason = derivatives_of(transcription, solution, [tangent])
+    if reason:
+        raise ValueError(f"solve: a derivative does not exist: {reason}.")
+    slopes = np.concatenate([cost[:, None], x], axis=1).T
+    values = np.append(plan.cost, solution.z * transcription.x_scale)
+
+    @jax.custom_jvp
+    def optimum(_: Array) -> Array:
+        return jnp.asarray(values)
+
+    @optimum.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        if isinstance(primals[0], Tracer):
+            raise TypeError("solve: second derivatives are not supported. Use differences of `plan.sensitivities`.")
+        return jnp.asarray(values), jnp.asarray(slopes) @ tangents[0]
+
+    found = optimum(jnp.concatenate([jnp.ravel(x) for x in leaves if isinstance(x, Tracer)]))
+    layout, own, x = transcription.layouts[0], transcription.parameters, found[1:]
+    rows, n_y = x[layout.node(np.arange(layout.K))], layout.variables.n_y
+    duration = plan.duration if layout.duration is None else x[layout.duration]
+    motion = Motion(layout.s, duration, rows[:, :n_y], rows[:, n_y:])  # type: ignore[arg-type]
+    theta, system = x[transcription.shared_parameters], problem.system
+    estimates = {} if own is None else dict(zip(own.names, own.values(theta), strict=True))
+    system = system if own is None else own.apply(system, theta)[0]
+    return dataclasses.replace(
+        plan, problem=problem, cost=found[0], duration=duration, estimates=estimates, system=system, motion=motion,
+        trajectory=trajectory_of(system, plan.problem, motion), mesh=layout.mesh * duration, costs=(),
+        multipliers=Multipliers({}, {}),
+    )  # fmt: skip

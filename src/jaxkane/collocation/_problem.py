@@ -23,6 +23,8 @@ from .._kane.consistent_state import assemble
 from .._kane.constraint_residuals import check_state, configuration_residual
 from .._kane.contact.forces import has_contacts
 from .._kane.right_hand_side import output_names, vector_field
+from .._scalarjit.cache_key import captured_tracers
+from .._scalarjit.compat import without_tangents
 from .._scalarjit.components import Numbers
 from .._system.parameters import in_batches
 from .._system.system import State, System, packed, units_of
@@ -87,10 +89,16 @@ class Problem(PhaseProblem):
     path: Callable[[Any, Now], Any] | None = None
     free: Any = ()
     inputs: Any = None
+    concrete: Problem | None = dataclasses.field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         system = self.system
         check_is_system(system)
+        self._check_tracers()
+        if not is_concrete(system) and is_concrete(known := without_tangents(system)):
+            # `solve` solves this problem, and adds the derivatives by the traced numbers to its plan.
+            object.__setattr__(self, "concrete", dataclasses.replace(self, system=known))
+            return
         self._check_system()
         for name in ("cost", "final_cost", "conditions", "path"):
             f = getattr(self, name)
@@ -110,6 +118,15 @@ class Problem(PhaseProblem):
         self.signals  # noqa: B018  raises an exception for wrong inputs
         self.parameters  # noqa: B018  the same for parameters
 
+    def _check_tracers(self) -> None:
+        for name in ("cost", "final_cost", "conditions", "path", "start", "end", "duration", "inputs"):
+            value = getattr(self, name)
+            if not is_concrete(value) or captured_tracers(value):
+                raise TypeError(
+                    f"Problem: `{name}` uses a traced number. Only the system may: use `now.system` in functions, and see "
+                    "`plan.sensitivities` and `plan.multipliers` for derivatives by other numbers."
+                )
+
     def _check_system(self) -> None:
         system, leaves = self.system, jax.tree.leaves(self.system)
         refuse_multipliers(system)
@@ -120,7 +137,11 @@ class Problem(PhaseProblem):
                 "system without contacts, and link such phases (`Phases`).",
             ),
             (in_batches(system), "is a batch. Pass one member of it."),
-            (not is_concrete(system), "is traced. Call this outside of jax.jit, vmap and grad."),
+            (
+                not is_concrete(system),
+                "is traced by jax.jit, vmap or a second derivative. Call this outside of them: jax.jacfwd and jax.grad are "
+                "supported, and `plan.sensitivities` returns derivatives.",
+            ),
             (
                 jnp.result_type(float) != jnp.float64 or any(getattr(x, "dtype", None) == jnp.float32 for x in leaves),
                 "needs float64 for collocation. Call jaxkane.configure() first, and create the system after it.",

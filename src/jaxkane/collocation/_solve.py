@@ -30,7 +30,7 @@ from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
 from .._scalarjit.components import Component
 from ._mesh import interpolated, jumps_inside, local_errors, quadrature_errors, refined, switch_errors
-from ._plan import Multipliers, Plan, trajectory_of
+from ._plan import Multipliers, Plan, differentiable, trajectory_of
 from ._problem import Phases, Problem, detoured, detours, guess_of
 
 Guess: TypeAlias = Plan | Trajectory | Mapping[str, Any] | Sequence[Any] | None
@@ -94,6 +94,15 @@ def solve(
     `ImportError` without CasADi.
     """
     casadi()
+    if isinstance(problem, Problem) and problem.concrete is not None:
+        given = {
+            "intervals": intervals, "method": method, "tolerance": tolerance, "options": options, "starts": starts,
+            "seed": seed, "max_iterations": max_iterations, "max_seconds": max_seconds,
+            "max_intervals": max_intervals, "progress": progress,
+        }  # fmt: skip
+        with jax.ensure_compile_time_eval():
+            plan = solve(problem.concrete, guess, **given)
+        return differentiable(problem, plan)
     phases = problem if isinstance(problem, Phases) else Phases([problem]) if isinstance(problem, Problem) else None
     if phases is None:
         raise TypeError(f"solve: the first argument must be a Problem or Phases, got {problem!r}.")
@@ -399,6 +408,7 @@ class _Search:
             "violation": program.violation(solution.z),
             "dual_residual": dual_residual(program, solution),
             "conflict": self._conflict(transcription, solution),
+            "solved": (transcription, solution),
             "estimates": dict(zip(() if parameters is None else parameters.names, map(float, values), strict=True)),
         }
         plans = [
