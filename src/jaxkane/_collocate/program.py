@@ -315,24 +315,18 @@ class NonlinearProgram:
             parts.append(b.hessian(x, weights.reshape(b.B, b.block.size)).ravel())
         return self._hessian_map @ np.concatenate([*parts, []])
 
-    def along(self, z: np.ndarray, multipliers: np.ndarray, tangents: Sequence[Any]) -> tuple[np.ndarray, ...]:
-        """Derivatives along p changes of the arrays of the functions, whose tangents are given for each block: of the
+    def along(self, z: np.ndarray, multipliers: np.ndarray, tangents_of: Callable[[Any], Any]) -> list[Any]:
+        """Derivatives along p changes of the arrays of the functions, whose tangents are `tangents_of(function)`: of the
         Lagrangian, objective + multipliers . constraints, (p,), of its gradient (p, n), and of the constraints (p, m).
         """
         x, factors, parts = z * self.x_scale, multipliers / self.g_scale, []
-        for b, S, w, tangent in zip(self._blocks, self._S, self._weights, tangents, strict=True):
-            weights = S.T @ factors + w / self.f_scale
-            values, slopes = b.along(x, weights.reshape(b.B, b.block.size), tangent)
+        for b, S, w in zip(self._blocks, self._S, self._weights, strict=True):
+            weights, columns = S.T @ factors + w / self.f_scale, b.columns[: b.B].ravel()
+            values, slopes = b.along(x, weights.reshape(b.B, b.block.size), tangents_of(b.block.function))
             rows = np.moveaxis(values, 1, 0).reshape(values.shape[1], -1)
-            columns = b.columns[: b.B].ravel()
             gradient = [np.bincount(columns, s.ravel(), minlength=self.n) for s in np.moveaxis(slopes, 1, 0)]
             parts.append((rows @ weights, np.array(gradient) * self.x_scale, (S @ rows.T).T / self.g_scale))
-        return tuple(sum(part) for part in zip(*parts, strict=True))
-
-    @property
-    def functions(self) -> list[Any]:
-        """The functions of the blocks."""
-        return [b.block.function for b in self._blocks]
+        return [sum(part) for part in zip(*parts, strict=True)]
 
     def in_jax(self, z: Array) -> tuple[Array, Array]:
         """The scaled cost and constraints as one function of JAX, for tests of the derivatives."""

@@ -19,7 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import FrameType, ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -367,63 +367,53 @@ def _second_and_first(program: NonlinearProgram, solution: Solution) -> tuple[Sp
     return (lower + scipy.sparse.tril(lower, -1).T).tocsr(), J
 
 
-class Response(NamedTuple):
-    """How a solution changes with the constants of its program (implicit function theorem).
+def response(
+    program: NonlinearProgram, solution: Solution, gradient: np.ndarray, g: np.ndarray
+) -> tuple[np.ndarray, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """How a solution changes with p constants of its program, by the implicit function theorem.
 
-    - `z` (p, n): the derivatives of the scaled variables.
-    - `undetermined`: the variables that have no unique derivative, because the KKT matrix is singular.
-    - `weak_variables`, `weak_rows`: the bounds and constraints that are active with a multiplier of zero. The
-        derivatives to both sides differ there.
-    - `unmet_rows`: equations between fixed values that a change of the constants violates.
+    **Arguments:** `gradient` (p, n), `g` (p, m): the derivatives by the constants of the gradient of the Lagrangian and
+    of the constraints, at fixed variables and multipliers.
+
+    **Returns:** the derivatives (p, n) of the scaled variables; and by sentences, which variables (n,) and constraints
+    (m,) make derivatives wrong.
     """
-
-    z: np.ndarray
-    undetermined: np.ndarray
-    weak_variables: np.ndarray
-    weak_rows: np.ndarray
-    unmet_rows: np.ndarray
-
-
-def response(program: NonlinearProgram, solution: Solution, gradient: np.ndarray, g: np.ndarray) -> Response:
-    """**Arguments:** `gradient` (p, n), `g` (p, m): the derivatives by p constants of the gradient of the Lagrangian and
-    of the constraints, at fixed variables and multipliers."""
-    z, values, m = solution.z, program.constraints(solution.z), solution.multipliers
-    fixed, weak_variables = _strictly_active(z, program.lower, program.upper, solution.bound_multipliers)
-    active, weak_rows = _strictly_active(values, program.g_lower, program.g_upper, m)
-    free, active, weak_rows = ~fixed, active & ~program.is_implied, weak_rows & ~program.is_implied
+    weak, free, active = [], np.zeros(0), np.zeros(0)
+    for x, lower, upper, multipliers in (
+        (solution.z, program.lower, program.upper, solution.bound_multipliers),
+        (program.constraints(solution.z), program.g_lower, program.g_upper, solution.multipliers),
+    ):
+        # IPOPT's last product of distance and multiplier is 1e-10. Both are about 1e-5 where neither is exactly zero.
+        distance, size, free = np.minimum(x - lower, upper - x), np.abs(multipliers), active
+        active = (lower >= upper) | (size > distance)
+        weak.append((lower < upper) & (np.maximum(size, distance) < 3e-5))
     H, J = _second_and_first(program, solution)
+    free, active = ~free, active & ~program.is_implied
     K: Any = scipy.sparse.bmat([[H[free][:, free], J[active][:, free].T], [J[active][:, free], None]], format="csr")
     scale, n = np.ones(K.shape[0]), int(free.sum())
-    for _ in range(5):  # towards rows and columns with a largest entry of one
-        size = np.abs(K).max(axis=1).toarray().ravel() if K.nnz else scale
+    for _ in range(5):  # towards rows and columns whose largest entry is one
+        size = abs(K).max(axis=1).toarray().ravel()
         D = scipy.sparse.diags_array(1.0 / np.sqrt(np.where(size > 0, size, 1.0)))
         scale, K = D @ scale, (D @ K @ D).tocsr()
-    # A small shift, because the factors of a singular matrix show which variables are not determined.
+    # With a small shift, the factors of a singular matrix exist, and show which variables are not determined.
     shift = scipy.sparse.diags_array(np.where(np.arange(len(scale)) < n, 1e-14, -1e-14))
     factors = scipy.sparse.linalg.splu((K + shift).tocsc())
     null = factors.solve(factors.solve(np.random.default_rng(0).normal(size=len(scale))))
-    growth = np.linalg.norm(factors.solve(null)) / np.linalg.norm(null)  # 1 / the least singular value, about
+    is_singular = np.linalg.norm(factors.solve(null)) > 1e12 * np.linalg.norm(null)
     right = -scale[:, None] * np.concatenate([gradient[:, free], g[:, active]], axis=1).T
     step = factors.solve(right)
-    step += factors.solve(right - K @ step)  # without the shift
-    dz, undetermined = np.zeros_like(gradient), np.zeros(program.n, bool)
-    dz[:, free] = (scale[:, None] * step)[:n].T
-    shares = np.abs(scale * null)[:n]
-    undetermined[free] = (shares > 0.5 * np.max(shares, initial=0.0)) & (growth > 1e12)
-    left = dz @ J.T + g
-    unmet = np.max(np.abs(left), axis=0) > 1e-6 * np.maximum(np.max(np.abs(g), axis=0), 1e-3)
-    return Response(
-        dz, undetermined, weak_variables, weak_rows, unmet & program.is_implied & (program.g_lower == program.g_upper)
-    )
+    step += factors.solve(right - K @ step)
+    dz, undetermined = np.zeros_like(gradient), np.zeros(program.n)
+    dz[:, free], undetermined[free] = (scale[:, None] * step)[:n].T, np.abs(scale * null)[:n] * is_singular
+    unmet = np.max(np.abs(dz @ J.T + g), axis=0) > 1e-6 * np.maximum(np.max(np.abs(g), axis=0), 1e-3)
+    return dz, {
+        UNMET: (np.zeros(0), unmet & program.is_implied & (program.g_lower == program.g_upper)),
+        "the KKT matrix is singular: nothing determines {}. Add a small cost of it": (undetermined, np.zeros(0)),
+        "{} is at a bound with a multiplier of zero, where the derivatives to both sides differ": (weak[0], weak[1]),
+    }
 
 
-def _strictly_active(
-    x: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    # Whether numbers are at a bound, and whether this is not decided. In an interior point method, the product of
-    # distance and multiplier is at most 1e-10, the last parameter of the barrier.
-    distance, size, is_fixed = np.minimum(x - lower, upper - x), np.abs(multipliers), lower >= upper
-    return is_fixed | (size > distance), ~is_fixed & (np.maximum(size, distance) < 3e-5)
+UNMET = "fixed values satisfy {} for these parameters only: leave one of these values out"
 
 
 def _at_bound(x: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: np.ndarray) -> np.ndarray:

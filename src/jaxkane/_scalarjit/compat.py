@@ -318,21 +318,15 @@ def filter_jit_uncached(f: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def without_tangents(tree: Any) -> Any:
-    """The arrays of a tree without the derivatives of `jax.jacfwd`, `jvp`, `grad`; numbers that `jit` or `vmap` trace remain.
-
-    JAX calls the rule of a `custom_jvp` with the numbers below one derivative.
-    """
+    """The arrays of a tree without the tangents of `jax.jvp`, `jacfwd` and `grad`. Tracers of `jit` and `vmap` remain."""
     found: list[Any] = []
 
-    @jax.custom_jvp
-    def seen(x: Any) -> Any:
+    def keep(x: Any) -> Any:
         found.append(x)
         return x
 
-    @seen.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        return seen(*primals), tangents[0]
-
+    seen = jax.custom_jvp(keep)
+    seen.defjvp(lambda primals, tangents: (seen(*primals), *tangents))  # called with the numbers below a derivative
     leaves, structure = jax.tree.flatten(tree)
     for leaf in leaves:
         seen(leaf)

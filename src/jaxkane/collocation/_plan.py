@@ -32,7 +32,7 @@ from .._system.parameters import wrapped
 from .._system.system import State, System, has_outputs, names_of, units_of, unpacked
 from ._mesh import ControlPolynomial, coefficients_of, interpolated, place_in_mesh, with_controls, without_events
 from ._problem import Problem
-from ._sensitivities import Sensitivity, derivatives_of, sensitivities_of, tangent_of
+from ._sensitivities import Sensitivity, derivatives_of, sensitivities_of, tangents_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -401,7 +401,7 @@ def differentiable(problem: Problem, plan: Plan) -> Plan:
     leaves = jax.tree.leaves(problem.system)
     directions = [[(i, k, 1.0)] for i, x in enumerate(leaves) if isinstance(x, Tracer) for k in range(np.size(x))]
     with jax.ensure_compile_time_eval():
-        tangent = tangent_of(plan.solved[0].layouts[0].problem.system, directions)
+        tangent = tangents_of(plan.problem.system, directions)
         cost, x, reason = derivatives_of(transcription, solution, [tangent])
     if reason:
         raise ValueError(f"solve: a derivative does not exist: {reason}.")

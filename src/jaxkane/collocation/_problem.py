@@ -123,8 +123,8 @@ class Problem(PhaseProblem):
             value = getattr(self, name)
             if not is_concrete(value) or captured_tracers(value):
                 raise TypeError(
-                    f"Problem: `{name}` uses a traced number. Only the system may: use `now.system` in functions, and see "
-                    "`plan.sensitivities` and `plan.multipliers` for derivatives by other numbers."
+                    f"Problem: `{name}` uses a traced number, but only `system` may. In functions, use `now.system`. "
+                    "`plan.multipliers` and `plan.sensitivities` contain other derivatives."
                 )
 
     def _check_system(self) -> None:
@@ -139,8 +139,8 @@ class Problem(PhaseProblem):
             (in_batches(system), "is a batch. Pass one member of it."),
             (
                 not is_concrete(system),
-                "is traced by jax.jit, vmap or a second derivative. Call this outside of them: jax.jacfwd and jax.grad are "
-                "supported, and `plan.sensitivities` returns derivatives.",
+                "is traced. Call this outside of jax.jit and vmap. For derivatives, use jax.jacfwd or jax.grad without "
+                "them, or `plan.sensitivities`.",
             ),
             (
                 jnp.result_type(float) != jnp.float64 or any(getattr(x, "dtype", None) == jnp.float32 for x in leaves),
@@ -312,6 +312,8 @@ class Phases:
         if isinstance(self.phases, Problem) or isinstance(self.links, str):
             raise TypeError("Phases: pass sequences, such as Phases([problem], links=[None]).")
         phases, links = tuple(self.phases), tuple(self.links)
+        if any(getattr(phase, "concrete", None) is not None for phase in phases):
+            raise TypeError("Phases: a system is traced. Use `plan.sensitivities` for derivatives of several phases.")
         object.__setattr__(self, "phases", phases)
         object.__setattr__(self, "links", links)
         if not phases or not all(isinstance(phase, Problem) for phase in phases):

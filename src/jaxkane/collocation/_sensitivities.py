@@ -1,8 +1,8 @@
-"""Derivatives of optimal motions by parameters of the mechanism, from the KKT matrix of the nonlinear program.
+"""Derivatives of optimal motions by parameters of the mechanism.
 
-At a solution, the gradient of the Lagrangian and the active constraints are zero. Their derivatives by a parameter are
-therefore zero too, which are linear equations for the derivatives of the variables and of the multipliers. The matrix of
-these equations is the KKT matrix. The derivative of the least cost is the partial derivative of the Lagrangian.
+At a solution, the gradient of the Lagrangian and the active constraints are zero, for all parameters. The KKT matrix
+relates the derivatives of these zeros to those of the variables and multipliers. The derivative of the least cost is the
+partial derivative of the Lagrangian.
 """
 
 from __future__ import annotations
@@ -18,11 +18,9 @@ import numpy as np
 from jaxtyping import Float
 
 from .._collocate.functions import Variables
-from .._collocate.solvers import Solution, response
+from .._collocate.solvers import UNMET, Solution, response
 from .._collocate.transcription import Transcription
-from .._common.lookup import not_there
 from .._system.system import System
-from ..fit.problem.specification import parameters_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,13 +28,13 @@ class Sensitivity:
     """Derivatives of an optimal motion by one parameter: `sensitivity["roll"]` (K,) is that of any state or control.
 
     A node is a fraction of the duration: if the duration is free, the times of the nodes change too. A derivative that
-    does not exist, or is not unique, is NaN.
+    does not exist is NaN.
 
     Attributes:
 
     - `cost`, `duration`: derivatives of the least cost and of its duration.
     - `estimates`: those of the free parameters of the problem, by name.
-    - `reason`: why derivatives are NaN, as a sentence; "" if there are all.
+    - `reason`: why derivatives are NaN, as a sentence, or "".
     - `values` (K,): those of states and controls at the nodes, by name.
     """
 
@@ -47,102 +45,76 @@ class Sensitivity:
     values: dict[str, Float[np.ndarray, " K"]] = dataclasses.field(repr=False)
 
     def __getitem__(self, name: str) -> Float[np.ndarray, " K"]:
-        if name not in self.values:
-            raise not_there(name, self.values, "the sensitivity")
         return self.values[name]
 
 
 def sensitivities_of(transcription: Transcription, solution: Solution, free: Any) -> dict[str, Sensitivity]:
     """See `Plan.sensitivities`."""
-    layouts, own = transcription.layouts, transcription.parameters
-    entries = {layout.problem.title: _entries(layout.problem.system, free) for layout in layouts}
-    names = [*next(iter(entries.values()))]
-    if both := {*names} & {*(() if own is None else own.names)}:
-        raise ValueError(
-            f"Plan.sensitivities: {', '.join(sorted(both))} is `free` in the problem: the least cost does not depend on "
-            "its initial guess. Name other parameters."
-        )
-    tangents = []
+    layouts, own, tangents, names = transcription.layouts, transcription.parameters, [], []
     for layout in layouts:
-        targets = _entries(layout.problem.system, free)
-        tangents.append(tangent_of(layout.problem.system, [targets[name] for name in names]))
+        targets = {e.name: e.targets for e in dataclasses.replace(layout.problem, free=free).parameters.entries}
+        names = [*targets]
+        tangents.append(tangents_of(layout.problem.system, [*targets.values()]))
+    known = () if own is None else own.names
+    if both := {*names} & {*known}:
+        raise ValueError(f"Plan.sensitivities: {', '.join(sorted(both))} is already `free` in the problem.")
     cost, x, reason = derivatives_of(transcription, solution, tangents)
-    theta = x[:, transcription.shared_parameters]
-    values = None if own is None else np.asarray(jax.jacfwd(own.values)(jnp.asarray(transcription.theta(solution.z))))
+    theta = transcription.theta(solution.z * transcription.x_scale)
+    slopes = np.zeros((0, 0)) if own is None else np.asarray(jax.jacfwd(own.values)(jnp.asarray(theta)))
     found = {}
     for k, name in enumerate(names):
-        at = [
-            (f"phase {p}: {each}" if len(layouts) > 1 else each, x[k, places])
-            for p, layout in enumerate(layouts)
-            for each, places in layout.by_name.items()
-            if each != "duration"
-        ]
-        durations = [x[k, layout.duration] for layout in layouts if layout.duration is not None]
-        estimates = {} if own is None else dict(zip(own.names, map(float, values @ theta[k]), strict=True))
-        found[name] = Sensitivity(float(cost[k]), float(sum(durations)), estimates, reason, dict(at))
+        duration, values = 0.0, {}
+        for p, layout in enumerate(layouts):
+            values |= {f"phase {p}: " * (len(layouts) > 1) + name: x[k, at] for name, at in layout.by_name.items()}
+            duration += 0.0 if layout.duration is None else x[k, layout.duration]
+        estimates = dict(zip(known, map(float, slopes @ x[k, transcription.shared_parameters]), strict=True))
+        found[name] = Sensitivity(float(cost[k]), float(duration), estimates, reason, values)
     return found
 
 
-def _entries(system: System, free: Any) -> dict[str, Any]:
-    parameters = parameters_of(system, free)
-    if wrong := [e.name for e in parameters.entries if not e.targets]:
-        raise ValueError(f"Plan.sensitivities: {', '.join(wrong)} is not a parameter of {type(system).__name__}.")
-    return {e.name: e.targets for e in parameters.entries}
-
-
-def tangent_of(system: System, directions: Sequence[Any]) -> System:
-    """The arrays of a system with a leading axis p: its changes along directions (leaf, entry, factor)."""
+def tangents_of(system: System, directions: Sequence[Any]) -> System:
+    """The arrays of a system with a leading axis p: its changes along directions of (leaf, entry, factor)."""
     leaves, structure = jax.tree.flatten(system)
     changes = [np.zeros((len(directions), np.size(leaf))) for leaf in leaves]
     for k, targets in enumerate(directions):
         for leaf, entry, factor in targets:
-            changes[leaf][k, entry] += factor
-    arrays = [
-        jnp.asarray(change.reshape(-1, *np.shape(leaf))) if eqx.is_inexact_array(leaf) else None
-        for leaf, change in zip(leaves, changes, strict=True)
-    ]
-    return jax.tree.unflatten(structure, arrays)
+            changes[leaf][k, entry] = factor
+    shaped = [jnp.asarray(x.reshape(-1, *np.shape(a))) for x, a in zip(changes, leaves, strict=True)]
+    return eqx.filter(jax.tree.unflatten(structure, shaped), jax.tree.map(eqx.is_inexact_array, system))
 
 
 def derivatives_of(
     transcription: Transcription, solution: Solution, tangents: Sequence[System]
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """The derivatives of the cost (p,) and of the variables (p, n) along changes of the systems of all phases. Those
-    that do not exist are NaN. A sentence states why."""
+    that do not exist are NaN, and a sentence states why."""
     program, layouts = transcription.program, transcription.layouts
-    by_system = {id(layout.variables.system): t for layout, t in zip(layouts, tangents, strict=True)}
+    of_system = {id(layout.variables.system): t for layout, t in zip(layouts, tangents, strict=True)}
     p = len(jax.tree.leaves(tangents)[0])
 
-    def tangent(part: Any) -> Any:
+    def of(part: Any) -> Any:
         zeros = jax.tree.map(lambda a: jnp.zeros((p, *a.shape)), eqx.filter(part, eqx.is_inexact_array))
-        return dataclasses.replace(zeros, system=by_system[id(part.system)]) if isinstance(part, Variables) else zeros
+        return dataclasses.replace(zeros, system=of_system[id(part.system)]) if isinstance(part, Variables) else zeros
 
-    along = [jax.tree.map(tangent, f, is_leaf=lambda v: isinstance(v, Variables)) for f in program.functions]
-    lagrangian, gradient, g = program.along(solution.z, solution.multipliers, along)
-    found = response(program, solution, gradient, g)
-    cost, x, reason = lagrangian * program.f_scale, found.z * transcription.x_scale, ""
-    if found.unmet_rows.any():
-        cost, name = cost * np.nan, _name(transcription, found.unmet_rows, is_row=True)
-        reason = f"fixed values satisfy {name} for the present parameters only: leave one of them out"
-    elif found.undetermined.any():
-        name = _name(transcription, found.undetermined)
-        reason = f"the KKT matrix is singular: the least cost does not determine {name}. Add a small cost of it"
-    elif found.weak_variables.any() or found.weak_rows.any():
-        name = _name(
-            transcription, *([found.weak_variables] if found.weak_variables.any() else [found.weak_rows, True])
-        )
-        reason = f"{name} is at its bound with a multiplier of zero, where the derivatives to both sides differ"
-    return cost, x * np.nan if reason else x, reason
+    def of_function(function: Any) -> Any:
+        return jax.tree.map(of, function, is_leaf=lambda part: isinstance(part, Variables))
+
+    lagrangian, gradient, g = program.along(solution.z, solution.multipliers, of_function)
+    z, doubts = response(program, solution, gradient, g)
+    cost, x = lagrangian * program.f_scale, z * transcription.x_scale
+    for reason, (variables, rows) in doubts.items():
+        if variables.any() or rows.any():
+            where = _name(transcription, variables, rows)
+            return cost * (np.nan if reason == UNMET else 1.0), x * np.nan, reason.format(where)
+    return cost, x, ""
 
 
-def _name(transcription: Transcription, which: np.ndarray, is_row: bool = False) -> str:
-    """The name, and the time, of the first of the marked variables or constraints."""
-    i = int(np.argmax(which))
-    if is_row:
-        return next((row.name for row in transcription.rows if i in row.rows), "a constraint")
-    for layout in transcription.layouts:
-        for name, at in layout.by_name.items():
-            if i in at:
-                k = int(np.argmax(at == i))
-                return name if len(at) == 1 else f"{name!r} at {layout.s[k]:.3g} of the duration"
-    return "a free parameter"
+def _name(transcription: Transcription, variables: np.ndarray, rows: np.ndarray) -> str:
+    """The name of the variable with the largest mark, and its place, or of the first marked constraint."""
+    if not variables.any():
+        return next((row.name for row in transcription.rows if np.argmax(rows) in row.rows), "a constraint")
+    i = np.argmax(variables)
+    places = [
+        (name, s) for x in transcription.layouts for name, at in x.by_name.items() for s in x.s[: len(at)][at == i]
+    ]
+    return f"{places[0][0]!r} at {places[0][1]:.3g} of the duration" if places else "a free parameter"

@@ -94,15 +94,7 @@ def solve(
     `ImportError` without CasADi.
     """
     casadi()
-    if isinstance(problem, Problem) and problem.concrete is not None:
-        given = {
-            "intervals": intervals, "method": method, "tolerance": tolerance, "options": options, "starts": starts,
-            "seed": seed, "max_iterations": max_iterations, "max_seconds": max_seconds,
-            "max_intervals": max_intervals, "progress": progress,
-        }  # fmt: skip
-        with jax.ensure_compile_time_eval():
-            plan = solve(problem.concrete, guess, **given)
-        return differentiable(problem, plan)
+    traced, problem = problem, getattr(problem, "concrete", None) or problem
     phases = problem if isinstance(problem, Phases) else Phases([problem]) if isinstance(problem, Problem) else None
     if phases is None:
         raise TypeError(f"solve: the first argument must be a Problem or Phases, got {problem!r}.")
@@ -120,16 +112,16 @@ def solve(
         max_seconds = positive_number(max_seconds, "solve: `max_seconds`")
     guesses = _guesses(problem, guess, starts, seed)
     plans: list[Plan] = []
-    with Effort(max_iterations, max_seconds, progress) as effort:
+    with Effort(max_iterations, max_seconds, progress) as effort, jax.ensure_compile_time_eval():
         search = _Search(phases, lobatto(method), tolerance, options, effort, max_intervals)
         for one in guesses:
             plans.append(search.plan(intervals, one))
             if plans[-1].reason == INTERRUPTED or effort.is_over:
                 break
     best = min(plans, key=lambda plan: (not plan.ok, plan.violation > 1e-6, plan.cost))
-    if len(guesses) == 1:
-        return best
-    return dataclasses.replace(best, starts=tuple((plan.cost, plan.reason) for plan in plans))
+    if len(guesses) > 1:
+        best = dataclasses.replace(best, starts=tuple((plan.cost, plan.reason) for plan in plans))
+    return best if traced is problem else differentiable(traced, best)
 
 
 def continuation(
