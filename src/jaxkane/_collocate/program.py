@@ -316,7 +316,7 @@ class NonlinearProgram:
         return self._hessian_map @ np.concatenate([*parts, []])
 
     def along(self, z: np.ndarray, multipliers: np.ndarray, tangents_of: Callable[[Any], Any]) -> list[Any]:
-        """Derivatives along p changes of the arrays of the functions, whose tangents are `tangents_of(function)`: of the
+        """Derivatives along p changes of the arrays of the functions, with the tangents `tangents_of(function)`: of the
         Lagrangian, objective + multipliers . constraints, (p,), of its gradient (p, n), and of the constraints (p, m).
         """
         x, factors, parts = z * self.x_scale, multipliers / self.g_scale, []

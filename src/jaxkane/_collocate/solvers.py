@@ -378,17 +378,19 @@ def response(
     **Returns:** the derivatives (p, n) of the scaled variables; and by sentences, which variables (n,) and constraints
     (m,) make derivatives wrong.
     """
-    weak, free, active = [], np.zeros(0), np.zeros(0)
-    for x, lower, upper, multipliers in (
-        (solution.z, program.lower, program.upper, solution.bound_multipliers),
-        (program.constraints(solution.z), program.g_lower, program.g_upper, solution.multipliers),
-    ):
-        # IPOPT's last product of distance and multiplier is 1e-10. Both are about 1e-5 where neither is exactly zero.
-        distance, size, free = np.minimum(x - lower, upper - x), np.abs(multipliers), active
-        active = (lower >= upper) | (size > distance)
-        weak.append((lower < upper) & (np.maximum(size, distance) < 3e-5))
     H, J = _second_and_first(program, solution)
-    free, active = ~free, active & ~program.is_implied
+    fixed, active, weak = np.zeros(0, bool), np.zeros(0, bool), []
+    for x, lower, upper, multipliers, curvature in (
+        (solution.z, program.lower, program.upper, solution.bound_multipliers, np.clip(H.diagonal(), 1e-4, 1.0)),
+        (program.constraints(solution.z), program.g_lower, program.g_upper, solution.multipliers, 1.0),
+    ):
+        # IPOPT's last product of distance and multiplier is about 1e-10. If both are zero at the solution, the
+        # derivatives of the barrier and of the cost are as large as each other: multiplier = curvature * distance.
+        distance, fixed = np.maximum(np.minimum(x - lower, upper - x), 1e-12), active
+        ratio = np.abs(multipliers) / (curvature * distance)
+        active = (lower >= upper) | (ratio > 1.0)
+        weak.append((lower < upper) & (distance < 1e-3) & (ratio > 0.1) & (ratio < 10.0))
+    free, active = ~fixed, active & ~program.is_implied
     K: Any = scipy.sparse.bmat([[H[free][:, free], J[active][:, free].T], [J[active][:, free], None]], format="csr")
     scale, n = np.ones(K.shape[0]), int(free.sum())
     for _ in range(5):  # towards rows and columns whose largest entry is one

@@ -318,7 +318,7 @@ def filter_jit_uncached(f: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def without_tangents(tree: Any) -> Any:
-    """The arrays of a tree without the tangents of `jax.jvp`, `jacfwd` and `grad`. Tracers of `jit` and `vmap` remain."""
+    """The arrays of a tree without the tangents of `jax.jvp`, `jacfwd` and `grad`. Tracers of `jit`, `vmap` remain."""
     found: list[Any] = []
 
     def keep(x: Any) -> Any:

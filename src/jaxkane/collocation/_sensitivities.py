@@ -1,8 +1,8 @@
 """Derivatives of optimal motions by parameters of the mechanism.
 
 At a solution, the gradient of the Lagrangian and the active constraints are zero, for all parameters. The KKT matrix
-relates the derivatives of these zeros to those of the variables and multipliers. The derivative of the least cost is the
-partial derivative of the Lagrangian.
+relates their derivatives to those of the variables and multipliers. The derivative of the least cost is the partial
+derivative of the Lagrangian.
 """
 
 from __future__ import annotations
