@@ -19,7 +19,8 @@ from jaxtyping import Float
 
 from .._collocate.functions import Variables
 from .._collocate.solvers import UNMET, Solution, response
-from .._collocate.transcription import Transcription
+from .._collocate.transcription import Layout, Transcription
+from .._kane.constraint_residuals import configuration_residual
 from .._system.system import System
 
 
@@ -102,11 +103,28 @@ def derivatives_of(
     lagrangian, gradient, g = program.along(solution.z, solution.multipliers, of_function)
     z, doubts = response(program, solution, gradient, g)
     cost, x = lagrangian * program.f_scale, z * transcription.x_scale
+    for layout, t in zip(layouts, tangents, strict=True):
+        if _moves_fixed_start(layout, t, solution.z * transcription.x_scale):
+            return cost * np.nan, x * np.nan, UNMET.format("the configuration constraints at the start")
     for reason, (variables, rows) in doubts.items():
         if variables.any() or rows.any():
             where = _name(transcription, variables, rows)
             return cost * (np.nan if reason == UNMET else 1.0), x * np.nan, reason.format(where)
     return cost, x, ""
+
+
+def _moves_fixed_start(layout: Layout, tangents: System, x: np.ndarray) -> bool:
+    # If the start fixes all coordinates, the program does not contain the configuration constraints there.
+    system, start = layout.problem.system, layout.problem.ends["start"]
+    if not layout.problem.n_constraints or any(isinstance(start.get(c, ()), tuple) for c in system.coordinates):
+        return False
+    (arrays, rest), q = eqx.partition(system, eqx.is_inexact_array), jnp.asarray(x[layout.node(0)])
+
+    def h(arrays: Any) -> Any:
+        values = configuration_residual(eqx.combine(arrays, rest), jnp.zeros(()), q[: len(system.coordinates)])
+        return jnp.stack([*values])
+
+    return bool(np.any(np.abs(jax.vmap(lambda t: jax.jvp(h, (arrays,), (t,))[1])(tangents)) > 1e-9))
 
 
 def _name(transcription: Transcription, variables: np.ndarray, rows: np.ndarray) -> str:
