@@ -12,7 +12,8 @@ foot at mid-stance is ignored.
 
 Run:      python examples/walk_down_a_slope.py [--out FOLDER]
 Appears:  the periodic gait on a slope of 3 degrees with its multipliers; the slope at which the period doubles; and
-          walk_down_a_slope.png: the gait in the plane of angle and rate, and the multipliers over the slope.
+          walk_down_a_slope.png: the gait in the plane of angle and rate, the multipliers over the slope, and the
+          durations of the steps over the slope, before and after the period doubling.
 Takes:    one minute.
 """
 
@@ -50,7 +51,13 @@ def main(out: Path) -> None:
     at = float(np.rad2deg(doubling.orbit.system.slope))
     assert abs(at - 4.3909) < 1e-3
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    # On steeper slopes a stable gait of two unequal steps exists.
+    limps = jk.stability.family(
+        doubling.orbit.system, doubling.orbit, towards={"slope": 1}, until={"slope": np.deg2rad(4.6)}, switch="doubling"
+    )
+    print(limps)
+
+    figure, (left, right, last) = plt.subplots(1, 3, figsize=(14, 4), layout="constrained")
     ride = gait.ride
     left.plot(np.rad2deg(ride["stance"]), ride["stance_rate"], label="stance leg")
     left.plot(np.rad2deg(ride["swing"]), ride["swing_rate"], label="swing leg")
@@ -64,9 +71,22 @@ def main(out: Path) -> None:
     right.axvline(at, color="C3", linestyle="--", label=f"period doubling at {at:.3f} deg")
     right.set(xlabel="slope [deg]", ylabel="size of the multipliers")
     right.legend()
+    draw_durations(last, family, limps)
     out.mkdir(parents=True, exist_ok=True)
     figure.savefig(out / "walk_down_a_slope.png", dpi=120)
     print(f"picture: {out / 'walk_down_a_slope.png'}")
+
+
+def draw_durations(ax, family, limps) -> None:
+    """The duration of a step of the gaits that repeat after one step, and of both steps of those that limp."""
+    ax.plot(np.rad2deg(np.asarray(family["slope"])), family.period, color="C0", label="gait of one step")
+    first = np.array([float(limps.orbit(i).ride.jumps.t[0]) for i in range(len(limps))])
+    both = np.stack([first, np.asarray(limps.period) - first], axis=1)
+    both.sort(axis=1)
+    lines = ax.plot(np.rad2deg(np.asarray(limps["slope"])), both, color="C1")
+    lines[0].set_label("gait of two steps: the short and the long step")
+    ax.set(xlabel="slope [deg]", ylabel="duration of a step [s]", title="period doubling")
+    ax.legend(loc="upper left")
 
 
 if __name__ == "__main__":
