@@ -390,7 +390,7 @@ def _along(system: System, signals: Signals, controls: tuple[str, ...], ts: Arra
     return jax.vmap(at)(ts, Y, W)
 
 
-def differentiable(problem: Problem, plan: Plan) -> Plan:
+def differentiable(problem: Any, plan: Plan) -> Plan:
     """The plan of `problem.concrete` with the derivatives by the traced numbers in the system of `problem`.
 
     The cost, duration, estimates, system and trajectory have derivatives. The multipliers have none and are left out.

@@ -53,10 +53,11 @@ def sensitivities_of(transcription: Transcription, solution: Solution, free: Any
     """See `Plan.sensitivities`."""
     layouts, own, tangents, names = transcription.layouts, transcription.parameters, [], []
     for layout in layouts:
-        targets = {e.name: e.targets for e in dataclasses.replace(layout.problem, free=free).parameters.entries}
+        problem: Any = layout.problem
+        targets = {e.name: e.targets for e in dataclasses.replace(problem, free=free).parameters.entries}
         names = [*targets]
         tangents.append(tangents_of(layout.problem.system, [*targets.values()]))
-    known = () if own is None else own.names
+    known: tuple[str, ...] = () if own is None else own.names
     if both := {*names} & {*known}:
         raise ValueError(f"Plan.sensitivities: {', '.join(sorted(both))} is already `free` in the problem.")
     cost, x, reason = derivatives_of(transcription, solution, tangents)
