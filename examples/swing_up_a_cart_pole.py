@@ -95,7 +95,7 @@ def draw(plan: col.Plan, open_loop, closed_loop, path: Path) -> None:
     for ride, label in ((open_loop, "without feedback"), (closed_loop, "with feedback")):
         right.plot(ride.t, np.rad2deg(ride["angle"]), label=f"5 % longer, {label}")
     right.plot(plan.t, np.rad2deg(plan["angle"]), "k--", lw=1, label="plan")
-    right.set(xlabel="time [s]", ylabel="angle [deg]")
+    right.set(xlabel="time [s]", ylabel="angle [deg]", ylim=(-150.0, None))
     right.legend(frameon=False, loc="lower right")
     figure.savefig(path, dpi=120)
     plt.close(figure)

@@ -56,6 +56,7 @@ def main(out: Path) -> None:
         doubling.orbit.system, doubling.orbit, towards={"slope": 1}, until={"slope": np.deg2rad(4.6)}, switch="doubling"
     )
     print(limps)
+    assert np.all(np.abs(limps.multipliers[1:]) < 1.0)
 
     figure, (left, right, last) = plt.subplots(1, 3, figsize=(14, 4), layout="constrained")
     ride = gait.ride
@@ -84,7 +85,7 @@ def draw_durations(ax, family, limps) -> None:
     both = np.stack([first, np.asarray(limps.period) - first], axis=1)
     both.sort(axis=1)
     lines = ax.plot(np.rad2deg(np.asarray(limps["slope"])), both, color="C1")
-    lines[0].set_label("gait of two steps: the short and the long step")
+    lines[0].set_label("gait of two steps")
     ax.set(xlabel="slope [deg]", ylabel="duration of a step [s]", title="period doubling")
     ax.legend(loc="upper left")
 

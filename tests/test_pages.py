@@ -44,7 +44,9 @@ def names_of_fit():
     return names
 
 
-@pytest.mark.weekly_cases("bicycles_control", "bicycles_riders", "bicycles_tyres", "diffrax", "periodic_orbits")
+@pytest.mark.weekly_cases(
+    "bicycles_control", "bicycles_riders", "bicycles_tyres", "diffrax", "gallery", "periodic_orbits"
+)
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUN, ids=[page.stem for page in RUN])
 def test_the_code_of_each_page_runs(page, tmp_path, monkeypatch, request):
