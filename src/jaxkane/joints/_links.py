@@ -53,8 +53,8 @@ class Link:
     - `mass` [kg], `center` [m]: mass and mass centre. A link without a mass is a frame that carries others.
         A mass of zero is permitted if the link has moments of inertia.
     - `inertia` [kg m^2]: about the mass centre, along the link's axes: three principal moments, or a (3, 3) matrix.
-    - `shape`: what animations draw, one of `jaxkane.shapes` or a list of these, with exact numbers. A link with shapes
-        and without a mass becomes a body of mass zero.
+    - `shape`: what animations draw, one of `jaxkane.shapes` or a list of these, with exact numbers. Those of a
+        link without a mass belong to a body of mass zero, `NAME shape`.
 
     Numbers become parameters: `mass.forearm`, `center.forearm.z`, `inertia.forearm.xx`, `position.forearm.z`. A zero
     that is written as a number is not a parameter but part of the structure, and costs nothing. Write `jnp.zeros(())`

@@ -253,10 +253,10 @@ class Mechanism(System):
                 m, I, G = _read(self, f"mass.{link.name}"), _inertia(self, link.name), _moved(P, F, center)
                 shapes = [s._replace(center=add3(s.center, scale3(-1.0, center))) for s in link.shapes]
                 bodies.append(Body(m, I, G, F, name=link.name, shape=shapes))
-            elif link.shapes:
-                bodies.append(Body(0.0, 0.0, P, F, name=link.name, shape=link.shapes))
             else:
                 points[link.name] = P.fixed(F.vector(0.0, 0.0, 0.0))
+                if link.shapes:  # the point keeps the name
+                    bodies.append(Body(0.0, 0.0, P, F, name=f"{link.name} shape", shape=link.shapes))
         for joint in self.structure.joints:
             armature = _read(self, f"armature.{joint.name}")
             if not is_zero(armature):
