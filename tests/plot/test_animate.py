@@ -323,7 +323,7 @@ def test_shapes_of_a_urdf_are_drawn():
     system, t = jk.convert.from_urdf(text), np.linspace(0.0, 1.0, 21)
     animation = jk.animate(system, moved(system, t, t[:, None], np.zeros((21, 1))))
     scene, turned = animation.scene, Rotation.from_euler("y", t[7])
-    assert {s.label for s in scene.shapes} == {"", "base shape", "arm"}
+    assert {s.label for s in scene.shapes} == {"", "base", "base shape", "arm"}
     faces = [ends_of(scene, t[7], s) for s in shapes(animation, "line") if s.fill == 0.08]
     np.testing.assert_allclose(np.ptp(np.concatenate(faces), axis=0), [0.4, 0.5, 0.2], atol=1e-12)
     np.testing.assert_allclose(np.mean(faces, axis=(0, 1)), [0.0, 0.0, -0.1], atol=1e-12)
