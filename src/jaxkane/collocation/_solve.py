@@ -509,7 +509,7 @@ def conflict_of(transcription: Transcription, program: NonlinearProgram, solutio
             if row.phase == p and row.kind != "dynamics":
                 add(prefix * (row.kind != "links") + row.name, np.abs(solution.multipliers[row.rows]), t)
     order = sorted(found, key=lambda label: -found[label])
-    return tuple(label for label in order if found[label] > 0.1 * found[order[0]])[:8]
+    return tuple(label for label in order if found[label] > 0.01 * found[order[0]])[:8]
 
 
 def multipliers_of(transcription: Transcription, solution: Solution, p: int) -> Multipliers:
