@@ -20,6 +20,7 @@ from jaxtyping import Float
 from .._collocate.functions import Variables
 from .._collocate.solvers import UNMET, Solution, response
 from .._collocate.transcription import Layout, Transcription
+from .._common.lookup import not_there
 from .._kane.constraint_residuals import configuration_residual
 from .._system.system import System
 
@@ -46,11 +47,15 @@ class Sensitivity:
     values: dict[str, Float[np.ndarray, " K"]] = dataclasses.field(repr=False)
 
     def __getitem__(self, name: str) -> Float[np.ndarray, " K"]:
+        if name not in self.values:
+            raise not_there(name, self.values, "this sensitivity")
         return self.values[name]
 
 
 def sensitivities_of(transcription: Transcription, solution: Solution, free: Any) -> dict[str, Sensitivity]:
     """See `Plan.sensitivities`."""
+    if isinstance(free, list | tuple) and not free:
+        raise ValueError("Plan.sensitivities: `free` names no parameter.")
     layouts, own, tangents, names = transcription.layouts, transcription.parameters, [], []
     for layout in layouts:
         problem: Any = layout.problem
