@@ -79,7 +79,7 @@ def main(out: Path) -> None:
 
 
 def draw_durations(ax, family, limps) -> None:
-    """The duration of a step of the gaits that repeat after one step, and of both steps of those that limp."""
+    """Durations of steps over the slope: of the gaits of one step, and of both steps of the gaits of two steps."""
     ax.plot(np.rad2deg(np.asarray(family["slope"])), family.period, color="C0", label="gait of one step")
     first = np.array([float(limps.orbit(i).ride.jumps.t[0]) for i in range(len(limps))])
     both = np.stack([first, np.asarray(limps.period) - first], axis=1)

@@ -82,7 +82,7 @@ def without_penetration(system: System, t: Array, state: State) -> State:
     def step(_: Any, q: Array) -> Array:
         return without_gaps(terms_at(system, t, q, u, none), is_slight, q)
 
-    moved = jax.lax.fori_loop(0, 3, step, q) - q
+    moved = jax.lax.fori_loop(0, jnp.where(jnp.any(is_slight), 3, 0), step, q) - q
     return State(state.q + moved, state.u, state.x, state.contacts)
 
 

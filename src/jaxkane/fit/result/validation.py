@@ -459,8 +459,8 @@ def predict(
             f"predict: no trial is longer than {past:g} s for the initial state plus {times.max():g} s to predict. "
             "Choose a shorter `past` or `ahead`."
         )
-    whole = dataclasses.replace(spec, window=None, defect_std=None)
-    whole = dataclasses.replace(whole, unknown=()) if from_sample else whole
+    unknown = () if from_sample else spec.unknown
+    whole = dataclasses.replace(spec, window=None, defect_std=None, unknown=unknown)
     unwindowed = dataclasses.replace(fit, problem=dataclasses.replace(fit.problem, specification=whole))
     fitted, rows = _validated(unwindowed, pieces, {}, quick=True).fitted, []
     for number, (name, piece, last) in enumerate(origins):
