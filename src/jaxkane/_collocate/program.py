@@ -315,6 +315,15 @@ class NonlinearProgram:
             parts.append(b.hessian(x, weights.reshape(b.B, b.block.size)).ravel())
         return self._hessian_map @ np.concatenate([*parts, []])
 
+    def jacobian_matrix(self, z: np.ndarray) -> Sparse:
+        """The derivatives (n_g, n) of `constraints`."""
+        return scipy.sparse.csr_matrix((self.jacobian(z), self.jacobian_structure), (self.m, self.n))
+
+    def hessian_matrix(self, z: np.ndarray, multipliers: np.ndarray) -> Sparse:
+        """The second derivatives (n, n) of objective + multipliers . constraints."""
+        lower = scipy.sparse.csr_matrix((self.hessian(z, multipliers), self.hessian_structure), (self.n, self.n))
+        return (lower + scipy.sparse.tril(lower, -1).T).tocsr()
+
     def along(self, z: np.ndarray, multipliers: np.ndarray, tangents_of: Callable[[Any], Any]) -> list[Any]:
         """Derivatives along p changes of the arrays of the functions, with the tangents `tangents_of(function)`: of the
         Lagrangian, objective + multipliers . constraints, (p,), of its gradient (p, n), and of the constraints (p, m).

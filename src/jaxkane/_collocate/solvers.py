@@ -330,8 +330,8 @@ def _has_negative_curvature(program: NonlinearProgram, border: np.ndarray, solut
     z, g = solution.z, program.constraints(solution.z)
     free = ~_at_bound(z, program.lower, program.upper, solution.bound_multipliers)
     active = _at_bound(g, program.g_lower, program.g_upper, solution.multipliers)
-    H, J = _second_and_first(program, solution)
-    H, is_border = H[free][:, free], np.isin(np.arange(program.n), border)[free]
+    H, J = program.hessian_matrix(z, solution.multipliers)[free][:, free], program.jacobian_matrix(z)
+    is_border = np.isin(np.arange(program.n), border)[free]
     project = _Projection(J[active][:, free], is_border)
     v = project(project(np.random.default_rng(0).normal(size=int(free.sum()))))
     if not np.linalg.norm(v) > 1e-3:  # the constraints determine all variables
@@ -358,15 +358,6 @@ def _has_negative_curvature(program: NonlinearProgram, border: np.ndarray, solut
 _STEPS = 80  # of the method of Lanczos
 
 
-def _second_and_first(program: NonlinearProgram, solution: Solution) -> tuple[Sparse, Sparse]:
-    """The Hessian (n, n) of the Lagrangian and the Jacobian (n_g, n) of the constraints."""
-    rows, columns = program.hessian_structure
-    entries = program.hessian(solution.z, solution.multipliers)
-    lower = scipy.sparse.csr_matrix((entries, (rows, columns)), (program.n,) * 2)
-    J = scipy.sparse.csr_matrix((program.jacobian(solution.z), program.jacobian_structure), (program.m, program.n))
-    return (lower + scipy.sparse.tril(lower, -1).T).tocsr(), J
-
-
 def response(
     program: NonlinearProgram, solution: Solution, gradient: np.ndarray, g: np.ndarray
 ) -> tuple[np.ndarray, dict[str, tuple[np.ndarray, np.ndarray]]]:
@@ -378,18 +369,21 @@ def response(
     **Returns:** the derivatives (p, n) of the scaled variables; and by sentences, which variables (n,) and constraints
     (m,) make derivatives wrong.
     """
-    H, J = _second_and_first(program, solution)
-    fixed, active, weak = np.zeros(0, bool), np.zeros(0, bool), []
-    for x, lower, upper, multipliers, curvature in (
-        (solution.z, program.lower, program.upper, solution.bound_multipliers, np.clip(H.diagonal(), 1e-4, 1.0)),
-        (program.constraints(solution.z), program.g_lower, program.g_upper, solution.multipliers, 1.0),
-    ):
+    H, J = program.hessian_matrix(solution.z, solution.multipliers), program.jacobian_matrix(solution.z)
+
+    def active_and_weak(
+        x: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: np.ndarray, curvature: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
         # IPOPT's last product of distance and multiplier is about 1e-10. If both are zero at the solution, the
         # derivatives of the barrier and of the cost are as large as each other: multiplier = curvature * distance.
-        distance, fixed = np.maximum(np.minimum(x - lower, upper - x), 1e-12), active
+        distance = np.maximum(np.minimum(x - lower, upper - x), 1e-12)
         ratio = np.abs(multipliers) / (curvature * distance)
-        active = (lower >= upper) | (ratio > 1.0)
-        weak.append((lower < upper) & (distance < 1e-3) & (ratio > 0.1) & (ratio < 10.0))
+        is_weak = (lower < upper) & (distance < 1e-3) & (ratio > 0.1) & (ratio < 10.0)
+        return (lower >= upper) | (ratio > 1.0), is_weak
+
+    curvature, g_now = np.clip(H.diagonal(), 1e-4, 1.0), program.constraints(solution.z)
+    fixed, weak = active_and_weak(solution.z, program.lower, program.upper, solution.bound_multipliers, curvature)
+    active, g_weak = active_and_weak(g_now, program.g_lower, program.g_upper, solution.multipliers, 1.0)
     free, active = ~fixed, active & ~program.is_implied
     K: Any = scipy.sparse.bmat([[H[free][:, free], J[active][:, free].T], [J[active][:, free], None]], format="csr")
     scale, n = np.ones(K.shape[0]), int(free.sum())
@@ -411,7 +405,7 @@ def response(
     return dz, {
         UNMET: (np.zeros(0), unmet & program.is_implied & (program.g_lower == program.g_upper)),
         "the KKT matrix is singular: nothing determines {}. Add a small cost of it": (undetermined, np.zeros(0)),
-        "{} is at a bound with a multiplier of zero, where the derivatives to both sides differ": (weak[0], weak[1]),
+        "{} is at a bound with a multiplier of zero, where the derivatives to both sides differ": (weak, g_weak),
     }
 
 

@@ -523,8 +523,7 @@ class Transcription:
         dependent = {i for i in order if i in of_ends}
         beside = np.clip(self.z + np.random.default_rng(0).uniform(-0.1, 0.1, self.n), program.lower, program.upper)
         for z in (self.z, beside) if dependent else ():  # gradients may depend on each other at the guess by chance
-            J: Any = scipy.sparse.csr_matrix((program.jacobian(z), (rows, columns)), (program.m, program.n))
-            A = J[order][:, free].toarray()
+            A = program.jacobian_matrix(z)[order][:, free].toarray()
             size = np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
             A = A / size if np.all(np.isfinite(size)) else np.eye(len(A))  # beside the guess it may not be finite
             ranks = [np.linalg.matrix_rank(A[:k], tol=1e-8) if k else 0 for k in range(len(A) + 1)]

@@ -10,7 +10,6 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
 from jaxtyping import Array
 
 from .._collocate.lobatto import Lobatto, lobatto
@@ -539,7 +538,7 @@ def costates_of(transcription: Transcription, solution: Solution, p: int) -> dic
     transformed adjoint system, Numerische Mathematik 87, 2000).
     """
     program, layout, z = transcription.program, transcription.layouts[p], solution.z
-    J: Any = scipy.sparse.csr_matrix((program.jacobian(z), program.jacobian_structure), (program.m, program.n))
+    J = program.jacobian_matrix(z)
     rows = np.stack([row.rows for row in transcription.rows if row.phase == p and row.kind == "dynamics"], axis=-1)
     rows, steps = rows.reshape(len(rows), -1), np.diff(layout.mesh)  # (N, (s - 1) n_y)
     columns = layout.node(np.arange(len(rows) + 1) * layout.every)[:, : rows.shape[1] // layout.every]

@@ -79,11 +79,9 @@ class Kkt:
         self.program = program
         is_free = (z - program.lower > 1e-7) & (program.upper - z > 1e-7)
         self.inner, self.border = np.setdiff1d(np.flatnonzero(is_free), border), border[is_free[border]]
-        rows, columns = program.hessian_structure
-        lower = scipy.sparse.csr_matrix((program.hessian(z, multipliers), (rows, columns)), (program.n,) * 2)
         # Half of the cost, in its own unit, so that the matrix is the curvature of minus the log density.
-        H = 0.5 * program.f_scale * (lower + scipy.sparse.tril(lower, -1).T).tocsr()
-        J = scipy.sparse.csr_matrix((program.jacobian(z), program.jacobian_structure), (program.m, program.n))
+        H = 0.5 * program.f_scale * program.hessian_matrix(z, multipliers)
+        J = program.jacobian_matrix(z)
         inner, border = self.inner, self.border
         K = scipy.sparse.bmat([[H[inner][:, inner], J[:, inner].T], [J[:, inner], None]], format="csr")
         order = np.asarray(scipy.sparse.csgraph.reverse_cuthill_mckee(K, symmetric_mode=True))
