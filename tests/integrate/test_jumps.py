@@ -419,3 +419,52 @@ def test_times_of_jumps_in_float32_with_posix_times():
     system = jax.tree.map(lambda x: x.astype(jnp.float32), Ball(0.8, 0.1))
     ride = jk.simulate(system, start, 1.7e9 + np.asarray(TS, np.float64))
     np.testing.assert_allclose(ride.jumps.t[:3] - 1.7e9, TIMES, atol=2e-4)
+
+
+class Masses(jk.System):
+    """Free masses on parallel lines, each with its own event: impacts with one and two residuals, and new values."""
+
+    masses: jk.Vector = jk.parameter(tuple(np.linspace(1.0, 2.0, 14)), unit="kg")
+    coordinates, speeds = tuple(f"x{i}" for i in range(14)), tuple(f"v{i}" for i in range(14))
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        points = [O.moving(x * N.x, v * N.x) for x, v in zip(q, u, strict=True)]
+        return jk.Motion([jk.Body(m, 0.0, point) for m, point in zip(self.masses, points, strict=True)])
+
+    def events(self, t, q, u):
+        stops = {f"stop{i:02}": jk.rising(q[i] - 1.0, then=jk.Impact(u[i], restitution=0.5)) for i in range(2, 14)}
+        both = jk.Impact(u[0] - u[1], u[1], restitution=(1.0, 0.0))
+        return {**stops, "both": jk.rising(q[0] - 1.0, then=(both, {"x0": 0.0})), "back": jk.rising(q[1] - 1.0, then={"v1": -u[1]})}
+
+
+@pytest.mark.slow
+def test_many_events_with_impacts_and_many_speeds():
+    """Each event changes its own masses only. Closed form, also of the derivatives."""
+    speeds = 1.0 / (0.1 + 0.05 * np.arange(14))  # mass i arrives after 0.1 + 0.05 i s; masses 0 and 1 together stop
+    speeds[1] = 0.5
+
+    def ride(masses):
+        start = jk.State(jnp.zeros(14), jnp.asarray(speeds))
+        return jk.simulate(Masses(masses), start, jnp.linspace(0.0, 0.8, 3), max_jumps=16)
+
+    masses = Masses().masses
+    found = ride(masses)
+    assert found.ok
+    assert [found.jumps.name(i) for i in range(int(found.jumps.count))] == ["both", *sorted(found.events)[2:]]
+    after, impulses = np.asarray(found.end.u), np.asarray(found.jumps.impulses)
+    np.testing.assert_allclose(after[2:], -0.5 * speeds[2:], rtol=1e-9)
+    np.testing.assert_allclose(after[:2], [0.5 - speeds[0], 0.0], atol=1e-9)
+    np.testing.assert_allclose(impulses[1:13, 0], -1.5 * masses[2:] * speeds[2:], rtol=1e-9)
+    assert np.isnan(impulses[1:13, 1]).all()
+
+    def of_both(masses):  # p1 = m0 (v0+ - v0), p2 = m1 (v1+ - v1) + p1
+        first = masses[0] * (speeds[1] - 2 * speeds[0])
+        return jnp.stack([first, first - masses[1] * speeds[1]])
+
+    direction = jnp.linspace(1.0, -1.0, 14)
+    exact, slope = jax.jvp(of_both, (masses,), (direction,))
+    np.testing.assert_allclose(impulses[0], exact, rtol=1e-9)
+    _, slopes = jax.jvp(lambda m: ride(m).jumps.impulses[:13], (masses,), (direction,))
+    np.testing.assert_allclose(slopes[0], slope, rtol=1e-9)
+    np.testing.assert_allclose(slopes[1:, 0], -1.5 * (direction * speeds)[2:], rtol=1e-9)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from .._common.lookup import not_there, real_number
 from .._integrate.events import Crossing, crossings, events_of
 from .._integrate.inputs import inputs_at
-from .._integrate.jumps import stages_of, state_after
+from .._integrate.jumps import StagesOf, after_jump
 from .._kane.api import _dependent_speeds
 from .._kane.arguments import is_one_number
 from .._kane.constraint_residuals import configuration_residual
@@ -88,7 +88,7 @@ class Now:
         if name not in events.names:
             raise not_there(name, events.names, "the events of the system")
         place = jnp.asarray(events.names.index(name), self._y.dtype)
-        y = state_after(self.system, self.t, self._y, place, stages_of(events))
+        y, _ = after_jump(self.system, self.t, self._y, place, StagesOf.of(events))
         return Now(self.system, self.t, y, self._inputs)
 
     def __contains__(self, name: object) -> bool:

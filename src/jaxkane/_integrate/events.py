@@ -236,12 +236,28 @@ def _ratio(x: Array, y: Array) -> Array:
     return jnp.where(y == 0, 0.0, x / jnp.where(y == 0, 1.0, y))
 
 
+class ImpactKind(NamedTuple):
+    """A stage of an event that is an `Impact`: the names that it releases, and the number of its residuals."""
+
+    release: tuple[str, ...]
+    size: int
+
+
+StageKind: TypeAlias = ImpactKind | None
+"""What a stage of an event does. None: it sets new values."""
+
+
+def first_impact(kinds: Sequence[StageKind]) -> tuple[int, int]:
+    """The first stage of an event that is an impact, and the number of its residuals; (-1, 0) if there is none."""
+    return next(((stage, kind.size) for stage, kind in enumerate(kinds) if kind is not None), (-1, 0))
+
+
 class Events(NamedTuple):
     """The events of a system.
 
     - `names`: in alphabetical order.
     - `directions`: 1, -1, or 0 for both.
-    - `stages`: the number of stages of `then`; 0 for an event that ends the simulation.
+    - `stages`: what each stage of `then` does; empty for an event that ends the simulation.
     - `conditions`: for each event its place among those with `when`, or None.
     - `read_rates`: whether any event uses speeds or first-order states, whose rates the solver must evaluate.
     - `read_time`: whether any event uses the time.
@@ -252,7 +268,7 @@ class Events(NamedTuple):
 
     names: tuple[str, ...]
     directions: tuple[int, ...]
-    stages: tuple[int, ...]
+    stages: tuple[tuple[StageKind, ...], ...]
     conditions: tuple[int | None, ...]
     read_rates: bool
     read_time: bool
@@ -269,7 +285,7 @@ class Events(NamedTuple):
         if both := set(self.names) & set(layout.names):
             raise ValueError(f"The name {both.pop()!r} is used twice, for an event and for a contact. Rename one.")
         own = [*zip(*self[:4], [None] * len(self.names), strict=True)]
-        of_contacts = [(name, -1, 1, None, (i, side)) for i, name in enumerate(layout.names) for side in (0, 1)]
+        of_contacts = [(name, -1, (None,), None, (i, side)) for i, name in enumerate(layout.names) for side in (0, 1)]
         columns = zip(*sorted([*own, *of_contacts], key=lambda event: event[0]), strict=True)
         names, directions, stages, conditions, contacts = (tuple(column) for column in columns)
         return Events(names, directions, stages, conditions, True, self.read_time | layout.reads_time, contacts, layout)
@@ -283,6 +299,12 @@ class Events(NamedTuple):
         opens = [no if x is None or x[1] else states[x[0]] == OPEN for x in self.contacts]
         limit = jnp.maximum(jnp.abs(values.rates) * rounding, 64 * values.noise)
         return jnp.stack(opens) & (jnp.abs(values.values) <= limit) & (values.rates < 0)
+
+    @property
+    def n_impulses(self) -> int:
+        """The number of impulses of a jump: of the contacts, otherwise of the largest first impact of an event."""
+        of_contacts = len(self.layout.names) * (1 + self.layout.d)
+        return of_contacts or max([first_impact(kinds)[1] for kinds in self.stages], default=0)
 
     @property
     def continue_(self) -> bool:
@@ -301,8 +323,14 @@ def own_events_of(system: System, t: Array, state: State) -> Events:
     u_all = jnp.zeros(len(system.speeds) + len(system.dependent_speeds), dtype)
     x, found = jnp.zeros(len(system.states), dtype), {}
 
+    kinds: dict[str, tuple[StageKind, ...]] = {}
+
     def values(t: Array, q: Array, u_all: Array, x: Array) -> Any:
-        found.update(crossings(system, t, tuple(q), tuple(u_all), tuple(x), dtype))
+        point = t, tuple(q), tuple(u_all), tuple(x)
+        found.update(crossings(system, *point, dtype))
+        for name, event in found.items():
+            thens = [called(system, then, *point) for then in event.stages]
+            kinds[name] = tuple(_kind_of(then, f"{type(system).__name__}.events: `then` of {name!r}") for then in thens)
         return [(event.value, event.when) for event in found.values()]
 
     program = jax.make_jaxpr(values)(t, state.q, u_all, x)
@@ -311,11 +339,37 @@ def own_events_of(system: System, t: Array, state: State) -> Events:
     return Events(
         tuple(found),
         tuple(event.direction for event in events),
-        tuple(len(event.stages) for event in events),
+        tuple(kinds.values()),
         tuple(conditional.index(name) if name in conditional else None for name in found),
         any(depends_on(program, [2, 3])),
         any(depends_on(program, [0])),
     )
+
+
+def called(
+    system: System,
+    then: Any,
+    t: Component,
+    q: Sequence[Component],
+    u_all: Sequence[Component],
+    x: Sequence[Component],
+) -> Any:
+    """A stage of an event; if it is a function, its result."""
+    if not callable(then):
+        return then
+    u = NamedVector(u_all, (*system.speeds, *system.dependent_speeds))
+    return call_with_states(then, t, NamedVector(q, system.coordinates), u, NamedVector(x, system.states))
+
+
+def _kind_of(then: Any, label: str) -> StageKind:
+    if isinstance(then, Impact):
+        return ImpactKind(then.release, len(then.residuals))
+    if not isinstance(then, Mapping):
+        raise TypeError(
+            f"{label} must be a dict of new values by name, a jaxkane.Impact, a function that returns one of both, or "
+            f"a tuple of these; got {then!r}."
+        )
+    return None
 
 
 def crossings(

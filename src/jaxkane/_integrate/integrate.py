@@ -61,7 +61,7 @@ from .inputs import (
     restore_times,
     samples_of,
 )
-from .jumps import JumpTable, impulses_at, stages_of, state_after, without_derivative_at
+from .jumps import JumpTable, StagesOf, after_jump, without_derivative_at
 from .loop import Jump, Steps, diffrax_loop, fast_loop, is_supported
 from .settings import (
     Settings,
@@ -420,9 +420,9 @@ class Problem(NamedTuple):
     def jump(self, t: Array, y: Array, event: Array, reach: Array, slack: float = 1.0) -> Jump:
         """The jump of an event, from a time and a packed state near it. `slack`: see `SLACK`."""
         point = self.event_point(t, y, None, event, slack * reach, jnp.array(True))
-        after, none = point.y, float(Status.COMPLETED)
-        if any((which := stages_of(self.events)).stages):
-            after = state_after(self.args.system, self.args.clock(point.t), point.y, event, which)
+        after, impulses, none = point.y, y[:0], float(Status.COMPLETED)
+        if any((which := StagesOf.of(self.events)).stages):
+            after, impulses = after_jump(tree_of(self.args.system), self.args.clock(point.t), point.y, event, which)
         is_possible = jnp.all(jnp.isfinite(after))
         if self.constrained:
             q = unpacked(self.system, jnp.where(is_possible, after, point.y)).q
@@ -432,7 +432,7 @@ class Problem(NamedTuple):
             # An event function that jumps across zero with an input vanishes nowhere: its time is that of the input.
             apart = jnp.abs(constant(point.t) - constant(self.discontinuities.times))
             smooth |= jnp.any(apart <= 2 * reach)
-        jump = Jump(point.t, event, point.y, after, smooth.astype(y.dtype), y[:0], jnp.zeros_like(event))
+        jump = Jump(point.t, event, point.y, after, smooth.astype(y.dtype), impulses, jnp.zeros_like(event))
         if self.events.layout.names:
             jump = self.contact_jump(jump._replace(after=jnp.where(is_possible, after, point.y)), event, reach)
         status = jnp.where(is_possible, jump.status, float(Status.IMPOSSIBLE_JUMP))
@@ -736,21 +736,18 @@ def _jump_table(problem: Problem, record: Jump, count: Array, follows_from: list
     system, args = problem.system, problem.args
     unused = jnp.arange(record.t.shape[0]) >= count
     before, after = (jnp.where(unused[:, None], problem.start, y) for y in (record.before, record.after))
-    times, which = args.clock(record.t), stages_of(problem.events)
+    times = args.clock(record.t)
 
     def energy(states: Array) -> Array:
         q, u = unpacked(system, states).q, unpacked(system, states).u
         return jax.vmap(lambda t, q, u: _kinetic_energy(system, t, q, u, {}))(times, q, u)
 
     lost = energy(before) - energy(after)
-    impulses = record.impulses
-    if not problem.events.layout.names:
-        impulses = jax.vmap(lambda t, y, event: impulses_at(system, t, y, event, which))(times, before, record.event)
     sides = [
         jax.vmap(lambda tau, y: args.inputs(system, tau, unpacked(system, y), all_of_them=True))(record.t, y)
         for y in (before, after)
     ]
-    values = times, before, after, lost, impulses, tuple(sides)
+    values = times, before, after, lost, record.impulses, tuple(sides)
     rough = jnp.cumsum(jnp.where(unused, 0.0, 1.0 - constant(record.smooth))) > 0
     values = nan_derivative_where(rough, values, follows_from)
     values = nan_beyond_second_derivative(count > 0, values, follows_from)

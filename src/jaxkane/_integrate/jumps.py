@@ -12,6 +12,7 @@ discontinuous right-hand sides").
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -24,15 +25,15 @@ from jaxtyping import Array, Float, Int
 
 from .._common.lookup import refuse_unknown
 from .._kane.contact.forces import has_contacts
-from .._kane.contact.impulses import REDUNDANT, Impact, Permanent, after_impact, inverse_root
+from .._kane.contact.impulses import REDUNDANT, Impact, Permanent, impact_at, inverse_root
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import Tracer
-from .._scalarjit.components import Component, as_vector, component, stack
+from .._scalarjit.components import Component, as_vector, component, is_written_out, stack
 from .._scalarjit.nan import nan_if_not_zero
 from .._scalarjit.scalar_function import ScalarFunction
 from .._system.parameters import wrapped
-from .._system.system import NamedVector, State, System, call_with_states, unpacked
-from .events import Events, crossings, events_of
+from .._system.system import State, System, unpacked
+from .events import Events, StageKind, called, crossings, events_of, first_impact
 
 
 class JumpTable(eqx.Module):
@@ -78,41 +79,104 @@ class JumpTable(eqx.Module):
         return self.names[event]
 
 
-@ScalarFunction
-def state_after(system: System, t: Component, y: Array, event: Array, which: StagesOf) -> Array:
-    """The packed state after the jump of an event, from the state before it.
+class StagesOf(eqx.Module):
+    """The part of `Events` that `after_jump` uses: the names, and the stages of the system's own events."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    stages: tuple[tuple[StageKind, ...], ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, events: Events, only: int | None = None) -> StagesOf:
+        """The stages of all events, or of one."""
+        numbered = enumerate(zip(events.stages, events.contacts or [None] * len(events.names), strict=True))
+        stages = [own if contact is None and only in (None, i) else () for i, (own, contact) in numbered]
+        return cls(events.names, tuple(stages))
+
+    def together(self, stage: int) -> dict[StageKind, list[int]]:
+        """The events that have this stage, by what it does: those with the same key are solved together."""
+        kinds = [(i, kinds[stage]) for i, kinds in enumerate(self.stages) if len(kinds) > stage]
+        keys = {i: kind and kind._replace(size=0) for i, kind in kinds}
+        return {key: [i for i in keys if keys[i] == key] for key in keys.values()}
+
+
+class _StageOf(eqx.Module):
+    """One stage of the `events` with these numbers. Called, it is their impact, with the residuals of the one that
+    happens. The equations of motion are then evaluated only once.
+
+    - `x`: first-order states. `event`: the number of the event that happens, as a float.
+    """
+
+    x: Array | None
+    event: Array
+    which: StagesOf
+    stage: int = eqx.field(static=True)
+    events: tuple[int, ...] = eqx.field(static=True)
+
+    def thens(self, system: System, t: Component, q: Sequence[Component], u_all: Sequence[Component]) -> list[Any]:
+        """What the stage of each event does."""
+        x = () if self.x is None else tuple(self.x)
+        found = crossings(system, t, q, u_all, x, self.event.dtype)
+        stages = [found[self.which.names[i]].stages[self.stage] for i in self.events]
+        return [called(system, then, t, q, u_all, x) for then in stages]
+
+    def __call__(self, system: System, t: Component, q: Sequence[Component], u_all: Sequence[Component]) -> Impact:
+        impacts = self.thens(system, t, q, u_all)
+        width = max(len(impact.residuals) for impact in impacts)
+        values: list[Array] = []
+        for i, impact in zip(self.events, impacts, strict=True):
+            rows = [row + (0.0,) * (width - len(row)) for row in (impact.residuals, impact.restitution)]
+            own = jnp.stack([as_vector(row, self.event) for row in rows])
+            values.append(jnp.where(self.event == i, own, values[-1]) if values else own)
+        return Impact(list(values[-1][0]), restitution=list(values[-1][1]), release=impacts[0].release)
+
+
+def after_jump(system: System, t: Component, y: Array, event: Array, which: StagesOf) -> tuple[Array, Array]:
+    """The packed state after all stages of an event, and the impulses (r,) of its first impact, NaN beyond the number
+    of its residuals.
 
     **Arguments:**
 
-    - `t`: time [s]. `y`: packed state. `event`: the number of the event, as a float.
-    - `which`: an object whose structure is the numbers of stages, by event (see `stages_of`).
+    - `t`: time [s]. `y`: packed state before the jump. `event`: the number of the event, as a float.
+    - `which`: the stages of all events.
     """
-    after = y
-    for i in range(len(which.names)):
-        if which.stages[i]:
-            after = jnp.where(event == i, after_stages(system, t, y, i, which)[0], after)
-    return after
+    f = after_jump_written_out if is_written_out(len(system.speeds)) else _after_jump
+    return f(system, t, y, event, which)
+
+
+def _after_jump(system: System, t: Any, y: Array, event: Array, which: StagesOf) -> tuple[Array, Array]:
+    n_q, n = len(system.coordinates), len(system.speeds)
+    impulses = jnp.full(max(first_impact(kinds)[1] for kinds in which.stages), jnp.nan, y.dtype)
+    for stage in range(max(map(len, which.stages))):
+        state, after = unpacked(system, y), y
+        for kind, events in which.together(stage).items():
+            read = _StageOf(state.x, event, which, stage, tuple(events))
+            if kind is None:
+                new = _replaced(system, t, y, read)
+            else:
+                result = impact_at(system, t, state.q, state.u, {}, read).result
+                new = jnp.concatenate([y[:n_q], result.u.astype(y.dtype), y[n_q + n :]])
+                for i in events:
+                    first, size = first_impact(which.stages[i])
+                    if first == stage:
+                        own = jnp.concatenate([result.impulses[:size].astype(y.dtype), impulses[size:]])
+                        impulses = jnp.where(event == i, own, impulses)
+            happens = functools.reduce(jnp.logical_or, [event == i for i in events])
+            after = jnp.where(happens, new, after)
+        y = after
+    return y, impulses
+
+
+after_jump_written_out = ScalarFunction(_after_jump)
 
 
 @ScalarFunction
-def impulses_at(system: System, t: Component, y: Array, event: Array, which: StagesOf) -> Array:
-    """The impulses (r,) of the first impact among the stages of an event. Arguments as `state_after`."""
-    rows = {i: after_stages(system, t, y, i, which)[1] for i in range(len(which.names)) if which.stages[i]}
-    width = max(len(row) for row in rows.values())
-    impulses = jnp.full((width,), jnp.nan, y.dtype)
-    for i, row in rows.items():
-        padded = as_vector([*row, *[jnp.full((), jnp.nan, y.dtype)] * (width - len(row))], y)
-        impulses = jnp.where(event == i, padded, impulses)
-    return impulses
-
-
-def after_stages(system: System, t: Component, y: Array, event: int, which: StagesOf) -> tuple[Array, Sequence[Array]]:
-    """The packed state after all stages of an event, and the impulses of its first impact."""
-    impulses: Sequence[Array] = ()
-    for stage in range(which.stages[event]):
-        y, more = _after_stage(system, t, y, which.names[event], stage)
-        impulses = impulses or more
-    return y, impulses
+def _replaced(system: System, t: Component, y: Array, read: _StageOf) -> Array:
+    """The packed state with the new values of the event that happens."""
+    state, after = unpacked(system, y), y
+    kane = KaneEquations(system, t, state.q, state.u)
+    for i, then in zip(read.events, read.thens(system, kane.t, kane.q, kane.u_all), strict=True):
+        after = jnp.where(read.event == i, _with_values(system, t, y, read.which.names[i], then), after)
+    return after
 
 
 def names_of_jumps(system: System) -> tuple[str, ...]:
@@ -143,45 +207,9 @@ def warn_of_jumps(system: System, label: str) -> None:
         )
 
 
-class StagesOf(eqx.Module):
-    """The static part of `Events` that `state_after` uses."""
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    stages: tuple[int, ...] = eqx.field(static=True)
-
-
-def stages_of(events: Events) -> StagesOf:
-    contacts = events.contacts or (None,) * len(events.names)
-    stages = [0 if contact else n for n, contact in zip(events.stages, contacts, strict=True)]
-    return StagesOf(events.names, tuple(stages))
-
-
-def _after_stage(system: System, t: Component, y: Array, name: str, stage: int) -> tuple[Array, Sequence[Array]]:
-    state = unpacked(system, y)
-    x = () if state.x is None else tuple(state.x)
-    kane = KaneEquations(system, t, state.q, state.u)
-
-    def then_at(t: Component, q: Sequence[Component], u_all: Sequence[Component]) -> Any:
-        then = crossings(system, t, q, u_all, x, y.dtype)[name].stages[stage]
-        if callable(then):
-            u_names = (*system.speeds, *system.dependent_speeds)
-            named = NamedVector(q, system.coordinates), NamedVector(u_all, u_names)
-            then = call_with_states(then, t, *named, NamedVector(x, system.states))
-        return then
-
-    then = then_at(kane.t, kane.q, kane.u_all)
-    if isinstance(then, Impact):
-        result = after_impact(kane, then_at).result
-        n_q = len(system.coordinates)
-        after = jnp.concatenate([y[:n_q], result.u.astype(y.dtype), y[n_q + len(system.speeds) :]])
-        return after, list(result.impulses)
-    if not isinstance(then, Mapping):
-        raise TypeError(
-            f"{type(system).__name__}.events: `then` of {name!r} must be a dict of new values by name, a "
-            f"jaxkane.Impact, a function that returns one of both, or a tuple of these; got {then!r}."
-        )
+def _with_values(system: System, t: Component, y: Array, event: str, then: Mapping[str, Component]) -> Array:
     names = (*system.coordinates, *system.speeds, *system.states)
-    label = f"{type(system).__name__}.events: `then` of {name!r}"
+    label = f"{type(system).__name__}.events: `then` of {event!r}"
     refuse_unknown(then, names, f"{label}: not a coordinate, an independent speed or a first-order state:")
     new = []
     for i, key in enumerate(names):
@@ -190,7 +218,7 @@ def _after_stage(system: System, t: Component, y: Array, name: str, stage: int) 
         except TypeError as error:
             raise TypeError(f"{label}: the new value of {key!r} must be one number, got {then[key]!r}.") from error
     after = jnp.concatenate([as_vector(new, y), y[len(names) :]])
-    return _onto_constraints(system, t, after, [key for key in system.speeds if key not in then]), ()
+    return _onto_constraints(system, t, after, [key for key in system.speeds if key not in then])
 
 
 def _onto_constraints(system: System, t: Component, y: Array, names: Sequence[str]) -> Array:

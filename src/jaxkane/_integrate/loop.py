@@ -35,8 +35,8 @@ class Jump(NamedTuple):
     """A jump of the state; or all jumps of a simulation, with a leading axis of at most `max_jumps`.
 
     Fields: the time `t` since the start [s], the `event` as a float, the packed states `before` and `after`, whether
-    all of this is a `smooth` function of the arguments, the `impulses` (r,) of contacts, and the `status`: 0 if the
-    jump is possible. The table of all jumps has no status.
+    all of this is a `smooth` function of the arguments, the `impulses` (r,) of the contacts or of the event, and the
+    `status`: 0 if the jump is possible. The table of all jumps has no status.
     """
 
     t: Array
@@ -158,9 +158,9 @@ def fast_loop(
     restart = controller.discontinuities is not None and controller.discontinuities.restart
     table = None
     if jumps is not None:
-        layout, times = controller.events.layout, jnp.zeros(jumps[1], y0.dtype)
-        states, n_impulses = jnp.zeros((jumps[1], *y0.shape), y0.dtype), len(layout.names) * (1 + layout.d)
-        table = Jump(times, times, states, states, times, jnp.zeros((jumps[1], n_impulses), y0.dtype), None)
+        times = jnp.zeros(jumps[1], y0.dtype)
+        states, impulses = (jnp.zeros((jumps[1], n), y0.dtype) for n in (*y0.shape, controller.events.n_impulses))
+        table = Jump(times, times, states, states, times, impulses, None)
     carry = Carry(
         start, end, begin, jnp.zeros_like(y0) if needs_rates else None, solver.init(term, start, end, begin, args),
         state, jnp.array(False) if restart else None, may_begin, jnp.zeros(2, int),

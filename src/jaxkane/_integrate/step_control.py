@@ -422,7 +422,7 @@ def _at_events(
     status = jnp.where(fails & ~is_lawful, float(Status.INVALID_COEFFICIENT), status)
     happens, jumps = at_end | at_start, jnp.zeros_like(kept)
     for i, stages in enumerate(events.stages):
-        jumps |= happens & (event == i) & (stages > 0)
+        jumps |= happens & (event == i) & (len(stages) > 0)
     repeats = jumps & at_start & (event == before.last_jump)
     status = jnp.where(repeats, float(Status.REPEATED_JUMP), status)
     end = end.with_sides(events, start, jumps, resolution)

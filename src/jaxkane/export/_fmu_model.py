@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from .._integrate.events import Events, event_values, own_events_of
 from .._integrate.inputs import Coordinates, Speeds
-from .._integrate.jumps import after_stages, stages_of
+from .._integrate.jumps import StagesOf, after_jump
 from .._kane.api import dependent_speeds
 from .._kane.expression_graph import Formulas, Function
 from .._kane.right_hand_side import output_names, outputs_at
@@ -129,7 +129,7 @@ class FMUModel(CText):
                 self.events = events._replace(
                     names=(*events.names, "singular speeds"),
                     directions=(*events.directions, 0),
-                    stages=(*events.stages, 0),
+                    stages=(*events.stages, ()),
                     conditions=(*events.conditions, None),
                 )
             else:  # it is constant
@@ -274,7 +274,6 @@ class FMUModel(CText):
 
 def _functions_of(system: System, events: Events, outputs: Sequence[str]) -> dict[str, Function]:
     """The functions that an FMU needs, by name. Events without a function do not exist."""
-    which = stages_of(events)
 
     def sensed(system: System, t: Array, q: Coordinates, u: Speeds, w: dict[str, Array], _: Array):
         values = outputs_at(system, t, q, u, w) if outputs else {}
@@ -284,7 +283,8 @@ def _functions_of(system: System, events: Events, outputs: Sequence[str]) -> dic
     def after(
         event: int, system: System, t: Array, q: Coordinates, u: Speeds, w: dict[str, Array], _: Array
     ) -> tuple[Any, ...]:
-        return (after_stages(system, t, _packed(system, q, u, w), event, which)[0],)
+        y = _packed(system, q, u, w)
+        return (after_jump(system, t, y, jnp.asarray(event, y.dtype), StagesOf.of(events, only=event))[0],)
 
     functions = {"motion": Function(("rate",), all_rates)}
     if outputs or system.dependent_speeds:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._integrate.events import Status, event_values, events_of, own_events_of
 from .._integrate.inputs import Samples, Signals, as_signals, inputs_at, samples_of
-from .._integrate.jumps import stages_of, state_after
+from .._integrate.jumps import StagesOf, after_jump, after_jump_written_out
 from .._integrate.simulate import simulate
 from .._integrate.trajectory import Trajectory
 from .._kane.arguments import is_concrete
@@ -28,7 +28,7 @@ from .._kane.kanes_method import KaneEquations
 from .._kane.right_hand_side import reads_time, values_of, vector_field
 from .._scalarjit.cache_key import captures_any, jit
 from .._scalarjit.compat import concretely, depends_on
-from .._scalarjit.components import Component, as_vector
+from .._scalarjit.components import Component, as_vector, is_written_out
 from .._system.system import NamedVector, System, call_with_states, packed_motion, unpacked, with_class
 from ._steady import cyclic_coordinates
 
@@ -176,7 +176,7 @@ class OrbitEquations(eqx.Module):
         # A simulation that ends elsewhere must not be passed to the jump: its derivatives could be NaN.
         ok = ride.status == Status.EVENT + ride.events.index(self.section)
         before, t_end = jnp.where(ok, packed_motion(ride.end), y), jnp.where(ok, ride.t_end, t)
-        after = state_after(args.system, t_end, before, jnp.asarray(place, y.dtype), stages_of(events))
+        after, _ = after_jump(args.system, t_end, before, jnp.asarray(place, y.dtype), StagesOf.of(events))
         return jnp.where(ok, after, jnp.nan), jnp.where(ok, t_end - t, jnp.nan)
 
     def flow(self, args: OrbitArguments, y: Array, t: Array, duration: Array) -> Array:
@@ -431,8 +431,8 @@ def _used_quantities(system: System, inputs: Signals, t: Array, y: Array) -> tup
     if events.names:
         at = event_values(system, t, y, jnp.zeros_like(y))
         found += [at.values, at.conditions]
-    for i in np.flatnonzero(events.stages):
-        after = state_after(system, t, y, jnp.asarray(i, y.dtype), stages_of(events))
+    for i in np.flatnonzero([len(stages) for stages in events.stages]):
+        after, _ = after_jump(system, t, y, jnp.asarray(i, y.dtype), StagesOf.of(events))
         found, of_coordinates = [*found, after[n_q:]], [*of_coordinates, after[:n_q]]
     if has_contacts(system):
         terms = terms_at(system, t, state.q, state.u, values_of(system, state.x, values))
@@ -444,9 +444,11 @@ def uses_time(system: System, inputs: Signals, y: Array) -> tuple[bool, bool]:
     """Whether the rates and inputs use the time, and whether events, jumps and contacts do."""
     t, state = jnp.zeros((), y.dtype), unpacked(system, y)
     program = jax.make_jaxpr(lambda t: [*inputs_at(system, inputs, t, state).values()])(t)
-    events, which = events_of(system, t, state), stages_of(own_events_of(system, t, state))
-    jumps = state_after.program(system, t, y, t, which)[1] if any(which.stages) else None
-    of_jumps = jumps is not None and jumps.reads[len(jax.tree.leaves(system))]
+    events, which = events_of(system, t, state), StagesOf.of(own_events_of(system, t, state))
+    of_jumps = any(which.stages)
+    if of_jumps and is_written_out(len(system.speeds)):
+        jumps = after_jump_written_out.program(system, t, y, t, which)[1]
+        of_jumps = jumps is None or jumps.reads[len(jax.tree.leaves(system))]
     return reads_time(system, y.dtype) or any(depends_on(program, [0])), events.read_time or of_jumps
 
 

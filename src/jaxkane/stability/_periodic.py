@@ -324,7 +324,7 @@ def _jumps_at(name: str, system: System, section: str | None, y: Array) -> bool:
             f"{name}: the event {section!r} has no direction, so an orbit would cross it twice. Return "
             "jaxkane.rising(...) or jaxkane.falling(...)."
         )
-    return bool(events.stages[place] > 0)
+    return len(events.stages[place]) > 0
 
 
 def _refuse_equilibrium(name: str, equations: OrbitEquations, args: OrbitArguments, y: Array) -> None:
