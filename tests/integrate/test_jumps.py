@@ -435,7 +435,8 @@ class Masses(jk.System):
     def events(self, t, q, u):
         stops = {f"stop{i:02}": jk.rising(q[i] - 1.0, then=jk.Impact(u[i], restitution=0.5)) for i in range(2, 14)}
         both = jk.Impact(u[0] - u[1], u[1], restitution=(1.0, 0.0))
-        return {**stops, "both": jk.rising(q[0] - 1.0, then=(both, {"x0": 0.0})), "back": jk.rising(q[1] - 1.0, then={"v1": -u[1]})}
+        first = {"both": jk.rising(q[0] - 1.0, then=(both, {"x0": 0.0}))}
+        return {**stops, **first, "back": jk.rising(q[1] - 1.0, then={"v1": -u[1]})}
 
 
 @pytest.mark.slow
