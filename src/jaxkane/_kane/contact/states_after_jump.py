@@ -425,8 +425,10 @@ def _changed(
             kept = jax.lax.stop_gradient(jnp.where(is_sliding, jnp.stack([first_slow, error], axis=1), 0.0))
     new = ContactMemory(states, directions, kept)
     u = projected_speeds(layout, after, new, second.u)
-    # Gaps of closed contacts drift by the error of the solver.
-    touching = first.takes_part & (event.touches | first.near | first.closed) & ~event.is_start
+    # Gaps of closed contacts drift by the error of the solver. This is corrected where another contact closes: if a slip
+    # began at other coordinates, the friction would not be at its limit, and the slip would end at once.
+    closes = first.takes_part & (event.touches | first.near)
+    touching = (closes | (first.takes_part & first.closed & jnp.any(closes))) & ~event.is_start
     q = without_gaps(after, touching, state.q)
     rest = y[len(q) + len(u) : y.size - layout.memory_size]
     y = jnp.concatenate([q, u, rest, new.packed()])
