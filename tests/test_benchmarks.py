@@ -1,4 +1,4 @@
-"""The suite of benchmarks without peers: the chain is right, what is absent is named, the table says what was met."""
+"""The benchmarks without other programs: the chain, the names of missing packages, and the table of figures."""
 
 import importlib.util
 import os

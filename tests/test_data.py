@@ -1,4 +1,4 @@
-"""The measured machines that are shipped: whole, in the units that are said, with their licences, and small."""
+"""The measured data sets are complete and small, have the stated units, and contain their licences."""
 
 import csv
 import gzip

@@ -1,4 +1,4 @@
-"""What the pages say can be typed in as it stands."""
+"""The mechanisms of `docs/constraints.md` satisfy the power balance."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What is easily done wrong, and used to be computed in silence or refused in words of Python and JAX."""
+"""Common mistakes raise errors of this library, instead of wrong results or errors of Python and JAX."""
 
 import functools
 import inspect

@@ -1,4 +1,4 @@
-"""What is published: one version everywhere, types, a citation, floors that are said, and every Python that we name."""
+"""The package: one version everywhere, types, citation, lower bounds of requirements, and supported Python versions."""
 
 import importlib.metadata
 import re

@@ -1,4 +1,4 @@
-"""The documentation's pages can be typed in as they stand, one after the other, and lead somewhere."""
+"""The code of the pages of the documentation runs in order, and their links are valid."""
 
 import importlib.util
 import logging

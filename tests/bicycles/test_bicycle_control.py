@@ -1,4 +1,4 @@
-"""Steering, drive and control of bicycles: against formulas, models put together by hand, and known limits."""
+"""Steering, drive and control of bicycles, compared with formulas, models assembled by hand, and known limits."""
 
 import dataclasses
 import pickle
@@ -134,7 +134,7 @@ def test_constant_speed_outputs_the_torque_that_balances_drag():
 
 
 def test_commanded_torques_are_outputs():
-    """With what came from outside, and what each part has added: exactly."""
+    """The applied torque is the sum of the input torque and the torques of all parts."""
     bicycle = BENCHMARK.with_parts(control=LeanSteerGains(roll=2.0), steering=SteeringMotor(limit=1e9))
     leaning = jk.assemble(bicycle, {"roll": 0.5}, {"rear_wheel_rate": -10.0})
     found = jk.outputs(bicycle, 0.0, leaning.q, leaning.u, {"steer_torque": 4.0, "steer_command": 3.0})

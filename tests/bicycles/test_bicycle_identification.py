@@ -1,4 +1,4 @@
-"""A leaning rider and the relaxation length of the tyres are found from controlled rides with noise."""
+"""Parameters of a leaning rider and of tyres are estimated from noisy simulations with control."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,7 +41,7 @@ def simulated(seed):
 
 @pytest.mark.weekly
 def test_rider_and_relaxation_length_are_identified_within_standard_errors():
-    """Two rides, as a sensor of the torque saw them: without the balance. The guess is 20 % off."""
+    """The input is the measured total torque, so the fitted model has no controller. The guess is 20 % off."""
     rides = [simulated(seed) for seed in (1, 2)]
     for seed in range(3):  # by one program
         rng, trials = np.random.default_rng(seed), []

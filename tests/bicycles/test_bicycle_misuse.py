@@ -1,4 +1,4 @@
-"""Bicycles and parts that are written or put together wrongly: each is refused by an error that says what to do."""
+"""Faulty bicycles and parts, and wrong combinations of parts, raise errors that state the remedy."""
 
 import dataclasses
 

@@ -163,7 +163,7 @@ def test_linear_models_along_a_road_raise_with_advice():
 
 @pytest.mark.weekly
 def test_linear_models_raise_if_straight_riding_is_not_steady():
-    """What to do is said; NaN only where a family was given."""
+    """The result is NaN instead if the caller passes a family of states."""
     across = Bicycle.benchmark().with_parts(road=Slope(0.1, towards=0.5 * np.pi))
     with pytest.raises(ValueError, match="no steady motion"):
         eigenvalues(across, 5.0)
@@ -311,7 +311,7 @@ def with_load_transfer(lag, **more):
 
 @pytest.mark.weekly
 def test_tyre_loads_equal_the_constraint_forces_during_braking():
-    """1e-10: the transfer stands still at what the moments about the rear contact give.
+    """1e-10: the load transfer is in equilibrium at the load that the moments about the rear contact require.
 
     N w = sum of m g x - a (sum of m h + IRyy / rR + IFyy / rF), with the acceleration a forwards.
     """
@@ -336,7 +336,7 @@ def test_tyre_loads_equal_the_constraint_forces_during_braking():
 @pytest.mark.slow_cases(all_but=["law2"])
 @pytest.mark.parametrize("law", [LateralSlip(9000.0), MagicFormula(12.0), LongitudinalSlip(2e4)])
 def test_the_tyre_force_opposes_the_slip(law):
-    """Less than the friction that it has, nothing without slip or load, with a slope everywhere, at rest too."""
+    """The force is within the friction limit and zero without slip or load. It has finite derivatives, also at rest."""
 
     def force(velocity, speed, load=400.0):
         return law.force(law.slip(velocity, speed, 0.0, None), load, 0.0)
@@ -392,7 +392,7 @@ def test_forces_of_a_measured_tyre_agree_with_its_formula(pressure):
 
 @pytest.mark.slow
 def test_a_measured_tyre_outside_its_range_of_validity():
-    """Held past the largest slip angle, nothing where the wheel would lift, NaN with NaN slopes above its load."""
+    """The force is constant at larger slip angles, zero for a negative load, and NaN above the largest load."""
     law = schwalbe_energizer(400e3, offsets=True)
     ends = [law.force(np.tan(np.deg2rad(angle)), 400.0, 0.1) for angle in (10.0, 60.0)]
     np.testing.assert_allclose(ends[1], ends[0], rtol=1e-12)

@@ -1,4 +1,4 @@
-"""Bicycles put together from parts: against the catalogue's bicycle and known limits."""
+"""Bicycles assembled from parts, compared with the catalogue's bicycle and known limits."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -59,7 +59,7 @@ FUNCTIONS = {f.__name__: f for f in (equations, forces, kinematics, modes)}
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("f", FUNCTIONS)
 def test_derivatives_in_three_modes_agree_with_differences(name, f):
-    """Along one direction of parameters, state and inputs, of one weighted sum of all that a function gives."""
+    """The derivative of a weighted sum of all results, along one direction of parameters, state and inputs."""
     rtol = 1e-6
     system, q, u = SYSTEMS[name]()
     inputs = {k: jnp.array(0.5 + i) for i, k in enumerate(system.inputs)}

@@ -52,7 +52,7 @@ def numbers(vectors):
 
 @pytest.mark.parametrize("name", CATALOG)
 def test_every_entry_can_be_extended_by_inheritance(name):
-    """The parts that were there are those of the entry itself, at the same coordinates and speeds: read by name."""
+    """The original bodies, rates and constraints equal those of the entry at the same coordinates and speeds."""
     entry, rng = CATALOG[name], np.random.default_rng(0)
     system = entry.example()
     kind = type(system)

@@ -1,4 +1,4 @@
-"""MJCF and URDF files brought over, held to MuJoCo's own accelerations. Without MuJoCo they are skipped."""
+"""Imported MJCF and URDF files, compared with the accelerations of MuJoCo. Without MuJoCo, the tests are skipped."""
 
 import importlib.util
 import json

@@ -1,4 +1,4 @@
-"""Lagrangians without bodies, held to the accelerations of SymPy's own mass matrix and forcing."""
+"""Lagrangians without bodies, compared with the accelerations from SymPy's mass matrix and forcing."""
 
 import dataclasses
 

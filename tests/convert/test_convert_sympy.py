@@ -1,4 +1,4 @@
-"""Models of SymPy brought over, held to SymPy's own accelerations. Without SymPy they are skipped.
+"""Imported SymPy models, compared with the accelerations of SymPy. Without SymPy, the tests are skipped.
 
 Figures: tests/data/sympy_kane_systems.json, which SymPy 1.14's KanesMethod computed; the models are those of its tests.
 """

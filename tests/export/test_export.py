@@ -1,4 +1,4 @@
-"""Exported equations, compiled, run or loaded elsewhere, give the library's numbers; what cannot be is named."""
+"""Exported equations, compiled or loaded, give the results of the library. Errors name unsupported systems."""
 
 import ctypes
 import functools

@@ -1,4 +1,4 @@
-"""How often 95 % intervals hold the truth, counted: of every kind of data those that are said to be valid for it."""
+"""The coverage of 95 % intervals for each kind of data, where the documentation states that the intervals are valid."""
 
 import dataclasses
 
@@ -327,7 +327,7 @@ def kicked():
 
 @pytest.mark.weekly
 def test_a_parameter_determined_by_one_trial_has_no_clustered_error(kicked):
-    """Left out, its estimate would stay where it is, and look exact."""
+    """Without this trial, the estimate would not change, and would seem exact."""
     found, folds = kicked, cross_validate(kicked)
     assert found.clustered_errors["other"] == np.inf
     assert np.isfinite([found.clustered_errors[name] for name in TRUTH]).all()
@@ -388,7 +388,7 @@ def test_few_trials_are_clustered_by_their_parts():
 
 
 def test_correlation_of_slow_errors_and_single_channels_is_detected():
-    """Of white residuals nothing is seen, of a slow error of 0.4 sigma and of one channel of four all that matters."""
+    """White residuals give 0. A slow error of 0.4 sigma is detected, and one correlated channel among four."""
     rng, n = np.random.default_rng(10), 400
 
     def of(noise, more=0):
@@ -407,7 +407,7 @@ def test_correlation_of_slow_errors_and_single_channels_is_detected():
 
 
 def test_degrees_of_freedom_agree_with_a_monte_carlo_simulation():
-    """Of Z / sqrt(sum w chi^2): equal clusters have as many as they are, unequal ones fewer."""
+    """Degrees of freedom of Z / sqrt(sum w chi^2): n for n equal clusters, fewer for unequal clusters."""
     rng = np.random.default_rng(11)
     for n in (1, 2, 5, 40):
         assert _freedom_of(np.full(n, 1 / n)) == pytest.approx(n, rel=1e-3)

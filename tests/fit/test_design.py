@@ -1,4 +1,4 @@
-"""Planned experiments: their errors are those of a fit of the plan, links between windows included; exact gradients."""
+"""Planned experiments: predicted errors equal those of a fit, also with linked windows, and gradients are exact."""
 
 import jax.numpy as jnp
 import numpy as np

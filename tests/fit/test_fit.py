@@ -1,4 +1,4 @@
-"""Fits of a double pendulum: exact derivatives, both optimizers, and what the data cannot tell."""
+"""Fits of a double pendulum: exact derivatives, both optimizers, and parameters that are not identifiable."""
 
 import equinox as eqx
 import jax

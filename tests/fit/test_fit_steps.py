@@ -119,7 +119,7 @@ def test_no_method_reports_convergence_if_the_optimum_cannot_be_simulated(beyond
 
 
 class Sticky(Cart):
-    """For which a hundredth of a second is long: friction that grows with the cube of the rate."""
+    """Friction grows with the cube of the rate, so the motion needs steps shorter than 0.01 s."""
 
     def loads(self, t, q, u, motion, inputs):
         friction = -300.0 * u["x_dot"] ** 3
@@ -128,7 +128,7 @@ class Sticky(Cart):
 
 @pytest.fixture(scope="module")
 def stiff():
-    """Motions that no step from sample to sample can follow, and what error control makes of a fit of them."""
+    """Guess, trials whose motion needs several steps per sample, and their fit with error control."""
     times, trials = np.arange(0.0, 2.0, 0.05), []
     for k in range(3):
         push = (3.0 + k) * np.sin(2.0 * times + k)
@@ -162,7 +162,7 @@ def test_stiff_motions_are_fitted(stiff, how):
 @pytest.mark.weekly
 @pytest.mark.many_steps
 def test_a_window_that_fails_at_the_guess_uses_the_step_of_the_others(stiff):
-    """One start is far off, so that the step finds no end there whatever it is; it is as short as those of others."""
+    """One initial state is so wrong that no step size is accurate. Its window uses the shortest step of the others."""
     guess, trials, _ = stiff
     problem = Problem.of(guess, trials, "stiffness")
     steps = np.asarray(problem.windows.step)

@@ -1,4 +1,4 @@
-"""What a model lacks is found by name, what it does not lack is not; simulated pendulums whose truth is known."""
+"""Forward selection finds the missing terms of simulated pendulums and selects no others."""
 
 import dataclasses
 import itertools
@@ -109,7 +109,7 @@ def test_dry_friction_is_selected_from_five_candidates(rubbing, found):
 
 @pytest.mark.weekly
 def test_predicted_cost_agrees_with_a_new_fit(rubbing):
-    """Beside a fit that is posed anew with one more parameter, and trials left out of it by refits."""
+    """The predictions are compared with a new fit with one more parameter, and with refits without some trials."""
     found = forward_selection(rubbing, FIVE[:3], depth=3, refits=3)
     # Beside dry friction nothing stands: the search ends by itself.
     assert found.selected == ("dry",)
@@ -166,7 +166,7 @@ def test_a_common_offset_of_known_initial_states_is_selected():
 @pytest.mark.weekly
 @pytest.mark.parametrize("hold", [(), ("torque",)], ids=["linear", "held"])
 def test_an_input_delay_is_selected(hold):
-    """By two samples of 0.05 s; of a held one the delay is found to where its mean is taken for it."""
+    """The delay is two samples of 0.05 s. With a zero-order hold, the estimate is half a sample shorter."""
     trials = record(5, late=2)
     asked = (Delay("torque"), Gain("torque"), "dry")
     found = forward_selection(fitted(trials, zero_order_hold=hold), asked, plausible={"delay of torque": (0.0, 0.3)})
@@ -190,7 +190,7 @@ class Lagging(Pendulum):
 
 @pytest.mark.weekly
 def test_a_candidate_system_with_an_additional_state_is_selected():
-    """What is not neutral anywhere is fitted; what its system begins with is not what is plausible."""
+    """No value of the lag gives the initial model, so the cost is not predicted, and the candidate is fitted."""
     trials = record(6, system=Lagging(lag=0.08))
     lag = Candidate("motor lag", system=Lagging(stiffness=3.0), free="lag", unknown="acting")
     found = forward_selection(fitted(trials), ["dry", Delay("torque"), lag], refits=3)
@@ -309,7 +309,7 @@ class Squared(Track):
 
 @pytest.mark.weekly
 def test_a_candidate_that_is_not_nested_is_compared_by_held_out_cost():
-    """Another system without one parameter more, beside what is promising, with one refit: trials left out decide."""
+    """The candidate is another system with the same number of parameters. With one refit, held-out trials decide."""
     rng, times, trials = np.random.default_rng(7), np.linspace(0.0, 3.0, 31), []
     for i in range(4):
         push = 2.0 * np.sin(2.0 * times + i)
@@ -399,7 +399,7 @@ def test_selection_does_not_depend_on_units():
 
 @pytest.mark.weekly
 def test_a_term_is_replaced():
-    """The fit has viscous friction, the cart has drag: nothing else is left of it once drag is there."""
+    """The fit has viscous friction, but the cart has drag. With drag in the model, viscous friction is removed."""
     before = loaded(carts(lambda x, v: 0.3 * v * abs(v)), ("stiffness", "damping"), damping=0.2)
     found = forward_selection(before, ["drag", "cubic"], remove="damping")
     assert (found.selected, found.removed) == (("drag",), ())  # the value of the system, 0.2, would stay
@@ -463,7 +463,7 @@ def test_trials_are_held_out_by_label():
 
 @pytest.mark.weekly
 def test_implausible_estimates_of_the_initial_model_are_reported():
-    """A negative damping makes up for an offset: it is named, and it is no reason against what is found."""
+    """A negative damping compensates an offset. It is reported, but does not prevent the selection of the offset."""
     trials = carts(lambda x, v: -0.1 * v + 0.3)
     before = loaded(trials, ("stiffness", "damping"))
     found = forward_selection(before, Offset("push"), plausible={"damping": (0.0, None)})

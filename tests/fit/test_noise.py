@@ -217,7 +217,7 @@ def test_the_smoother_is_conditioned_on_all_measurements(case):
 
 @pytest.mark.weekly
 def test_an_initial_state_without_a_standard_deviation_has_a_diffuse_prior(case):
-    """Found with the parameters, it is the mean of the smoother that began with any start, whose band is its own."""
+    """The estimated motion and its deviations are those of a smoother with a very wide prior."""
     _, y, _ = case
     options = OPTIONS | {"unknown": ("x", "x_dot")}
     problem = Problem.of(Cart(), trial_of(y), FREE, simulation=TIGHT, **options)
@@ -232,7 +232,7 @@ def test_an_initial_state_without_a_standard_deviation_has_a_diffuse_prior(case)
 
 @pytest.mark.weekly
 def test_zero_process_noise_reduces_the_fit_to_least_squares(case):
-    """A start that is found and no intensity: the same numbers as a plain fit, but for the residuals' variance."""
+    """With a free initial state, the results equal those of a plain fit, except for the residual variance."""
     _, y, _ = case
     free, options = ("stiffness", "damping"), {"unknown": ("x", "x_dot"), "simulation": TIGHT}
     plain = fit(Cart(), trial_of(y), free, optimizer=LeastSquares(rtol=1e-12), **options)
@@ -324,7 +324,7 @@ def linked(y, t, values, jump, factor=1.0):
 
 @pytest.mark.weekly
 def test_linked_windows_with_log_determinant_equal_the_kalman_filter():
-    """As short as the samples, linked by what disturbs them."""
+    """The windows are one sample interval long, and the process noise links them."""
     t, jump = np.arange(0.0, 3.0, 0.1), np.array([0.01, 0.15])
     rng, state, rows = np.random.default_rng(8), START + DEVIATION * np.random.default_rng(7).normal(size=2), []
     Phi, _ = transition(0.1, STIFFNESS, DAMPING, 0.0)
@@ -462,7 +462,7 @@ def test_a_step_longer_than_the_sample_interval_is_reported_as_too_coarse():
 
 @pytest.mark.weekly
 def test_a_measured_initial_state_has_the_uncertainty_of_its_sample():
-    """As a start of which nothing is known before, but that its sample is no measurement any more."""
+    """The first sample is the mean of the initial state, with its error. It is not used as a measurement again."""
     _, y = drawn(1)
     y["x"][0] = 0.37
     trial = trial_of(y, initial={"x_dot": 0.1})  # of x_dot the start is known

@@ -44,7 +44,7 @@ def test_matrix_times_parameters_equals_kanes_equations(name):
 
 @pytest.mark.slow_cases("XLA")
 def test_the_matrix_does_not_depend_on_unknown_parameters(kernels):
-    """Y of a guess, times the parameters of the truth, is what acts on the truth as it moves."""
+    """Y of a guess, times the true parameters, gives the forces that act on the true system."""
     tolerance = 1e-12
     truth, at = swings()
     i = (0.0, at.q[3], at.u[3], at.u_dot[3], {"torque1": at.inputs["torque1"][3]})

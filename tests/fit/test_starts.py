@@ -1,4 +1,4 @@
-"""Where windows start: what a trial does not say of coordinates follows from the constraints, as for `assemble`."""
+"""Initial states of windows: coordinates that a trial omits follow from the constraints, as for `assemble`."""
 
 import equinox as eqx
 import jax

@@ -1,4 +1,4 @@
-"""Trials and problems: what they are made from, how trials are cut into windows, and invalid data, refused by name."""
+"""Trials and problems: their arguments, windows of trials, and error messages that name invalid data."""
 
 import io
 

@@ -156,7 +156,7 @@ def test_a_fit_continues_without_a_trial_that_cannot_be_simulated(falling, tmp_p
 
 @pytest.mark.weekly
 def test_growing_horizons_exclude_no_trial_with_or_without_a_checkpoint(falling, tmp_path):
-    """By them the fit comes to parameters that simulate all, from a guess that simulates none."""
+    """The initial guess simulates no trial to its end. With growing horizons, the fit reaches parameters that do."""
     guess = Falling(drift=30.0)
     with pytest.raises(ValueError, match="3 of 3 windows"):
         fit(guess, NEAR, FREE, simulation=STEP, checkpoint=tmp_path / "none.npz")
@@ -193,7 +193,7 @@ def test_the_held_out_score_is_independent_of_the_initial_guess():
 
 @pytest.mark.weekly
 def test_reported_initial_states_equal_those_of_the_trajectory():
-    """With a gain and an offset of what is known of the starts."""
+    """The given initial states have a gain and an offset."""
     trial = TRIAL.with_initial_state({"x": 0.5, "x_dot": 0.2})
     free = (Gain("x_dot", of="start"), Offset("x", of="start", prior=(0.3, 0.05)))
     found = fit(Track(), trial, free, unknown={"x": 0.1}, simulation=STEP, optimizer=LeastSquares())
@@ -221,7 +221,7 @@ def test_a_note_reports_a_fixed_initial_state_that_is_noisy():
 
 @pytest.mark.slow
 def test_validation_of_a_system_with_given_parameter_values():
-    """Of a system as of a fit with the same values: nothing but the starts is estimated."""
+    """A system and a fit with the same values give the same result. Only the initial states are estimated."""
     posed = {"unknown": ("x", "x_dot"), "simulation": STEP}
     found = fit(Track(), NEAR[:2], FREE, optimizer=LeastSquares(), **posed)
     assert validate(found, NEAR[:2]).cost == pytest.approx(found.cost, rel=1e-9)

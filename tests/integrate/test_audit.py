@@ -1,4 +1,4 @@
-"""The audit: energy balance of every entry, its honesty about quadrature, and what it says of what went wrong."""
+"""The audit: energy balance of every entry, its quadrature error, and its reports of faults."""
 
 import dataclasses
 

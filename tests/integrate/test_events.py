@@ -1,4 +1,4 @@
-"""The instant at which a motion ends: exact times, directions, derivatives, batches, and what does not end it."""
+"""Events that end a simulation: exact times, directions, derivatives, batches, and cases without an end."""
 
 import itertools
 import re
@@ -114,7 +114,7 @@ def test_second_derivatives_along_several_directions():
 
 @pytest.mark.slow
 def test_an_event_that_is_zero_at_the_start():
-    """Thrown up from the ground it comes back; resting on it, or thrown down, it has passed it at once."""
+    """A particle that is thrown up returns later. If it is at rest or is thrown down, the event occurs at the start."""
     ride = dropped(0.0, 3.0)
     assert ride.reason == "ground"
     np.testing.assert_allclose(ride.t_end, 6.0 / 9.81, atol=1e-9)
@@ -158,7 +158,7 @@ class Suction(Particle):
 
 @pytest.mark.weekly
 def test_non_finite_trial_steps_are_rejected_without_nan_in_derivatives():
-    """Steps that ended under the ground are thrown away, and leave no NaN in a derivative in either mode."""
+    """Trial steps that end under the ground are rejected and leave no NaN in derivatives in either mode."""
 
     def read(v, adjoint):
         ride = dropped(1.0, v[0], Suction(), adjoint=adjoint, rtol=1e-10, atol=1e-10)
@@ -207,7 +207,7 @@ def test_outputs_after_an_early_end_are_nan():
 
 @pytest.mark.weekly
 def test_other_end_times_have_nan_derivatives():
-    """`max_steps` is no smooth end: its time has a derivative that is NaN, and so has what was not reached."""
+    """The end time by `max_steps` is not a smooth function, so its derivative is NaN, as is that of missing samples."""
 
     def few(v, adjoint):
         ride = dropped(100.0, v, Particle(ends="none"), max_steps=3, adjoint=adjoint)
@@ -225,7 +225,7 @@ def test_other_end_times_have_nan_derivatives():
     ("ends", "height", "options"), [("root", 0.21, {"step": 0.07}), ("lost", 0.2, {})], ids=["fixed", "adaptive"]
 )
 def test_an_event_function_that_becomes_nan(ends, height, options):
-    """It is found beside where it is none; if it becomes none before it vanishes, nobody can say what follows."""
+    """A zero near the NaN values is found. If the function becomes NaN before its zero, the simulation ends there."""
     ride = dropped(1.0, 0.0, Particle(ends=ends), **options)
     assert ride.reason == {"root": "low", "lost": "step too small"}[ends]
     np.testing.assert_allclose(ride.t_end, np.sqrt(2 * (1.0 - height) / 9.81), atol=1e-8)

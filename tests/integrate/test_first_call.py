@@ -37,7 +37,7 @@ def test_system_methods_are_called_at_most_three_times():
 
 
 def test_assemble_compiles_nothing():
-    """What is asked a few times, by the check and by Newton's method, is answered by NumPy."""
+    """The check and Newton's method evaluate the system a few times only, so NumPy is used."""
     system = type("Another", (OnACircle,), {})()
     compiled.clear()
     state = jk.assemble(system, {"x": 0.3, "y": -0.9}, {"x_dot": 0.1})

@@ -116,7 +116,7 @@ def test_a_fall_and_singular_speeds_end_a_bicycle_simulation():
     ids=str,
 )
 def test_every_adjoint_against_differences(adjoint, mode):
-    """Of a pendulum's length, start and torque, in four steps. The trajectory says how it was done."""
+    """Derivatives by length, start and torque of a pendulum, in four steps. The trajectory states its adjoint."""
 
     def read(x, _):
         torque = {"torque": x[2] * TS[:3]}
@@ -200,7 +200,7 @@ def test_a_simulation_can_be_resumed_from_its_end():
 
 @pytest.mark.weekly
 def test_invalid_times_and_samples_give_status_invalid_under_jit():
-    """Where no check sees the numbers."""
+    """Under a trace, no check can read the values."""
 
     @jax.jit
     @jax.vmap
@@ -270,7 +270,7 @@ class Pendulum(jk.System):
 
 @pytest.mark.slow
 def test_a_simulation_that_ends_at_an_inner_input_sample():
-    """The last step ended a rounding error before that sample, which then was never reached: NaN, and "completed"."""
+    """The last step once ended a rounding error before this sample. The sample was NaN, but the status "completed"."""
     ts, start = jnp.linspace(0.0, 2.5, 51), jk.State(jnp.array([0.1]), jnp.zeros(1))
     torque = {"torque": jk.Samples(ts, 3.0 * jnp.sin(2.0 * ts))}
     whole = jk.simulate(Pendulum(), start, ts, inputs=torque)

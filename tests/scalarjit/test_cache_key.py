@@ -362,7 +362,7 @@ def test_a_traced_value_captured_by_a_system_is_rejected(method):
 
 @pytest.mark.slow
 def test_tracers_stored_by_an_earlier_trace_are_not_captured_values():
-    """What an earlier trace left behind is nobody's."""
+    """A tracer of an earlier trace in a closure is ignored."""
     kept = []
 
     class Keeping(Still):
@@ -455,7 +455,7 @@ def test_programs_do_not_keep_systems_and_their_arrays_alive():
 
 
 def test_every_compiled_function_detects_changes():
-    """One at module level that is compiled by itself would keep what was read when it was traced."""
+    """A function that is compiled at module level by plain JAX would keep the values that it read while tracing."""
     source = Path(jk.__file__).parent
     wrong = r"^@(eqx\.filter_jit|jax\.jit)\s+def (\w+)"
     found = {m[2] for path in source.rglob("*.py") for m in re.finditer(wrong, path.read_text(), re.MULTILINE)}

@@ -179,7 +179,7 @@ def singular_equations(a, z, x, r):
 
 @pytest.mark.slow
 def test_a_derivative_takes_one_and_a_half_times_the_operations_of_the_rates():
-    """Of the bicycle, beside its rates; it was 2.1 times as long as the solution was differentiated."""
+    """For the bicycle. The factor was 2.1 when the solution algorithm itself was differentiated."""
     bicycle = catalog.WhippleBicycle.benchmark()
     y = jnp.zeros(len(bicycle.coordinates) + len(bicycle.speeds))
     _, program = _vector_field.program(bicycle, jnp.zeros(()), y, {})

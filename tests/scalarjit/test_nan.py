@@ -1,4 +1,4 @@
-"""What is missing is NaN with its derivatives of every order; who does not read it never meets it."""
+"""Missing values and all their derivatives are NaN. They do not affect results that do not use them."""
 
 import itertools
 

@@ -71,7 +71,7 @@ def sprung(system, spring):
 
 
 def softest(length, damper=1.0):
-    """The spring from which on it hangs still."""
+    """The critical stiffness, above which the hanging pendulum is stable."""
     system = Pushed(length=length, damper=damper)
     return critical_speeds(system, jnp.array([-20.0, -3.0, 5.0]), sprung)["mode 1"]
 
@@ -114,7 +114,7 @@ def test_an_invalid_parameter_is_not_a_way_to_become_stable():
 
 
 def test_an_unsteady_motion_gives_a_nan_linear_model_under_jit():
-    """It was the model of an instant, without a word: now NaN in its row, as it is an error alone."""
+    """In a batch, the row of an unsteady motion is NaN. A single unsteady motion raises an error."""
     tilts = jnp.array([0.0, 0.4, np.pi])
     found = eigenvalues(Pushed(), tilts, lambda system, angle: jk.State(angle[None], jnp.zeros(1)))
     np.testing.assert_array_equal(np.isnan(found.eigenvalues), [[False] * 2, [True] * 2, [False] * 2])

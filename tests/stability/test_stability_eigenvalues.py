@@ -281,7 +281,7 @@ def test_mode_names_are_correct_or_omitted(first, step):
 
 
 def test_an_ambiguous_mode_name_is_omitted_with_a_warning():
-    """From 0.22 to 12 m/s in one step two real modes become the weave; which of four cannot be told."""
+    """Between 0.22 and 12 m/s, two of four real modes become the weave. One large step does not show which."""
     speeds = jnp.repeat(jnp.array([0.22, 12.0]), jnp.array([50, 51]), total_repeat_length=101)
     with pytest.warns(UserWarning, match="the modes weave, .*capsize.* cannot be identified and are numbered"):
         found = eigenvalues(BIKE, speeds)

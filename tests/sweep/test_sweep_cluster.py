@@ -1,4 +1,4 @@
-"""A cluster's workers compute what was asked for, or say that they would not."""
+"""Workers of a cluster compute the requested results, or raise an error."""
 
 import logging
 import sys

@@ -1,4 +1,4 @@
-"""Folders of sweeps: known again by what was computed, and sound after whatever has happened to their files."""
+"""Folders of sweeps are recognized by their program and inputs, and remain valid if files are damaged."""
 
 import dataclasses
 import errno
