@@ -195,7 +195,7 @@ def coverage(programs: dict[str, Callable[[np.ndarray], Answer]], angles: np.nda
             uncertainty = 100 * np.sqrt(share * (1 - share) / sets)
             each = " ".join(f"{100 * one:.0f}" for one in hits.mean(axis=0))
             print(
-                f"{title:<20}{program:<14}{100 * hits.mean():>6.1f} ± {uncertainty:<4.1f} %   {each:<18}"
+                f"{title:<20}{program:<14}{100 * hits.mean():>6.1f} ± {uncertainty:.1f} %   {each:<18}"
                 f"{np.mean(scatter / reference):>6.2f}{np.mean(width):>8.2f}",
                 flush=True,
             )
