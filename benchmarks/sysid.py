@@ -134,7 +134,7 @@ def by_sysid(t: np.ndarray, torques: np.ndarray, known_sigma: bool = False) -> C
         sequences = sysid.ModelSequences("arm", spec, names, [rest] * len(names), control, data)
         options: dict[str, Any] = {"modify_residual": weighted} if known_sigma else {}
         residual = sysid.build_residual_fn(models_sequences=[sequences], **options)
-        # Without x_scale="jac", some of these fits take five times as many iterations to the same minimum.
+        # Without x_scale="jac", a fit took four times as long to the same minimum.
         with contextlib.redirect_stdout(io.StringIO()):
             parameters, found = sysid.optimize(parameters, residual, verbose=False, x_scale="jac")
         half = sysid.calculate_intervals(residual(found.x, parameters)[0], found.jac)[1]
