@@ -31,7 +31,7 @@ def joint(name, parent, child, origin, axis):
         <origin xyz="{origin}"/><axis xyz="{axis}"/></joint>"""
 
 
-def robot():
+def urdf():
     parts = [link("trunk", 1.2, "0.01 0 0", (0.006, 0.02, 0.025))]
     for leg, (x, y) in LEGS.items():
         names, side = [f"{leg}_{part}" for part in ("hip", "thigh", "knee")], 0.014 if y > 0 else -0.014
@@ -45,10 +45,10 @@ def robot():
             f'<link name="{leg}"/>',
             joint(f"{leg}_foot", f"{leg}_lower", leg, "0 0 -0.16", "0 0 1").replace("continuous", "fixed"),
         ]
-    return jk.convert.from_urdf(f'<robot name="robot">{"".join(parts)}</robot>', floating=True)
+    return f'<robot name="robot">{"".join(parts)}</robot>'
 
 
-ROBOT = robot()
+ROBOT = jk.convert.from_urdf(urdf(), floating=True)
 
 
 class Standing(type(ROBOT)):
@@ -85,9 +85,15 @@ def of(kind, **more):
     return kind(**{field.name: getattr(ROBOT, field.name) for field in dataclasses.fields(ROBOT)}, **more)
 
 
-def dropped(system, duration=2.0, n=2001, **options):
-    start = {**STANCE, "root_z": 0.345, "root_e4": 1.0}
-    return jk.simulate(system, jk.State(start, {}), jnp.linspace(0.0, duration, n), **options)
+LEVEL = jk.State({**STANCE, "root_z": 0.345, "root_e4": 1.0}, {})
+# Its feet slide: one that sticks starts to slip, turns the direction of its slip and sticks again.
+TILTED = jk.State(
+    {**STANCE, "root_z": 0.37, "root_e1": np.sin(0.1), "root_e4": np.cos(0.1)}, {"root_vx": 0.3, "root_vy": 0.2}
+)
+
+
+def dropped(system, duration=2.0, n=2001, start=LEVEL, **options):
+    return jk.simulate(system, start, jnp.linspace(0.0, duration, n), **options)
 
 
 @pytest.mark.slow
@@ -106,16 +112,50 @@ def test_a_quadruped_falls_on_its_feet_and_comes_to_rest():
 
 
 @pytest.mark.weekly
-def test_derivatives_of_a_quadruped_that_falls_on_its_feet():
-    def height(p):
+@pytest.mark.parametrize("start", [LEVEL, TILTED], ids=["level", "tilted"])
+def test_derivatives_of_a_quadruped_that_falls_on_its_feet(start):
+    def height(p, rtol=1e-9):
         system = of(Standing, spring=p[0], rubber=p[1]).replace({"mass.trunk": p[2]})
-        return dropped(system, 0.6, 41, rtol=1e-8, atol=1e-10)["root_z"][jnp.array([20, 40])]
+        return dropped(system, 0.6, 41, start, rtol=rtol, atol=rtol)["root_z"][jnp.array([20, 40])]
 
-    p = jnp.array([5.0, 0.7, 1.2])
-    slopes, h = jax.jacfwd(height)(p), 1e-4
+    p, h = jnp.array([5.0, 0.7, 1.2]), 1e-5
+    slopes = jax.jacfwd(height)(p)
     for i in range(3):
         step = jnp.zeros(3).at[i].set(h)
-        np.testing.assert_allclose(slopes[:, i], (height(p + step) - height(p - step)) / (2 * h), rtol=1e-5, atol=1e-9)
+        differences = (height(p + step, 1e-12) - height(p - step, 1e-12)) / (2 * h)
+        np.testing.assert_allclose(slopes[:, i], differences, rtol=1e-5, atol=2e-9)
+
+
+@pytest.mark.weekly
+def test_a_quadruped_ends_where_that_of_mujoco_ends():
+    mujoco = pytest.importorskip("mujoco")
+    radius, scene = 1e-3, mujoco.MjSpec.from_string(urdf())
+    scene.compiler.fusestatic = False
+    scene = mujoco.MjSpec.from_string(scene.to_xml())
+    scene.body("trunk").add_freejoint()
+    for joint in scene.joints:
+        if joint.name in STANCE:
+            joint.stiffness, joint.damping, joint.springref = [5.0, 0.0, 0.0], [0.2, 0.0, 0.0], STANCE[joint.name]
+    stiff = {"condim": 3, "friction": [0.7, 0.0, 0.0], "solref": [1e-4, 1.0], "solimp": [0.999, 0.9999, 1e-4, 0.5, 2.0]}
+    for leg in LEGS:
+        ball = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [radius, 0, 0], "mass": 0.0}
+        scene.body(leg).add_geom(**ball, contype=1, conaffinity=0, **stiff)
+    floor = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [5, 5, 1], "pos": [0, 0, -radius]}
+    scene.worldbody.add_geom(**floor, contype=0, conaffinity=1, **stiff)
+    scene.option.timestep, scene.option.impratio = 1e-4, 100
+    scene.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    model = scene.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:7] = [0, 0, 0.345, 1, 0, 0, 0]
+    for name, angle in STANCE.items():
+        data.joint(name).qpos = angle
+    while data.time < 3.0:
+        mujoco.mj_step(model, data)
+    ride = dropped(of(Standing), 3.0, 2)
+    np.testing.assert_allclose(data.qpos[2], ride["root_z"][-1], atol=1e-4)  # [m]
+    np.testing.assert_allclose(
+        [data.joint(name).qpos[0] for name in STANCE], [ride[name][-1] for name in STANCE], atol=1e-3
+    )
 
 
 def test_limit_of_speeds_is_named():
