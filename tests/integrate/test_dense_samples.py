@@ -62,14 +62,12 @@ def test_derivatives_by_delay_and_scale_of_samples_agree_with_the_closed_form():
     ts = np.linspace(-1.0, 2.0, n)
 
     def end(x):
-        motion = ride(ts + x[0], (1 + x[1]) * wave(ts), adjoint="forward")
-        return motion["x"][-1], motion.stats["steps"]
+        return ride(ts + x[0], (1 + x[1]) * wave(ts), adjoint="forward")["x"][-1]
 
-    slopes, steps = jax.jit(jax.jacfwd(end, has_aux=True))(jnp.zeros(2))
+    slopes = jax.jit(jax.jacfwd(end))(jnp.zeros(2))
     # By d at d = 0, of the integral of (1 - t) wave(t - d).
     by_delay = -(1 - np.cos(5)) / 5
     np.testing.assert_allclose(slopes, [by_delay, place(1.0)], atol=atol)
-    assert steps > n // 3 - 2
 
 
 @pytest.mark.slow
