@@ -203,6 +203,7 @@ class NonlinearProgram:
         self.lower, self.upper = x_bounds.lower / x_scale, x_bounds.upper / x_scale
         self.g_lower, self.g_upper = g_bounds.lower / g_scale, g_bounds.upper / g_scale
         self.is_implied = np.zeros(self.m, bool)  # constraints that follow from the others: IPOPT does not get them
+        self.places = np.zeros(self.n)  # of the variables in time, to order matrices
         self.slope = np.zeros(self.n)  # a linear part of the scaled cost
         self._blocks = list(blocks)
         sizes = [b.B * b.block.size for b in self._blocks]

@@ -332,7 +332,7 @@ def _has_negative_curvature(program: NonlinearProgram, border: np.ndarray, solut
     active = _at_bound(g, program.g_lower, program.g_upper, solution.multipliers)
     H, J = program.hessian_matrix(z, solution.multipliers)[free][:, free], program.jacobian_matrix(z)
     is_border = np.isin(np.arange(program.n), border)[free]
-    project = _Projection(J[active][:, free], is_border)
+    project = _Projection(J[active][:, free], is_border, program.places[free])
     v = project(project(np.random.default_rng(0).normal(size=int(free.sum()))))
     if not np.linalg.norm(v) > 1e-3:  # the constraints determine all variables
         return False
@@ -419,15 +419,22 @@ def _at_bound(x: np.ndarray, lower: np.ndarray, upper: np.ndarray, multipliers: 
 
 
 class _Projection:
-    """The orthogonal projection onto J d = 0, for J (m, n). `is_border` (n,): the columns that are eliminated last."""
+    """The orthogonal projection onto J d = 0, for J (m, n).
 
-    def __init__(self, J: Sparse, is_border: np.ndarray):
+    **Arguments:**
+
+    - `J`: the sparse matrix.
+    - `is_border` (n,): whether a column is eliminated last.
+    - `places` (n,): see `NonlinearProgram.places`.
+    """
+
+    def __init__(self, J: Sparse, is_border: np.ndarray, places: np.ndarray):
         self.inner, self.border, m = np.flatnonzero(~is_border), np.flatnonzero(is_border), J.shape[0]
         part, of_border = J[:, self.inner], J[:, self.border].toarray()
         # With a small number instead of zero, constraints that depend on each other do not make the matrix singular.
         blocks = [[scipy.sparse.identity(part.shape[1]), part.T], [part, -1e-12 * scipy.sparse.identity(m)]]
         matrix = scipy.sparse.bmat(blocks, format="csr")
-        order = np.asarray(scipy.sparse.csgraph.reverse_cuthill_mckee(matrix, symmetric_mode=True))
+        order = banded_order(matrix, places[self.inner])
         self.factors = BandedFactors(matrix, order, order)
         self.coupling = np.concatenate([np.zeros((part.shape[1], len(self.border))), of_border])
         self.solved = self.factors.solve(self.coupling)
@@ -439,6 +446,28 @@ class _Projection:
         d, x = np.empty_like(v), np.linalg.solve(self.schur, v[self.border] - self.coupling.T @ step)
         d[self.border], d[self.inner] = x, (step - self.solved @ x)[: len(self.inner)]
         return d
+
+
+def banded_order(matrix: Sparse, places: np.ndarray) -> np.ndarray:
+    """An order in which a matrix of Karush, Kuhn and Tucker, [[H, J^T], [J, .]], has a narrow band.
+
+    It is the order of the places of the variables, or that of Cuthill and McKee for motions whose ends are linked. The
+    band of the latter is up to twice as wide. Beyond 64, LAPACK's band factors use the threads of the BLAS. Then 241
+    nodes of a bicycle took 0.05 to 2.7 CPU s on two busy cores, instead of 0.009.
+
+    **Arguments:**
+
+    - `matrix`: the sparse matrix (n + m, n + m).
+    - `places` (n,): the places of the variables. A constraint has the mean place of its variables.
+    """
+    n = len(places)
+    occurs = scipy.sparse.csr_matrix(matrix[n:, :n] != 0, dtype=float)
+    of_rows = (occurs @ places) / np.maximum(occurs @ np.ones(n), 1.0)
+    # `round`, because the means of constraints of one interval differ by rounding errors
+    by_place = np.argsort(np.concatenate([places, of_rows]).round(9), kind="stable")
+    by_graph = np.asarray(scipy.sparse.csgraph.reverse_cuthill_mckee(matrix, symmetric_mode=True))
+    i, j = matrix.nonzero()
+    return min(by_place, by_graph, key=lambda order: np.max(np.abs(np.diff(np.argsort(order)[[i, j]], axis=0)), initial=0))
 
 
 class BandedFactors:
@@ -455,6 +484,7 @@ class BandedFactors:
     def __init__(self, matrix: Sparse, rows: np.ndarray, columns: np.ndarray):
         self.rows, self.columns, n = rows, columns, matrix.shape[0]
         ordered = scipy.sparse.coo_matrix(matrix.tocsr()[rows][:, columns])
+        ordered.eliminate_zeros()  # a condition at the start has zeros in the columns of the end
         i, j = ordered.row, ordered.col
         self.below, self.above = int(np.max(i - j, initial=0)), int(np.max(j - i, initial=0))
         band = np.zeros((2 * self.below + self.above + 1, n))

@@ -282,6 +282,8 @@ class Transcription:
         self._check_functions(builder)
         g_scale = builder.scales(self.x, self.x_scale)
         self.program = NonlinearProgram(*builder.arguments(), self.x_bounds, builder.bounds, self.x_scale, g_scale)
+        for p, layout in enumerate(self.layouts):
+            self.program.places[layout.node(np.arange(layout.K))] = (p + layout.s)[:, None]
         self.program.f_scale = self._cost_scale()
         self.implied = self._drop_implied()
         self.unresolved = self._unresolved(builder, dynamics)

@@ -7,8 +7,8 @@ the upper left block of the inverse of the matrix of Karush, Kuhn and Tucker
     [ J   0  ]
 
 with the Hessian H of the Lagrangian (Y. Bard, Nonlinear Parameter Estimation, 1974, section 7-6). The variables of the
-nodes are eliminated first. In the order of Cuthill and McKee this part of the matrix is banded, and LAPACK factorizes
-it in a fraction of a second. SuperLU took 40 to 90 s for 23 000 variables: the parameters occur in all equations.
+nodes are eliminated first. In the order of time this part of the matrix is banded, and LAPACK factorizes it in a
+fraction of a second. SuperLU took 40 to 90 s for 23 000 variables: the parameters occur in all equations.
 
 If inputs are unknown, the estimate of all unknowns together is biased: for unknown inputs w with few measurements each,
 the most probable (w, parameters) is not near the most probable parameters. With Laplace's approximation of the integral
@@ -34,7 +34,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-import scipy.sparse.csgraph
 from jaxtyping import Array, Float, PyTree
 
 from .._collocate.functions import bounds_of
@@ -46,6 +45,7 @@ from .._collocate.solvers import (
     BandedFactors,
     Effort,
     Solution,
+    banded_order,
     casadi,
     minimized,
     refused_unless_minimum,
@@ -84,7 +84,7 @@ class Kkt:
         J = program.jacobian_matrix(z)
         inner, border = self.inner, self.border
         K = scipy.sparse.bmat([[H[inner][:, inner], J[:, inner].T], [J[:, inner], None]], format="csr")
-        order = np.asarray(scipy.sparse.csgraph.reverse_cuthill_mckee(K, symmetric_mode=True))
+        order = banded_order(K, program.places[inner])
         self.factors = BandedFactors(K, order, order)
         self.coupling = np.concatenate([H[inner][:, border].toarray(), J[:, border].toarray()])
         self.solved = self.factors.solve(self.coupling)
