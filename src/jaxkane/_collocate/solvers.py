@@ -467,7 +467,12 @@ def banded_order(matrix: Sparse, places: np.ndarray) -> np.ndarray:
     by_place = np.argsort(np.concatenate([places, of_rows]).round(9), kind="stable")
     by_graph = np.asarray(scipy.sparse.csgraph.reverse_cuthill_mckee(matrix, symmetric_mode=True))
     i, j = matrix.nonzero()
-    return min(by_place, by_graph, key=lambda order: np.max(np.abs(np.diff(np.argsort(order)[[i, j]], axis=0)), initial=0))
+
+    def width(order: np.ndarray) -> int:
+        place = np.argsort(order)
+        return int(np.max(np.abs(place[i] - place[j]), initial=0))
+
+    return min(by_place, by_graph, key=width)
 
 
 class BandedFactors:
