@@ -45,8 +45,8 @@ class PhaseProblem:
     """A phase of a motion: see `jaxkane.collocation.Problem` for the meaning of each attribute.
 
     `parameters` has the method `apply` and the attribute `size`; its last `n_local` numbers belong to this phase alone,
-    the others are shared by all phases. `ends` and `limits` are bounds by name. If `is_piecewise`, a control has one
-    value in each interval; else it is continuous, with a value at each node.
+    the others are shared by all phases. `ends` and `limits` are bounds by name. A control is continuous, with a value at
+    each node. If `is_piecewise`, it jumps between intervals: a node between two of them has two values.
     """
 
     system: System
@@ -158,35 +158,36 @@ class Layout:
     def node(self, k: np.ndarray | int, interval: np.ndarray | None = None) -> np.ndarray:
         """The indices (..., n_z) of the states and controls at nodes k (...,).
 
-        A control that is constant in each interval has the value of `interval` (...,), by default of the interval that
-        begins at the node.
+        A control that jumps between intervals has the value in `interval` (...,), by default in the interval that begins
+        at the node.
         """
         k, n_y, n_w = np.asarray(k), self.variables.n_y, len(self.variables.controls)
         if not self.problem.is_piecewise:
             return self.first + k[..., None] * (n_y + n_w) + np.arange(n_y + n_w)
         i = np.minimum(k // self.every, len(self.mesh) - 2) if interval is None else interval
         states = self.first + k[..., None] * n_y + np.arange(n_y)
-        controls = self.first + self.K * n_y + i[..., None] * n_w + np.arange(n_w)
+        controls = self.first + self.K * n_y + (k + i)[..., None] * n_w + np.arange(n_w)
         return np.concatenate([states, controls], axis=-1)
 
     @property
     def by_name(self) -> dict[str, np.ndarray]:
-        """The indices (K,) of each state and control at the nodes, and (1,) of the duration if it is free."""
+        """The indices (B,) of each state and control where the equations of motion are evaluated, and (1,) of the
+        duration if it is free."""
         names = (*self.problem.names, *self.variables.controls)
-        found = dict(zip(names, self.node(np.arange(self.K)).T, strict=True))
+        found = dict(zip(names, self.dynamics[1].T, strict=False))
         return found if self.duration is None else found | {"duration": np.array([self.duration])}
 
     @property
     def size(self) -> int:
         n_y, n_w = self.variables.n_y, len(self.variables.controls)
-        return self.K * n_y + (len(self.mesh) - 1 if self.problem.is_piecewise else self.K) * n_w
+        return self.K * n_y + len(self.dynamics[0]) * n_w
 
     @property
     def dynamics(self) -> tuple[np.ndarray, ...]:
         """Where the equations of motion are evaluated.
 
         **Returns:** the nodes (B,), the variables (B, n) and, for each point of each interval, its place (N, s) among
-        them. A node between two intervals is evaluated twice if controls are constant in each interval.
+        them. A node between two intervals is evaluated twice if controls jump there.
         """
         N = len(self.mesh) - 1
         nodes = np.arange(N)[:, None] * self.every + np.arange(self.every + 1)  # (N, s)
@@ -258,7 +259,8 @@ class Transcription:
         self.parameters = self.layouts[0].variables.parameters
         self.x = np.zeros(self.n)
         for layout, motion in zip(self.layouts, motions, strict=True):
-            self.x[layout.node(np.arange(layout.K))] = np.concatenate([motion.Y, motion.W], axis=1)
+            nodes, columns, _ = layout.dynamics
+            self.x[columns[:, : layout.variables.n_z]] = np.concatenate([motion.Y, motion.W], axis=1)[nodes]
             if layout.duration is not None:
                 self.x[layout.duration] = motion.duration
         self.x[self.shared_parameters] = theta
@@ -283,7 +285,8 @@ class Transcription:
         g_scale = builder.scales(self.x, self.x_scale)
         self.program = NonlinearProgram(*builder.arguments(), self.x_bounds, builder.bounds, self.x_scale, g_scale)
         for p, layout in enumerate(self.layouts):
-            self.program.places[layout.node(np.arange(layout.K))] = (p + layout.s)[:, None]
+            nodes, columns, _ = layout.dynamics
+            self.program.places[columns[:, : layout.variables.n_z]] = (p + layout.s)[nodes, None]
         self.program.f_scale = self._cost_scale()
         self.implied = self._drop_implied()
         self.unresolved = self._unresolved(builder, dynamics)
@@ -396,7 +399,7 @@ class Transcription:
                 # A state that should be zero is as large as its error (2e-5 m beside 200 m in the flight of an
                 # aircraft). Relative to that, no error is small, and the mesh would grow from 40 to 316 intervals.
                 values = np.maximum(values, 1e-2 * known)
-            scale[layout.node(np.arange(layout.K))] = values
+            scale[layout.dynamics[1][:, : len(values)]] = values
             if layout.duration is not None:
                 scale[layout.duration] = max(self.x[layout.duration], 1e-3 * layout.problem.durations[1])
         return scale
