@@ -45,8 +45,8 @@ class PhaseProblem:
     """A phase of a motion: see `jaxkane.collocation.Problem` for the meaning of each attribute.
 
     `parameters` has the method `apply` and the attribute `size`; its last `n_local` numbers belong to this phase alone,
-    the others are shared by all phases. `ends` and `limits` are bounds by name. A control is continuous, with a value at
-    each node. If `is_piecewise`, it jumps between intervals: a node between two of them has two values.
+    the others are shared by all phases. `ends` and `limits` are bounds by name. A control is continuous, with a value
+    at each node. If `is_piecewise`, it jumps between intervals: a node between two of them has two values.
     """
 
     system: System
@@ -158,8 +158,8 @@ class Layout:
     def node(self, k: np.ndarray | int, interval: np.ndarray | None = None) -> np.ndarray:
         """The indices (..., n_z) of the states and controls at nodes k (...,).
 
-        A control that jumps between intervals has the value in `interval` (...,), by default in the interval that begins
-        at the node.
+        A control that jumps between intervals has the value in `interval` (...,), by default in the interval that
+        begins at the node.
         """
         k, n_y, n_w = np.asarray(k), self.variables.n_y, len(self.variables.controls)
         if not self.problem.is_piecewise:
