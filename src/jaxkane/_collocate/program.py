@@ -21,6 +21,7 @@ from jaxtyping import Array, PyTree
 
 from .._scalarjit.cache import Cache
 from .._scalarjit.cache_key import jit, kept
+from .._scalarjit.compat import on_device
 from .._scalarjit.components import Numbers
 from .._scalarjit.jaxpr import patterns
 
@@ -86,9 +87,9 @@ class EvaluatedBlock:
         self.block, (self.B, n) = block, block.columns.shape
         # `padded` would hide another number of places: 27 samples were compared with those of 20 others.
         assert all(len(x) == self.B for x in jax.tree.leaves(block.data)), "The data have another number of places."
-        self.data = jax.tree.map(lambda x: jnp.asarray(padded(x)), block.data)
+        self.data = jax.tree.map(lambda x: on_device(padded(x)), block.data)
         self.columns = padded(block.columns)
-        one = jax.tree.map(lambda x: jnp.asarray(x[0]), block.data), jnp.zeros(n, dtype)
+        one = jax.tree.map(lambda x: on_device(np.asarray(x)[0]), block.data), on_device(np.zeros(n, dtype))
         self.pattern = kept(_PATTERNS, (block.function, *one), lambda: _pattern(block.function, *one))
 
     def values(self, x: np.ndarray) -> np.ndarray:

@@ -1,10 +1,11 @@
 """The solver of nonlinear programs: IPOPT from the wheel of CasADi.
 
-IPOPT stops where the gradient of the Lagrangian is zero. It is also zero at a maximum or a saddle point. At a
-minimum, the Hessian H of the Lagrangian has no negative curvature along directions d with J d = 0 (J. Nocedal, S.
-Wright, Numerical Optimization, 2006, section 12.5). Here J contains the active constraints, and variables at their
-bounds are fixed. The least curvature is computed by the method of Lanczos, which only needs products with H and
-projections onto J d = 0. Each projection solves a system of linear equations with banded factors.
+IPOPT stops where the gradient of the Lagrangian is zero. It is also zero at a maximum or a saddle point. At a minimum,
+the Hessian H of the Lagrangian has no negative curvature along directions d with J d = 0 (J. Nocedal, S. Wright,
+Numerical Optimization, 2006, section 12.5). The inertia of IPOPT's last KKT matrix usually proves this. If IPOPT had to
+regularize this matrix, the curvature is computed. Here J contains the active constraints, and variables at their bounds
+are fixed. The least curvature is computed by the method of Lanczos, which only needs products with H and projections
+onto J d = 0. Each projection solves a system of linear equations with banded factors.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ class Solution:
         at an upper bound.
     - `ok`: whether the solver reports a local minimum.
     - `status`: the result in words.
+    - `is_convex`: whether the last KKT matrix of the solver had the inertia of a minimum, without regularization.
     """
 
     z: np.ndarray
@@ -46,6 +48,7 @@ class Solution:
     bound_multipliers: np.ndarray
     ok: bool
     status: str
+    is_convex: bool = False
 
 
 LATE = 5.0  # s
@@ -265,7 +268,9 @@ def minimized(
     if status in (INTERRUPTED, TIME_IS_UP) and monitor.best is not None:
         found = monitor.best
     effort.iterations += int(stats["iter_count"])
-    return Solution(found, lam_g, lam_x, ok, status)
+    is_exact = "hessian_approximation" not in (options or {})  # the others are always convex
+    is_convex = is_exact and stats["iter_count"] > 0 and stats["iterations"]["regularization_size"][-1] == 0.0
+    return Solution(found, lam_g, lam_x, ok, status, is_convex)
 
 
 def _callback(
@@ -320,7 +325,7 @@ def refused_unless_minimum(program: NonlinearProgram, border: np.ndarray, soluti
     - `border`: the indices of the variables that occur in the equations of all nodes.
     - `solution`: the result of a solver.
     """
-    if solution.ok and _has_negative_curvature(program, border, solution):
+    if solution.ok and not solution.is_convex and _has_negative_curvature(program, border, solution):
         return dataclasses.replace(solution, ok=False, status=NOT_A_MINIMUM)
     return solution
 
@@ -347,7 +352,7 @@ def _has_negative_curvature(program: NonlinearProgram, border: np.ndarray, solut
         if beside[-1] <= 1e-9 * max(np.abs(diagonal)):  # both are zero in a linear problem
             break
         V[k + 1] = w / beside[-1]
-    _, vectors = scipy.linalg.eigh_tridiagonal(diagonal, beside[: len(diagonal) - 1])
+    _, vectors = scipy.linalg.eigh_tridiagonal(diagonal, beside[: len(diagonal) - 1], select="i", select_range=(0, 0))
     # The direction is a proof, whether or not Lanczos converged, if it meets the constraints: steps beyond the number
     # of directions add vectors of rounding errors, which the projection removes.
     d = project(V[: len(diagonal)].T @ vectors[:, 0])

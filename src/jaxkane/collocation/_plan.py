@@ -26,7 +26,7 @@ from .._kane.api import _dependent_speeds
 from .._kane.constraint_residuals import configuration_residual
 from .._kane.right_hand_side import outputs_at, values_of, vector_field
 from .._scalarjit.cache_key import jit
-from .._scalarjit.compat import Tracer, on_device
+from .._scalarjit.compat import Tracer, concretely, on_device
 from .._scalarjit.components import Component, Numbers
 from .._system.parameters import wrapped
 from .._system.system import State, System, has_outputs, names_of, units_of, unpacked
@@ -400,7 +400,7 @@ def differentiable(problem: Any, plan: Plan) -> Plan:
     transcription, solution = plan.solved
     leaves = jax.tree.leaves(problem.system)
     directions = [[(i, k, 1.0)] for i, x in enumerate(leaves) if isinstance(x, Tracer) for k in range(np.size(x))]
-    with jax.ensure_compile_time_eval():
+    with concretely():
         tangent = tangents_of(plan.problem.system, directions)
         cost, x, reason = derivatives_of(transcription, solution, [tangent])
     if reason:

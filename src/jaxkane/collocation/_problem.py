@@ -10,8 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
-from .._collocate.functions import Bound, Condition, Now, bounds_of
+from .._collocate.functions import Bound, Condition, Node, Now, Variables, bounds_of
 from .._collocate.transcription import Motion, PhaseProblem
 from .._common.lookup import as_names, real_number, refuse_unknown
 from .._integrate.inputs import as_signals, is_samples
@@ -23,7 +24,7 @@ from .._kane.consistent_state import assemble
 from .._kane.constraint_residuals import check_state, configuration_residual
 from .._kane.contact.forces import has_contacts
 from .._kane.right_hand_side import output_names, vector_field
-from .._scalarjit.cache_key import captured_tracers
+from .._scalarjit.cache_key import captured_tracers, jit
 from .._scalarjit.compat import without_tangents
 from .._scalarjit.components import Numbers
 from .._system.parameters import in_batches
@@ -436,13 +437,17 @@ def _assembled(problem: Problem, start: np.ndarray, given: np.ndarray) -> np.nda
 
 def _rates(problem: Problem, y: np.ndarray, w: np.ndarray) -> np.ndarray:
     variables = problem.variables()
-    x = jnp.concatenate([jnp.asarray(y), jnp.asarray(w)])
-    tail = jnp.zeros(problem.has_free_duration + (0 if variables.parameters is None else variables.parameters.size))
+    n = problem.has_free_duration + (0 if variables.parameters is None else variables.parameters.size)
     known = {} if callable(problem.signals) else problem.signals
     samples = {k: f for k, f in known.items() if k not in variables.signals}
     node = {"s": jnp.zeros(()), "inputs": {k: f(0.0) for k, f in samples.items()}}
-    system, _, t, y_now, inputs = variables.at(node, jnp.concatenate([x, tail]))
-    return np.asarray(vector_field(system, t, y_now, inputs))
+    return np.asarray(_rates_at(variables, node, np.concatenate([y, w, np.zeros(n)])))
+
+
+@jit
+def _rates_at(variables: Variables, node: Node, x: Array) -> Array:
+    system, _, t, y, inputs = variables.at(node, x)
+    return vector_field(system, t, y, inputs)
 
 
 def _values(

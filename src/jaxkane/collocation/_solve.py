@@ -27,6 +27,7 @@ from .._collocate.solvers import (
 from .._collocate.transcription import Motion, Transcription, nodes_of, system_at
 from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
+from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component
 from ._mesh import interpolated, jumps_inside, local_errors, quadrature_errors, refined, switch_errors
 from ._plan import Multipliers, Plan, differentiable, trajectory_of
@@ -111,7 +112,7 @@ def solve(
         max_seconds = positive_number(max_seconds, "solve: `max_seconds`")
     guesses = _guesses(problem, guess, starts, seed)
     plans: list[Plan] = []
-    with Effort(max_iterations, max_seconds, progress) as effort, jax.ensure_compile_time_eval():
+    with Effort(max_iterations, max_seconds, progress) as effort, concretely():
         search = _Search(phases, lobatto(method), tolerance, options, effort, max_intervals)
         for one in guesses:
             plans.append(search.plan(intervals, one))
@@ -357,9 +358,9 @@ class _Search:
         program = transcription.program
         size = program.f_scale * max(abs(program.objective(x / transcription.x_scale)), 1e-3)
         found = []
-        for p, (layout, motion) in enumerate(zip(transcription.layouts, transcription.motions(x), strict=True)):
-            scales, system = transcription.x_scale[layout.node(0)], system_at(transcription, p, x)
-            errors = local_errors(layout, system, motion, self.method, scales, self.tolerance or COARSE)
+        for layout, motion in zip(transcription.layouts, transcription.motions(x), strict=True):
+            scales = transcription.x_scale[layout.node(0)]
+            errors = local_errors(layout, x, motion, self.method, scales, self.tolerance or COARSE)
             if self.tolerance is not None:  # no mesh resolves a cost of noisy measurements, which have their own nodes
                 errors = np.maximum(errors, quadrature_errors(layout, x, motion, self.method) / size)
                 errors = np.maximum(errors, switch_errors(layout, motion, self.method))
@@ -538,15 +539,16 @@ def costates_of(transcription: Transcription, solution: Solution, p: int) -> dic
     transformed adjoint system, Numerische Mathematik 87, 2000).
     """
     program, layout, z = transcription.program, transcription.layouts[p], solution.z
-    J = program.jacobian_matrix(z)
     rows = np.stack([row.rows for row in transcription.rows if row.phase == p and row.kind == "dynamics"], axis=-1)
-    rows, steps = rows.reshape(len(rows), -1), np.diff(layout.mesh)  # (N, (s - 1) n_y)
-    columns = layout.node(np.arange(len(rows) + 1) * layout.every)[:, : rows.shape[1] // layout.every]
+    N, n_y, steps = len(rows), rows.shape[-1], np.diff(layout.mesh)  # rows (N, s - 1, n_y)
+    columns = layout.node(np.arange(N + 1) * layout.every)[:, :n_y]
+    interval, end, (i, j) = np.full(program.m, -1), np.full(program.n, -2), program.jacobian_structure
+    interval[rows], end[columns] = np.arange(N)[:, None, None], np.arange(N + 1)[:, None]
+    is_own = (interval[i] == end[j]) | ((interval[i] == N - 1) & (end[j] == N))
+    of_rows = np.bincount(j, solution.multipliers[i] * program.jacobian(z) * is_own, minlength=program.n)[columns]
     integral = transcription.gradient_of_integrals(z)[columns]
     shares = np.append(steps, 0.0) / (np.append(steps, 0.0) + np.append(0.0, steps))  # of the interval after a node
-    of_rows = [solution.multipliers[r] @ J[r][:, c] for r, c in zip(rows, columns)]
-    of_rows.append(solution.multipliers[rows[-1]] @ J[rows[-1]][:, columns[-1]])
-    found = shares[:, None] * integral + np.array(of_rows)
+    found = shares[:, None] * integral + of_rows
     found[-1] = -integral[-1] - of_rows[-1]
     return dict(zip(layout.problem.names, (found * program.f_scale / program.x_scale[columns]).T, strict=True))
 
