@@ -15,6 +15,7 @@
     identification    fits of the bicycle, and whether they can be trusted (four minutes)
     million           a million bicycles, killed on the way (five minutes)
     swing_up          optimal control by direct collocation: opty (one minute)
+    opti              the same: CasADi's Opti (one minute)
 
 Every answer is compared before it is timed; a peer that is not installed is named and left out (pip install
 'jaxkane[benchmarks]').
@@ -22,7 +23,7 @@ Every answer is compared before it is timed; a peer that is not installed is nam
 Run:      python -m benchmarks [part ...] [--quick] [--out FOLDER] [--publish]
 Appears:  every figure with its target; results.md, results.json and speed.png in the folder. Parts that were measured
           before, on the same machine with the same versions, stay in the table.
-Takes:    about twenty-five minutes without the last three parts, which are measured only where they are named; some
+Takes:    about twenty-five minutes without the last four parts, which are measured only where they are named; some
           minutes with `--quick`, whose figures mean nothing.
 """
 
@@ -57,9 +58,10 @@ SETTINGS = {
     "walkers": (XLA, NATIVE),
     "million": TWO[1:],
     "swing_up": (XLA,),
+    "opti": (NATIVE,),
 }
 SCRIPTS = {"eigenvalues": ("eigenvalues.py",), "identification": ("identification.py", "--repetitions", "50")}
-NAMED_ONLY = ("identification", "million", "swing_up")
+NAMED_ONLY = ("identification", "million", "swing_up", "opti")
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -26,6 +26,7 @@ TITLES = {
     "eigenvalues": "Eigenvalues of ten thousand bicycles",
     "identification": "Identification",
     "swing_up": "Optimal control: a double pendulum swung up",
+    "opti": "Optimal control: a bar on a cart, against CasADi's Opti",
 }
 
 

@@ -266,7 +266,7 @@ class NonlinearProgram:
         """The scaled cost at scaled variables."""
         values = self._remembered(EvaluatedBlock.values, z)
         f = sum(w @ v.ravel() for w, v in zip(self._weights, values, strict=True)) / self.f_scale
-        return float(f + self.slope @ z)
+        return float(f + np.sum(self.slope * z))  # `@` would start the threads of BLAS, for 0.2 of 0.5 s
 
     def gradient(self, z: np.ndarray, blocks: Sequence[int] | None = None) -> np.ndarray:
         """The derivatives (n,) of `objective`, or of the part of it that some blocks have."""

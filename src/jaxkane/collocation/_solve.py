@@ -61,7 +61,7 @@ def solve(
     The states are polynomials in each interval of a mesh. They satisfy the equations of motion at the collocation
     points of a Lobatto IIIA method. IPOPT solves the problem with exact sparse first and second derivatives.
 
-    After the solution, each interval is simulated from its own start to compute its local error. Intervals whose error
+    After the solution, each interval is integrated from its own start to compute its local error. Intervals whose error
     is too large are divided. Then the problem is solved on the new mesh, from the present solution.
 
     **Arguments:**
