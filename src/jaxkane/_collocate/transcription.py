@@ -274,7 +274,7 @@ class Transcription:
         for p, (layout, block) in enumerate(zip(self.layouts, dynamics, strict=True)):
             builder.defects(p, layout, block, self.x_scale)
         for p, layout in enumerate(self.layouts):
-            self._add_functions(builder, p, layout)
+            self._add_functions(builder, p, layout, follows=0 < p <= len(links) and not callable(links[p - 1]))
         for i, how in enumerate(links):
             self._add_link(builder, i, how, dynamics)
         if objectives is not None:
@@ -404,7 +404,7 @@ class Transcription:
                 scale[layout.duration] = max(self.x[layout.duration], 1e-3 * layout.problem.durations[1])
         return scale
 
-    def _add_functions(self, builder: Builder, p: int, layout: Layout) -> None:
+    def _add_functions(self, builder: Builder, p: int, layout: Layout, follows: bool) -> None:
         problem, variables = layout.problem, layout.variables
         data = layout.node_data(layout.s)
         if problem.cost is not None:
@@ -416,9 +416,9 @@ class Transcription:
             function = Path(variables, tuple(along), problem.path)
             items = [*along.items(), *constraints_of("path", path, is_equality=False).items()]
             builder.constraints("path", p, EvaluatedBlock(Block(function, data, layout.columns, len(items))), items)
-        self._add_ends(builder, p, layout)
+        self._add_ends(builder, p, layout, follows)
 
-    def _add_ends(self, builder: Builder, p: int, layout: Layout) -> None:
+    def _add_ends(self, builder: Builder, p: int, layout: Layout, follows: bool) -> None:
         problem, variables = layout.problem, layout.variables
         names = (*problem.names, *variables.controls)
         by_name = {
@@ -426,7 +426,9 @@ class Transcription:
             for label in ("start", "end")
         }
         fixed = [c for c in problem.system.coordinates if not isinstance(problem.ends["start"].get(c, ()), tuple)]
-        n_h = 0 if len(fixed) == len(problem.system.coordinates) else problem.n_constraints
+        # If the phase before gives all coordinates, its start satisfies the constraints, except for the drift. A second
+        # time, they would contradict the equations of motion there: a drone was not solved in 1000 iterations.
+        n_h = 0 if follows or len(fixed) == len(problem.system.coordinates) else problem.n_constraints
         places = np.array([0, layout.K - 1])
         columns = np.concatenate([*layout.node(places), layout.shared])[None]
         data = layout.node_data(layout.s[places])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -344,7 +345,26 @@ def _pair(label: str, value: object) -> Bound:
     return bounds_of(label, value)
 
 
-def guess_of(problem: Problem, guess: object, s: np.ndarray) -> Motion:
+def boundaries(phases: Phases) -> list[np.ndarray]:
+    """For each phase the values (2, n_y) at its start and end, NaN if they are unknown. Between phases with a
+    continuous state, they are on the straight line between known values."""
+    ends = [[[_middle(p.ends[k].get(x), math.nan) for x in p.names] for k in ("start", "end")] for p in phases.phases]
+    found, first = [], 0
+    for i in range(len(ends)):
+        if i == len(ends) - 1 or phases.links[i] is not None:
+            part = np.array(ends[first : i + 1])  # (phases, 2, n_y)
+            between = (np.where(np.isnan(b), a, b) for (_, a), (b, _) in itertools.pairwise(part))
+            values = np.array([part[0, 0], *between, part[-1, 1]])
+            t = np.cumsum([0.0, *(sum(p.durations) for p in phases.phases[first : i + 1])])
+            for x in values.T:
+                if (known := np.isfinite(x)).any():
+                    x[:] = np.interp(t, t[known], x[known], left=math.nan, right=math.nan)
+            found += [values[k : k + 2] for k in range(len(part))]
+            first = i + 1
+    return found
+
+
+def guess_of(problem: Problem, guess: object, s: np.ndarray, ends: np.ndarray) -> Motion:
     """The guess of a motion at nodes, which may violate bounds: see `Transcription`.
 
     **Arguments:**
@@ -353,6 +373,7 @@ def guess_of(problem: Problem, guess: object, s: np.ndarray) -> Motion:
     - `guess`: None, a `Trajectory`, or by name numbers, arrays (n,) of samples at even distances, or functions of time;
         with "duration" a number.
     - `s` (K,): the nodes, as fractions of the duration.
+    - `ends` (2, n_y): see `boundaries`.
 
     **Raises:** `ValueError` for unknown names and for values that are not finite.
     """
@@ -369,7 +390,7 @@ def guess_of(problem: Problem, guess: object, s: np.ndarray) -> Motion:
     duration = real_number(given.get("duration", 0.5 * sum(problem.durations)), "solve: `guess` of 'duration'")
     if not 0 < duration < math.inf:
         raise ValueError(f"solve: `guess` of 'duration' must be a positive number of seconds, got {duration!r}.")
-    Y, W = _automatic(problem, s, duration)
+    Y, W = _automatic(problem, s, duration, ends)
     for name, value in given.items():
         if name != "duration":
             target, i = (Y, names.index(name)) if name in names else (W, controls.index(name))
@@ -403,12 +424,10 @@ def _middle(value: Condition | None, otherwise: float) -> float:
     return 0.5 * (low + high) if math.isfinite(high - low) else min(max(otherwise, low), high)
 
 
-def _automatic(problem: Problem, s: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
+def _automatic(problem: Problem, s: np.ndarray, duration: float, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Straight lines from the start to the end. Coordinates without an end continue with their initial rates."""
     system, names, limits = problem.system, problem.names, problem.limits
-    ends, controls = problem.ends, tuple(problem.bounds_of_controls)
-    numbers = [[_middle(ends[label].get(name), math.nan) for name in names] for label in ("start", "end")]
-    first, last = np.array(numbers)
+    controls, (first, last) = tuple(problem.bounds_of_controls), ends
     inside = np.array([_middle(limits.get(name), 0.0) for name in names])
     start = np.where(np.isnan(first), np.where(np.isnan(last), inside, last), first)
     start = _assembled(problem, start, first)
@@ -418,12 +437,14 @@ def _automatic(problem: Problem, s: np.ndarray, duration: float) -> tuple[np.nda
     moving = start + duration * np.where(np.arange(len(names)) < n_q, y_dot, 0.0)
     moving = np.where(np.isfinite(moving), moving, start)
     end = np.where(np.isnan(last), np.where(np.isnan(first), start, moving), last)
+    if np.isfinite(last[:n_q]).any():
+        end = _assembled(problem, end, last)
     Y = start + s[:, None] * (end - start)
     return Y, np.tile(W0, (len(s), 1))
 
 
 def _assembled(problem: Problem, start: np.ndarray, given: np.ndarray) -> np.ndarray:
-    """The start with coordinates that satisfy the configuration constraints."""
+    """The start or end with coordinates that satisfy the configuration constraints."""
     system, n_q = problem.system, len(problem.system.coordinates)
     if not problem.n_constraints or np.all(np.isfinite(given[:n_q])):
         return start

@@ -31,7 +31,7 @@ from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component
 from ._mesh import interpolated, jumps_inside, local_errors, quadrature_errors, refined, switch_errors
 from ._plan import Multipliers, Plan, differentiable, trajectory_of
-from ._problem import Phases, Problem, detoured, detours, guess_of
+from ._problem import Phases, Problem, boundaries, detoured, detours, guess_of
 
 Guess: TypeAlias = Plan | Trajectory | Mapping[str, Any] | Sequence[Any] | None
 """A guess of a motion, or a sequence of guesses."""
@@ -169,7 +169,8 @@ def check_derivatives(
     """
     phases = problem if isinstance(problem, Phases) else Phases([problem])
     found, mesh = lobatto(method), np.linspace(0.0, 1.0, intervals + 1)
-    motions = [_guessed(p, guess, nodes_of(mesh, found), None) for p in phases.phases]
+    ends = zip(phases.phases, boundaries(phases), strict=True)
+    motions = [_guessed(p, guess, nodes_of(mesh, found), None, e) for p, e in ends]
     theta, meshes = _theta(phases.phases[0], guess), [mesh] * len(motions)
     transcription = Transcription(phases.phases, phases.links, meshes, found, motions, theta)
     program = transcription.program
@@ -247,7 +248,8 @@ class _Search:
             for guess, _ in guesses
         ]
         nodes = [nodes_of(mesh, self.method) for mesh in meshes]
-        motions = [_guessed(p, g, s, detour) for p, (g, detour), s in zip(problems, guesses, nodes, strict=True)]
+        each = zip(problems, guesses, nodes, boundaries(self.phases), strict=True)
+        motions = [_guessed(p, g, s, detour, ends) for p, (g, detour), s, ends in each]
         theta = _theta(problems[0], guesses[0][0])
         self.effort.iterations, is_warm = 0, isinstance(guesses[0][0], Plan)
         sizes = [g.scales if _is_similar(p, g) else None for p, (g, _) in zip(problems, guesses, strict=True)]
@@ -448,13 +450,13 @@ def _is_similar(problem: Problem, guess: Guess) -> bool:
     return isinstance(guess, Plan) and not guess.phases and both[0] == both[1]
 
 
-def _guessed(problem: Problem, guess: Any, s: np.ndarray, detour: np.ndarray | None) -> Motion:
+def _guessed(problem: Problem, guess: Any, s: np.ndarray, detour: np.ndarray | None, ends: np.ndarray) -> Motion:
     if _is_similar(problem, guess):
         found = interpolated(guess.motion, guess.mesh / guess.duration, guess.method, s)
         low, high = problem.durations
         found = found._replace(duration=min(max(guess.duration, low), high))
     else:
-        found = guess_of(problem, getattr(guess, "trajectory", guess), s)
+        found = guess_of(problem, getattr(guess, "trajectory", guess), s, ends)
     return found if detour is None else detoured(found, detour)
 
 
