@@ -147,6 +147,7 @@ class Monitor:
 INTERRUPTED = "interrupted"
 TIME_IS_UP = "the longest time was reached"
 NOT_FINITE = "a function or a derivative is not finite"
+DIVERGES = "the iterates diverge: the cost may have no lower bound"
 
 
 _IPOPT_STATUS = {
@@ -157,9 +158,9 @@ _IPOPT_STATUS = {
     "Maximum_Iterations_Exceeded": (False, "the largest number of iterations was reached"),
     "Maximum_CpuTime_Exceeded": (False, "the longest CPU time was reached"),
     "Maximum_WallTime_Exceeded": (False, TIME_IS_UP),
-    "Diverging_Iterates": (False, "the iterates diverge: the cost may have no lower bound"),
+    "Diverging_Iterates": (False, DIVERGES),
     "Search_Direction_Becomes_Too_Small": (False, "the steps became too small"),
-    "Restoration_Failed": (False, "no feasible point was found near the last iterate"),
+    "Restoration_Failed": (False, "no feasible point was found near the last iterate: pass another guess"),
     "Error_In_Step_Computation": (False, "no step could be computed"),
     "Invalid_Number_Detected": (False, NOT_FINITE),
     "Not_Enough_Degrees_Of_Freedom": (False, "there are more equations than variables"),

@@ -92,15 +92,12 @@ def local_errors(
     sizes = np.maximum(scales[:n_y], 0.5 * np.ptp(motion.Y, axis=0))
     unsure, starts, ends = np.arange(len(errors)), motion.Y[:-1:every], motion.Y[every::every]
     while len(unsure) and k <= 1024:
-        reached, doubts = [], []
+        found = []
         for i in range(0, len(unsure), _CHUNK):
-            place = unsure[np.minimum(np.arange(i, i + _CHUNK), len(unsure) - 1)]
-            s = layout.mesh[place], layout.mesh[place + 1]
-            for found, a in zip(
-                (reached, doubts), _integrated(function, *s, starts[place], C[place], x[layout.shared], k)
-            ):
-                found.append(np.asarray(a))
-        end, doubt = (np.concatenate(found)[: len(unsure)] for found in (reached, doubts))
+            at = unsure[np.minimum(np.arange(i, i + _CHUNK), len(unsure) - 1)]
+            s = layout.mesh[at], layout.mesh[at + 1]
+            found.append(np.asarray(_integrated(function, *s, starts[at], C[at], x[layout.shared], k)))
+        end, doubt = np.concatenate(found)[: len(unsure)].swapaxes(0, 1)
         error = np.max(np.abs(end - ends[unsure]) / sizes, axis=1)
         sure = np.max(doubt / sizes, axis=1) <= 0.1 * np.maximum(tolerance, error)  # False if anything is not finite
         errors[unsure[sure]] = error[sure]
@@ -114,31 +111,28 @@ _CHUNK = 64  # intervals that are integrated together, so that every mesh uses t
 @jit
 def _integrated(
     function: Dynamics, first: Array, last: Array, Y: Array, C: Array, shared: Array, steps: Component
-) -> tuple[Array, Array]:
-    """The states (B, n_y) at the ends of intervals, and the sums of their errors, by equal steps of DOP853.
+) -> Array:
+    """The states at the ends of intervals, and the sums of their errors, (B, 2, n_y), by equal steps of DOP853.
 
     `simulate` would adapt its steps, but its program took 2 of the 4 s of a first solution.
     """
     method = scipy.integrate.DOP853
-    nodes, weights, doubts = (jnp.asarray(a[:12]) for a in (method.C, method.B, method.E5))
-    coefficients = jnp.asarray(method.A[:12, :12])
+    A, b, c, e = (jnp.asarray(a) for a in (method.A[:12, :12], method.B, method.C[:12], method.E5[:12]))
 
-    def one(first: Array, last: Array, y: Array, C: Array) -> tuple[Array, Array]:
+    def one(first: Array, last: Array, y: Array, C: Array) -> Array:
         def rates(u: Array, y: Array) -> Array:
             powers = jnp.stack([u**k for k in range(C.shape[0])])  # an array of integers would be promoted
             node = {"s": first + u * (last - first), "inputs": {}}
             return (last - first) / steps * function(node, jnp.concatenate([y, powers @ C, shared]))
 
-        def step(i: Array, reached: tuple[Array, Array]) -> tuple[Array, Array]:
-            y, doubt = reached
-
+        def step(i: Array, reached: Array) -> Array:
             def stage(j: Array, K: Array) -> Array:
-                return K.at[j].set(rates((i + nodes[j]) / steps, y + coefficients[j] @ K))
+                return K.at[j].set(rates((i + c[j]) / steps, reached[0] + A[j] @ K))
 
             K = jax.lax.fori_loop(0, 12, stage, jnp.zeros((12, y.size)))
-            return y + weights @ K, doubt + jnp.abs(doubts @ K)
+            return reached + jnp.stack([b @ K, jnp.abs(e @ K)])
 
-        return jax.lax.fori_loop(0, steps, step, (y, jnp.zeros_like(y)))
+        return jax.lax.fori_loop(0, steps, step, jnp.stack([y, jnp.zeros_like(y)]))
 
     return jax.vmap(one)(first, last, Y, C)
 
@@ -200,8 +194,8 @@ def with_controls(signals: Signals, polynomials: dict[str, Any]) -> Any:
     return every
 
 
-def refined(mesh: np.ndarray, errors: np.ndarray, tolerance: float, order: int) -> np.ndarray:
-    """A finer mesh where errors are too large, and a coarser one where they are far below the tolerance.
+def refined(mesh: np.ndarray, errors: np.ndarray, tolerance: float, order: int, merges: bool = True) -> np.ndarray:
+    """A finer mesh where errors are too large. If it `merges`, a coarser one where they are far below the tolerance.
 
     An interval of error e is divided into (e / tolerance)^(1 / order) parts, at most eight. Two neighbours become one
     interval if a tenth of the tolerance is not reached by its expected error, which grows with length^(order + 1).
@@ -211,7 +205,7 @@ def refined(mesh: np.ndarray, errors: np.ndarray, tolerance: float, order: int) 
     new, i = [mesh[0]], 0
     roots = np.minimum(errors, 1.0) ** (1.0 / (order + 1))
     while i < len(errors):
-        has_next = i + 1 < len(errors) and parts[i] == parts[i + 1] == 1
+        has_next = merges and i + 1 < len(errors) and parts[i] == parts[i + 1] == 1
         if has_next and (roots[i] + roots[i + 1]) ** (order + 1) < 0.1 * tolerance:
             new.append(mesh[i + 2])
             i += 2
@@ -244,6 +238,13 @@ def switch_errors(layout: Layout, motion: Motion, method: Lobatto) -> np.ndarray
 
 
 _JUMP = 1 / 3
+
+
+def oscillating(layout: Layout, motion: Motion) -> list[str]:
+    """The names of controls whose second differences change their sign from node to node."""
+    D = np.diff(motion.W, 2, axis=0)
+    alternates = np.sum(np.abs(D[1:] + D[:-1]), axis=0) < 0.5 * np.sum(np.abs(D), axis=0)
+    return [name for name, x in zip(layout.variables.controls, alternates, strict=True) if x]
 
 
 def quadrature_errors(layout: Layout, x: np.ndarray, motion: Motion, method: Lobatto) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -346,21 +345,18 @@ def _pair(label: str, value: object) -> Bound:
 
 
 def boundaries(phases: Phases) -> list[np.ndarray]:
-    """For each phase the values (2, n_y) at its start and end, NaN if they are unknown. Between phases with a
-    continuous state, they are on the straight line between known values."""
+    """For each phase the values (2, n_y) at its start and end, NaN if they are unknown. If the state is continuous from
+    phase to phase, they are on the straight line between known values."""
     ends = [[[_middle(p.ends[k].get(x), math.nan) for x in p.names] for k in ("start", "end")] for p in phases.phases]
-    found, first = [], 0
-    for i in range(len(ends)):
-        if i == len(ends) - 1 or phases.links[i] is not None:
-            part = np.array(ends[first : i + 1])  # (phases, 2, n_y)
-            between = (np.where(np.isnan(b), a, b) for (_, a), (b, _) in itertools.pairwise(part))
-            values = np.array([part[0, 0], *between, part[-1, 1]])
-            t = np.cumsum([0.0, *(sum(p.durations) for p in phases.phases[first : i + 1])])
-            for x in values.T:
-                if (known := np.isfinite(x)).any():
-                    x[:] = np.interp(t, t[known], x[known], left=math.nan, right=math.nan)
-            found += [values[k : k + 2] for k in range(len(part))]
-            first = i + 1
+    found = [*map(np.array, ends)]
+    if len(found) > 1 and not any(phases.links[: len(found) - 1]):
+        first, last = np.swapaxes(found, 0, 1)  # (phases, n_y)
+        values = np.concatenate([first[:1], np.where(np.isnan(first[1:]), last[:-1], first[1:]), last[-1:]])
+        t = np.cumsum([0.0, *(sum(p.durations) for p in phases.phases)])
+        for x in values.T:
+            if (known := np.isfinite(x)).any():
+                x[:] = np.interp(t, t[known], x[known], left=math.nan, right=math.nan)
+        found = [*np.stack([values[:-1], values[1:]], axis=1)]
     return found
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Array
 from .._collocate.lobatto import Lobatto, lobatto
 from .._collocate.program import NonlinearProgram
 from .._collocate.solvers import (
+    DIVERGES,
     INTERRUPTED,
     NOT_FINITE,
     TIME_IS_UP,
@@ -29,7 +30,7 @@ from .._common.lookup import positive_number
 from .._integrate.trajectory import Trajectory
 from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component
-from ._mesh import interpolated, jumps_inside, local_errors, quadrature_errors, refined, switch_errors
+from ._mesh import interpolated, jumps_inside, local_errors, oscillating, quadrature_errors, refined, switch_errors
 from ._plan import Multipliers, Plan, differentiable, trajectory_of
 from ._problem import Phases, Problem, boundaries, detoured, detours, guess_of
 
@@ -290,7 +291,9 @@ class _Search:
             new, tolerance = None, None if transcription.unresolved else self.tolerance  # no mesh would help
             if errors is not None and tolerance is not None and any(np.max(e) > tolerance for e in errors):
                 new = [
-                    refined(mesh, e, tolerance, self.method.order) if np.max(e) > tolerance else mesh
+                    refined(mesh, e, tolerance, self.method.order, merges=len(costs) < 3)
+                    if np.max(e) > tolerance
+                    else mesh
                     for mesh, e in zip(meshes, errors, strict=True)
                 ]
             if new is None or len(costs) == MAX_MESHES or max(len(m) for m in new) > self.max_intervals + 1:
@@ -386,9 +389,17 @@ class _Search:
         elif ok and self.tolerance is None and worst > COARSE:
             ok, reason = False, f"solved, but the local error is {worst:.1e}: pass more `intervals` or a `tolerance`"
         elif ok and is_coarse:
-            ok, reason = False, f"solved, but the local error is {worst:.1e} instead of {self.tolerance:g}"
+            pairs = zip(transcription.layouts, transcription.motions(x), strict=True)
+            names = ", ".join(name for pair in pairs for name in oscillating(*pair))
+            hint = f"{names} oscillates from node to node: increase its cost, or the cost of its rate"
+            hint = hint if names else "pass a larger `tolerance` or other bounds"
+            ok, reason = False, f"solved, but the local error is {worst:.1e} instead of {self.tolerance:g}: {hint}"
         elif ok and program.violation(solution.z) > 1e-6:
             ok, reason = False, f"dropped constraints are violated: {', '.join(transcription.implied)}"
+        if reason == DIVERGES:
+            big = [name for layout in transcription.layouts for name, at in layout.by_name.items()
+                   if np.max(np.abs(solution.z[at])) > 1e6]  # fmt: skip
+            reason += f"; {', '.join(dict.fromkeys(big))} without a sufficient bound" * bool(big)
         if reason == NOT_FINITE and (names := transcription.not_finite(x)):
             reason = f"{', '.join(names)} is not finite at the last iterate"
         parameters = transcription.parameters
