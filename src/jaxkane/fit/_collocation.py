@@ -454,7 +454,10 @@ class CollocationFit(Estimates):
 
     @property
     def mean_square(self) -> float:
-        """The cost divided by the number of measurements; about one if `sigma` and the spectral densities are right."""
+        """The cost divided by the number of measurements; about one if `sigma` and the spectral densities are right.
+
+        It is also about one if a wrong parameter, such as a free mass, can compensate for wrong ones.
+        """
         return self.cost / self._n_measured
 
     @property
