@@ -254,8 +254,8 @@ def test_options_not_supported_by_collocation_are_rejected(option):
 
 @pytest.mark.weekly
 def test_wrong_standard_deviations_are_noted():
-    """With a tenth of the true errors of the sensors, the mean square is not one. A free mass would hide this: a smaller
-    mass moves more, and the Kalman filter estimates the same."""
+    """With a tenth of the true errors of the sensors, the mean square is not one. A free mass would hide this:
+    a smaller mass moves more, and the Kalman filter estimates the same."""
     trial = record(2, density=0.3)
     wrong = Trial(T, trial.measured, trial.inputs, sigma={"x": 2e-4, "x_dot": 1e-3})
     known = NAMES[1:], dataclasses.replace(GUESS, mass=TRUTH.mass)
