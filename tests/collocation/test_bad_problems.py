@@ -330,5 +330,5 @@ def test_a_function_that_is_not_finite_on_a_finer_mesh_keeps_the_solution():
 def test_a_cost_without_a_lower_bound():
     plan = solved(cost=lambda t, now: -(now["force"] ** 2))
     assert not plan.ok
-    assert "no lower bound" in plan.reason
+    assert "no lower bound; x, v, force without a sufficient bound" in plan.reason
     assert plan.cost < -1e6

@@ -1,7 +1,4 @@
-"""Problems of opty's gallery, solved by the default options.
-
-The references are formulas, or costs from the gallery.
-"""
+"""Problems of opty's gallery and of Moco. The references are formulas, costs from the gallery, or simulations."""
 
 import math
 
@@ -175,3 +172,235 @@ def test_two_links_on_a_cart_are_raised_in_the_shortest_time():
     assert plan.ok
     assert plan.duration < 2.8910
     assert plan.deviation(plan.replay(feedback=True)) < 1e-2
+
+
+class Car(jk.System):
+    """A car as a bicycle model: a body of 1200 kg, and a front wheel of 200 kg that a torque steers."""
+
+    coordinates, speeds, dependent_speeds = (
+        ("x", "y", "yaw", "steer"),
+        ("forward", "steer_rate"),
+        ("sideways", "yaw_rate"),
+    )
+    inputs, units = ("force", "torque"), {"yaw": "rad", "steer": "rad"}
+
+    def motion(self, t, q, u):
+        N, _ = jk.inertial()
+        A = N.rotate(3, q["yaw"], u["yaw_rate"])
+        B = A.rotate(3, q["steer"], u["steer_rate"])
+        center = jk.Point.at(u["forward"] * A.x + u["sideways"] * A.y, q["x"] * N.x + q["y"] * N.y)
+        front, rear = center.fixed(1.5 * A.x), center.fixed(-1.5 * A.x)
+        body = jk.Body(1200.0, (0.0, 0.0, 1300.0), center, A, name="body")
+        wheel = jk.Body(200.0, (0.0, 0.0, 1300.0 / 32.0), front, B, name="wheel")
+        slips = [rear.velocity.dot(A.y), front.velocity.dot(B.y)]
+        return jk.Motion([body, wheel], slips, points={"rear": rear}, frames={"A": A})
+
+    def q_dot(self, t, q, u):
+        c, s = jnp.cos(q["yaw"]), jnp.sin(q["yaw"])
+        v, w = u["forward"], u["sideways"]
+        return c * v - s * w, s * v + c * w, u["yaw_rate"], u["steer_rate"]
+
+    def loads(self, t, q, u, motion, inputs):
+        torque = inputs["torque"] * motion.N.z
+        steering = jk.Torque(torque, motion["wheel"]), jk.Torque(-torque, motion["body"])
+        return jk.Force(inputs["force"] * motion["A"].x, motion["rear"]), *steering
+
+
+@pytest.mark.slow
+def test_a_car_is_parked_with_the_least_effort():
+    """A simulation of the plan arrives 2 m to the side. The linearized car at rest cannot, so the guess steers."""
+    still = {"yaw": 0.0, "steer": 0.0, "forward": 0.0, "steer_rate": 0.0}
+    problem = Problem(
+        Car(), 30.0, controls={"force": (-300.0, 300.0), "torque": (-50.0, 50.0)},
+        cost=lambda t, now: now["force"] ** 2 + now["torque"] ** 2, within={"steer": (-math.pi / 4, math.pi / 4)},
+        start={"x": 0.0, "y": 0.0, **still}, end={"x": 0.0, "y": 2.0, **still},
+    )  # fmt: skip
+    plan = solve(problem, {"x": [0.0, 3.0, 0.0], "steer": [0.0, 0.5, -0.5, 0.5, 0.0]})
+    assert plan.ok
+    assert plan.cost == pytest.approx(320236.0, rel=1e-4)
+    assert plan.deviation(plan.replay()) < 1e-3
+
+
+class Steamboat(jk.System):
+    """A boat of 10 kg with two wheels of 1 kg. Drag acts on the boat and on the lowest points of the wheels."""
+
+    coordinates, speeds = ("yaw", "x", "y", "left", "right"), ("yaw_rate", "vx", "vy", "left_rate", "right_rate")
+    inputs, units = ("left_torque", "right_torque"), dict.fromkeys(("yaw", "left", "right"), "rad")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["yaw"], u["yaw_rate"])
+        center = O.moving(q["x"] * N.x + q["y"] * N.y, u["vx"] * N.x + u["vy"] * N.y)
+        bodies, points = [jk.Body(10.0, (0.0, 0.0, 10.0 * 26.0 / 12.0), center, A, name="boat")], {}
+        for side, place in (("left", -1.1), ("right", 1.1)):
+            wheel, hub = A.rotate(1, q[side], u[f"{side}_rate"]), center.fixed(place * A.x, A)
+            bodies.append(jk.Body(1.0, (0.5, 0.25, 0.25), hub, wheel, name=side))
+            points[f"{side} blade"] = hub.fixed(-1.0 * A.z, wheel)
+        return jk.Motion(bodies, points=points, frames={"A": A})
+
+    def loads(self, t, q, u, motion, inputs):
+        A, boat, r = motion["A"], motion["boat"], u["yaw_rate"]
+        v = boat.center.velocity
+        loads = [jk.Force(drag(3.75, v.dot(A.x)) * A.x + drag(0.75, v.dot(A.y)) * A.y, boat)]
+        loads.append(jk.Torque((drag(0.75 * 626.0 / 32.0, r)) * A.z + 3.75 * r * A.x, boat))
+        for side in ("left", "right"):
+            blade, torque = motion[f"{side} blade"], inputs[f"{side}_torque"] * A.x
+            loads += [jk.Force(drag(0.75, blade.velocity.dot(A.y)) * A.y, blade), jk.Torque(torque, motion[side])]
+        return loads
+
+
+def drag(c, v):
+    return -c * v**2 * jnp.tanh(20.0 * v)
+
+
+@pytest.mark.weekly
+def test_a_steamboat_moves_to_the_side():
+    """The trapezoidal rule finds the motion, and the default method refines it. No other source gives a number."""
+    rest = dict.fromkeys(("yaw_rate", "vx", "vy"), 0.0)
+    still = {"left": 0.0, "right": 0.0, "left_rate": 0.0, "right_rate": 0.0}
+    problem = Problem(
+        Steamboat(), (1.0, 30.0), controls=dict.fromkeys(Steamboat.inputs, (-25.0, 25.0)),
+        cost=lambda t, now: now["left_torque"] ** 2 + now["right_torque"] ** 2, final_cost=lambda t, now: 4e4 * t,
+        start={"yaw": -math.pi / 2, "x": 0.0, "y": 0.0, **rest, **still},
+        end={"yaw": -math.pi / 2, "x": 10.0, "y": 10.0, **rest},
+    )  # fmt: skip
+    guess = {"yaw": [-1.57, -0.3, -1.57], "vx": 1.0, "vy": 1.0, "left_rate": -5.0, "right_rate": -5.0}
+    plan = solve(problem, solve(problem, guess, method="trapezoid", tolerance=1e-3))
+    assert plan.ok
+    assert plan.cost == pytest.approx(268776.6, rel=1e-4)
+    assert plan.deviation(plan.replay()) < 1e-3
+
+
+class Swing(jk.System):
+    """A pendulum with an unknown squared frequency p (Vyasarayani et al., Multibody System Dynamics 26, 2011)."""
+
+    p: jk.Scalar = jk.parameter(1.0, positive=True)
+    states = ("angle", "rate")
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return {"angle": x["rate"], "rate": -self.p * jnp.sin(x["angle"])}
+
+
+def test_the_frequency_of_a_pendulum_from_noisy_data_over_many_periods():
+    """From a tenth of its value, where shooting finds a local minimum. SciPy from the true value is the reference."""
+    t, rng = np.linspace(0.0, 50.0, 501), np.random.default_rng(0)
+
+    def simulated(p, angle, rate):
+        f = lambda t, y: [y[1], -p * np.sin(y[0])]  # noqa: E731
+        return scipy.integrate.solve_ivp(f, (0.0, 50.0), [angle, rate], "DOP853", t, rtol=1e-9, atol=1e-9).y
+
+    sigma = np.array([[0.05], [0.1]])
+    y = simulated(10.0, math.pi / 6, 0.0) + sigma * rng.normal(size=(2, 501))
+    trial = jk.fit.Trial(t, dict(zip(Swing.states, y)), sigma={"angle": 0.05, "rate": 0.1})
+    found = jk.fit.fit(Swing(), [trial], ["p"], unknown=Swing.states, transcription=jk.fit.Collocation())
+    best = scipy.optimize.least_squares(lambda v: ((simulated(*v) - y) / sigma).ravel(), [10.0, math.pi / 6, 0.0])
+    assert found.ok
+    assert abs(found.estimates["p"] - best.x[0]) < 0.5 * found.standard_errors["p"]
+    assert found.estimates["p"] == pytest.approx(10.0, abs=0.01)
+
+
+class Drone(jk.System):
+    """A box of 2 kg with four thrusts along its z axis, Euler parameters, and linear drag."""
+
+    coordinates, speeds = ("x", "y", "z", "e1", "e2", "e3", "e4"), ("vx", "vy", "vz", "wx", "wy", "wz")
+    inputs = ("F1", "F2", "F3", "F4")
+
+    def motion(self, t, q, u):
+        N, _ = jk.inertial()
+        A = N.rotate_euler(q[3:7], u[3:6])
+        center = jk.Point.at(A.vector(*u[:3]), N.vector(*q[:3]))
+        corners = zip(self.inputs, ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)))
+        points = {name: center.fixed(0.5 * x * A.x + 0.25 * y * A.y) for name, (x, y) in corners}
+        inertia = (2.0 * 0.26 / 12.0, 2.0 * 1.01 / 12.0, 2.0 * 1.25 / 12.0)
+        return jk.Motion([jk.Body(2.0, inertia, center, A, name="box")], points=points, frames={"A": A})
+
+    def q_dot(self, t, q, u):
+        N, _ = jk.inertial()
+        v = N.rotate_euler(q[3:7], u[3:6]).vector(*u[:3])
+        return *v.components_in(N), *jk.rotations.euler_parameter_rates(q[3:7], u[3:6])
+
+    def configuration_constraints(self, t, q):
+        return [jk.rotations.euler_parameter_norm(q[3:7])]
+
+    def loads(self, t, q, u, motion, inputs):
+        A, box = motion["A"], motion["box"]
+        thrusts = [jk.Force(inputs[name] * A.z, motion[name]) for name in self.inputs]
+        return jk.weight(motion, -9.81 * motion.N.z), jk.Force(-0.06 * A.vector(*u[:3]), box), *thrusts
+
+
+@pytest.mark.weekly
+def test_a_drone_passes_through_a_prescribed_attitude():
+    """The sum of thrusts must on average be the weight, so the cost is at least 10 s (2 kg 9.81 m/s^2)^2 / 4."""
+    thrusts = dict.fromkeys(Drone.inputs, (-100.0, 100.0))
+    level, rest = dict.fromkeys(("e1", "e2", "e3"), 0.0), dict.fromkeys(Drone.speeds, 0.0)
+    given = {"controls": thrusts, "cost": lambda t, now: sum(now[name] ** 2 for name in Drone.inputs)}
+    start = {"x": 0.0, "y": 0.0, "z": 0.0, **level, "e4": 1.0, **rest}
+    first = Problem(Drone(), 5.0, start=start, end=level | {"e1": math.sqrt(0.5)}, **given)
+    second = Problem(Drone(), 5.0, end={"x": 10.0, "y": 10.0, "z": 10.0, **level, **rest}, **given)
+    plan = solve(jk.collocation.Phases([first, second], links=[None]))
+    assert plan.ok
+    assert 10.0 * (2.0 * 9.81) ** 2 / 4.0 < plan.cost < 1018.0
+    norms = [np.sum(np.square([part[name] for name in ("e1", "e2", "e3", "e4")]), axis=0) for part in plan.phases]
+    assert np.max(np.abs(np.concatenate(norms) - 1.0)) < 1e-4
+
+
+F0, L0, TENDON, FASTEST = 30.0, 0.10, 0.05, 10.0  # [N], [m], [m], [1/s]
+D1, D2, D3, D4 = -0.3211346127989808, -8.149, -0.374, 0.8825327733249912  # De Groote et al. (2016), as in Moco
+
+
+class Muscle(jk.System):
+    """A mass on a Hill muscle with activation, fibre and elastic tendon. The rate of the fibre is an input: an
+    algebraic variable."""
+
+    coordinates, speeds, states = ("x",), ("v",), ("activation", "fibre")
+    inputs, units = ("excitation", "lengthening"), {"x": "m"}
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(0.5, 0.0, O.moving(-q["x"] * N.y, -u["v"] * N.y), N, name="mass")])
+
+    def loads(self, t, q, u, motion, inputs):
+        force = F0 * tendon_force(q["x"], inputs["fibre"])
+        return jk.weight(motion, -9.81 * motion.N.y), jk.Force(force * motion.N.y, motion["mass"])
+
+    def state_rates(self, t, q, u, x, motion, now):
+        more = now["excitation"] - x["activation"]
+        rises = 0.5 + 0.5 * jnp.tanh(10.0 * more)
+        return {"activation": more * (rises / 0.015 + (1.0 - rises) / 0.06), "fibre": FASTEST * now["lengthening"]}
+
+
+def tendon_force(x, fibre):
+    return 0.2 * jnp.exp(35.0 * ((x - L0 * fibre) / TENDON - 0.995)) - 0.25
+
+
+def balance(t, now):
+    length, z = now["fibre"], D2 * now["lengthening"] + D3
+    active = now["activation"] * jnp.exp(-(((length - 1.0) / 0.45) ** 2)) * (D1 * jnp.arcsinh(z) + D4)
+    passive = (jnp.exp(4.0 * (length - 1.0) / 0.6) - 1.0) / (math.exp(4.0) - 1.0)
+    return {"tendon": (active + passive - tendon_force(now["x"], length), 0.0, 0.0)}
+
+
+def lifting(duration, **arguments):
+    """A mass is lifted by 1 cm."""
+    return Problem(
+        Muscle(), duration, controls={"excitation": (0.01, 1.0), "lengthening": (-1.0, 1.0)}, path=balance,
+        within={"x": (0.14, 0.16), "v": (-1.0, 1.0), "activation": (0.01, 1.0), "fibre": (0.2, 1.8)},
+        start={"x": 0.15, "v": 0.0, "activation": 0.01}, end={"x": 0.14, "v": 0.0}, **arguments,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_hill_muscle_lifts_a_mass_in_the_shortest_time():
+    """With 20 intervals, two meshes alternated while neighbouring intervals were merged each time."""
+    for intervals in (20, 50):
+        plan = solve(lifting((0.05, 1.0), final_cost=time), intervals=intervals)
+        assert plan.ok
+        assert plan.duration == pytest.approx(0.096132, abs=6e-6)  # the figure with a tolerance of 1e-7
+
+
+@pytest.mark.weekly
+def test_a_control_that_oscillates_from_node_to_node_is_named():
+    """The activation rises faster than it falls, so rapid changes of the excitation are of advantage."""
+    plan = solve(lifting(0.5, cost=lambda t, now: now["activation"] ** 2))
+    assert not plan.ok
+    assert "excitation oscillates from node to node" in plan.reason

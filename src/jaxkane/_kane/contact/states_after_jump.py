@@ -425,8 +425,8 @@ def _changed(
             kept = jax.lax.stop_gradient(jnp.where(is_sliding, jnp.stack([first_slow, error], axis=1), 0.0))
     new = ContactMemory(states, directions, kept)
     u = projected_speeds(layout, after, new, second.u)
-    # Gaps of closed contacts drift by the error of the solver. This is corrected where another contact closes: if a slip
-    # began at other coordinates, the friction would not be at its limit, and the slip would end at once.
+    # Gaps of closed contacts drift by the error of the solver. This is corrected where another contact closes: if a
+    # slip began at other coordinates, the friction would not be at its limit, and the slip would end at once.
     closes = first.takes_part & (event.touches | first.near)
     touching = (closes | (first.takes_part & first.closed & jnp.any(closes))) & ~event.is_start
     q = without_gaps(after, touching, state.q)
