@@ -734,26 +734,30 @@ def scales_of(layout: Layout, block: EvaluatedBlock, x: np.ndarray) -> np.ndarra
     # Without units, a place of 1 and a force of 1e18 are not comparable, but the forces are.
     groups = (*names_of(problem.system), variables.controls)
     kinds = [(next(i for i, group in enumerate(groups) if name in group), units.get(name, "")) for name in names]
-    for kind in {*kinds}:
-        same = np.array([each == kind for each in kinds])
-        sizes[same & (sizes < 1e-8 * np.max(sizes[same]))] = 0.0  # rounding errors
     angles = np.array([units.get(name, "") == "rad" for name in names])
-    sizes[angles & (sizes == 0)] = 0.3
     # dF/dx at the nodes, where F is duration * y_dot
     slopes = np.zeros((variables.n_y, len(names)))
     entries = np.max(np.abs(block.jacobian(x)), axis=0, initial=0.0)
     for row, column, slope in zip(block.pattern.rows, block.pattern.columns, entries, strict=True):
         if column < len(names) and math.isfinite(slope):
             slopes[row, column] = slope
+    # Rounding errors are no sizes. A roll angle of 1e-32 couples the steer torque of a bicycle to its wheels, by 1e-33.
+    for kind in {*kinds}:
+        same = np.array([each == kind for each in kinds])
+        sizes[same & (sizes < 1e-8 * np.max(sizes[same]))] = 0.0
+        rows = same[: variables.n_y, None]
+        slopes[rows & (slopes < 1e-8 * np.max(slopes, axis=0, where=rows, initial=0.0))] = 0.0
+    sizes[angles & (sizes == 0)] = 0.3
     changes = np.max(np.abs(block.values(x)), axis=0)  # over the whole duration, with the present rates
     for _ in range(len(names)):
         known = sizes[: variables.n_y] > 0
         typical = np.maximum(changes, sizes[: variables.n_y])
         new = sizes.copy()
         for i in np.nonzero(sizes == 0)[0]:
-            usable = known & (slopes[:, i] > 0)
+            effects = np.where(known, slopes[:, i], 0.0) / np.where(known, typical, 1.0)
+            usable = effects > 1e-8 * np.max(effects)
             if usable.any():
-                new[i] = np.exp(np.mean(np.log(typical[usable] / slopes[usable, i])))
+                new[i] = np.exp(-np.mean(np.log(effects[usable])))
         if np.array_equal(new, sizes):  # no rate depends on the others: their sizes are those of their own rates
             for i in np.nonzero(sizes[: variables.n_y] == 0)[0]:
                 new[i] = np.max(slopes[i] * sizes)

@@ -21,7 +21,7 @@ from .._integrate.trajectory import Trajectory
 from .._kane.arguments import check_is_system, is_concrete, refuse_multipliers
 from .._kane.checks import check_system
 from .._kane.consistent_state import assemble
-from .._kane.constraint_residuals import check_state, configuration_residual
+from .._kane.constraint_residuals import check_state, configuration_residual, projected
 from .._kane.contact.forces import has_contacts
 from .._kane.right_hand_side import output_names, vector_field
 from .._scalarjit.cache_key import captured_tracers, jit
@@ -433,14 +433,15 @@ def _automatic(problem: Problem, s: np.ndarray, duration: float, ends: np.ndarra
     moving = start + duration * np.where(np.arange(len(names)) < n_q, y_dot, 0.0)
     moving = np.where(np.isfinite(moving), moving, start)
     end = np.where(np.isnan(last), np.where(np.isnan(first), start, moving), last)
-    if np.isfinite(last[:n_q]).any():
-        end = _assembled(problem, end, last)
+    if problem.n_constraints and np.isfinite(last[:n_q]).any():
+        # Not by `assemble`, which sets unknown coordinates to zero, such as the distance that a bicycle travels.
+        end[:n_q] = projected(system, 0.0, jnp.asarray(end[:n_q]))
     Y = start + s[:, None] * (end - start)
     return Y, np.tile(W0, (len(s), 1))
 
 
 def _assembled(problem: Problem, start: np.ndarray, given: np.ndarray) -> np.ndarray:
-    """The start or end with coordinates that satisfy the configuration constraints."""
+    """The start with coordinates that satisfy the configuration constraints."""
     system, n_q = problem.system, len(problem.system.coordinates)
     if not problem.n_constraints or np.all(np.isfinite(given[:n_q])):
         return start
