@@ -291,7 +291,7 @@ class _Search:
             new, tolerance = None, None if transcription.unresolved else self.tolerance  # no mesh would help
             if errors is not None and tolerance is not None and any(np.max(e) > tolerance for e in errors):
                 new = [
-                    refined(mesh, e, tolerance, self.method.order, merges=len(costs) < 3)
+                    refined(mesh, e, tolerance, self.method.order, merges=len(costs) < 6)
                     if np.max(e) > tolerance
                     else mesh
                     for mesh, e in zip(meshes, errors, strict=True)
