@@ -265,7 +265,8 @@ class NonlinearProgram:
     def objective(self, z: np.ndarray) -> float:
         """The scaled cost at scaled variables."""
         values = self._remembered(EvaluatedBlock.values, z)
-        f = sum(w @ v.ravel() for w, v in zip(self._weights, values, strict=True)) / self.f_scale
+        with np.errstate(invalid="ignore"):  # the solver tries shorter steps if the cost is infinite
+            f = sum(w @ v.ravel() for w, v in zip(self._weights, values, strict=True)) / self.f_scale
         return float(f + np.sum(self.slope * z))  # `@` would start the threads of BLAS, for 0.2 of 0.5 s
 
     def gradient(self, z: np.ndarray, blocks: Sequence[int] | None = None) -> np.ndarray:

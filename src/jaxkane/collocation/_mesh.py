@@ -241,10 +241,16 @@ _JUMP = 1 / 3
 
 
 def oscillating(layout: Layout, motion: Motion) -> list[str]:
-    """The names of controls whose second differences change their sign from node to node."""
+    """The names of controls that oscillate from node to node, by two ratios.
+
+    That of the second differences is 2 for a smooth control, 1 for jumps, 0.8 for noise, and 0 if all signs alternate.
+    The mean change between nodes is a tenth of the range for 20 nodes per period, and a third for random jumps between
+    two bounds.
+    """
     D = np.diff(motion.W, 2, axis=0)
-    alternates = np.sum(np.abs(D[1:] + D[:-1]), axis=0) < 0.5 * np.sum(np.abs(D), axis=0)
-    return [name for name, x in zip(layout.variables.controls, alternates, strict=True) if x]
+    alternates = np.sum(np.abs(D[1:] + D[:-1]), axis=0) < 0.9 * np.sum(np.abs(D), axis=0)
+    jumps = np.mean(np.abs(np.diff(motion.W, axis=0)), axis=0) > 0.2 * np.ptp(motion.W, axis=0)
+    return [name for name, x in zip(layout.variables.controls, alternates | jumps, strict=True) if x]
 
 
 def quadrature_errors(layout: Layout, x: np.ndarray, motion: Motion, method: Lobatto) -> np.ndarray:

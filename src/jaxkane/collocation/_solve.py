@@ -37,7 +37,7 @@ from ._problem import Phases, Problem, boundaries, detoured, detours, guess_of
 Guess: TypeAlias = Plan | Trajectory | Mapping[str, Any] | Sequence[Any] | None
 """A guess of a motion, or a sequence of guesses."""
 
-MAX_MESHES = 10
+MAX_MESHES = 15
 COARSE = 1e-2
 """The largest local error with which a plan on a mesh that is not refined is `ok`."""
 
@@ -319,7 +319,7 @@ class _Search:
         costs: Sequence[float],
     ) -> Plan:
         """The plan of a solution whose mesh should be finer, with the status of the finer mesh."""
-        hint = "pass more `intervals`"
+        hint = _remedy(transcription, solution.z * transcription.x_scale, "pass more `intervals`")
         reason = status if status == INTERRUPTED else f"solved, but not on a finer mesh: {status}; {hint}"
         solution = dataclasses.replace(solution, ok=False, status=reason)
         return self._plan(transcription, solution, errors, costs, False)
@@ -389,10 +389,7 @@ class _Search:
         elif ok and self.tolerance is None and worst > COARSE:
             ok, reason = False, f"solved, but the local error is {worst:.1e}: pass more `intervals` or a `tolerance`"
         elif ok and is_coarse:
-            pairs = zip(transcription.layouts, transcription.motions(x), strict=True)
-            names = ", ".join(name for pair in pairs for name in oscillating(*pair))
-            hint = f"{names} oscillates from node to node: increase its cost, or the cost of its rate"
-            hint = hint if names else "pass a larger `tolerance` or other bounds"
+            hint = _remedy(transcription, x, "pass a larger `tolerance` or other bounds")
             ok, reason = False, f"solved, but the local error is {worst:.1e} instead of {self.tolerance:g}: {hint}"
         elif ok and program.violation(solution.z) > 1e-6:
             ok, reason = False, f"dropped constraints are violated: {', '.join(transcription.implied)}"
@@ -453,6 +450,17 @@ class _Search:
             scales=transcription.x_scale[layout.node(0)],
             **common,
         )
+
+
+def _remedy(transcription: Transcription, x: np.ndarray, otherwise: str) -> str:
+    """What to do about local errors that remain at variables (n,): controls may oscillate, or `otherwise`."""
+    pairs = zip(transcription.layouts, transcription.motions(x), strict=True)
+    names = ", ".join(name for pair in pairs for name in oscillating(*pair))
+    return (
+        f"{names} oscillates from node to node: bound it, or increase its cost or that of its rate"
+        if names
+        else otherwise
+    )
 
 
 def _is_similar(problem: Problem, guess: Guess) -> bool:
