@@ -53,7 +53,7 @@ def test_a_range_at_the_end_does_not_replace_the_bounds_along_the_motion():
     assert np.min(plan["v"]) >= -atol
 
 
-def test_a_stationary_motion_that_is_not_a_minimum_is_not_ok():
+def test_the_search_leaves_a_stationary_motion_that_is_not_a_minimum():
     """Rest is stationary by symmetry. In 4 s (less than 4.73 s, by cos s cosh s = 1) it is the minimum, in 6 s not."""
 
     def problem(duration):
@@ -64,11 +64,11 @@ def test_a_stationary_motion_that_is_not_a_minimum_is_not_ok():
 
     short = solve(problem(4.0), intervals=10, tolerance=None)
     assert short.ok
+    assert short.cost == 0.0
     long = solve(problem(6.0), intervals=10, tolerance=None)
-    assert not long.ok
-    assert long.cost == 0.0
-    assert long.reason == "stationary, but not a minimum: pass another guess"
-    assert solve(problem(6.0), {"x": [0.0, 1.0, 0.0]}, intervals=10, tolerance=None).cost < -10.0
+    assert long.ok
+    assert long.cost < -10.0
+    assert long.cost == pytest.approx(solve(problem(6.0), {"x": [0.0, 1.0, 0.0]}, intervals=10, tolerance=None).cost)
 
 
 def test_a_plan_on_a_coarse_mesh_is_not_ok():

@@ -317,22 +317,38 @@ def _callback(
 NOT_A_MINIMUM = "stationary, but not a minimum: pass another guess"
 
 
-def refused_unless_minimum(program: NonlinearProgram, border: np.ndarray, solution: Solution) -> Solution:
-    """The solution, with the status `NOT_A_MINIMUM` if it is stationary but not a minimum.
+def minimum(
+    program: NonlinearProgram,
+    z: np.ndarray,
+    border: np.ndarray,
+    effort: Effort,
+    *,
+    is_warm: bool = False,
+    options: Mapping[str, Any] | None = None,
+) -> Solution:
+    """Solve a program by IPOPT. At a saddle point, often due to symmetry, continue in a direction in which it falls.
 
-    **Arguments:**
+    If this does not lower the cost, the status is `NOT_A_MINIMUM`.
 
-    - `program`: the nonlinear program.
+    **Arguments:** as in `minimized`, and
+
     - `border`: the indices of the variables that occur in the equations of all nodes.
-    - `solution`: the result of a solver.
     """
-    if solution.ok and not solution.is_convex and _has_negative_curvature(program, border, solution):
-        return dataclasses.replace(solution, ok=False, status=NOT_A_MINIMUM)
+    solution = minimized(program, z, effort, is_warm=is_warm, options=options)
+    while (d := _downwards(program, border, solution)) is not None:
+        beside = np.clip(solution.z + d, program.lower, program.upper)
+        better = minimized(program, beside, effort, is_warm=True, options=options)
+        if not better.ok or not program.objective(better.z) < program.objective(solution.z):
+            return dataclasses.replace(solution, ok=False, status=NOT_A_MINIMUM)
+        solution = better
     return solution
 
 
-def _has_negative_curvature(program: NonlinearProgram, border: np.ndarray, solution: Solution) -> bool:
-    """Whether the curvature along a direction of the active constraints is negative beyond rounding errors."""
+def _downwards(program: NonlinearProgram, border: np.ndarray, solution: Solution) -> np.ndarray | None:
+    """A step (n,) along the active constraints, at most a tenth of a variable's size, by which the cost falls beyond
+    rounding errors. None at a minimum, and if there is no solution."""
+    if not solution.ok or solution.is_convex:
+        return None
     z, g = solution.z, program.constraints(solution.z)
     free = ~_at_bound(z, program.lower, program.upper, solution.bound_multipliers)
     active = _at_bound(g, program.g_lower, program.g_upper, solution.multipliers)
@@ -341,7 +357,7 @@ def _has_negative_curvature(program: NonlinearProgram, border: np.ndarray, solut
     project = _Projection(J[active][:, free], is_border, program.places[free])
     v = project(project(np.random.default_rng(0).normal(size=int(free.sum()))))
     if not np.linalg.norm(v) > 1e-3:  # the constraints determine all variables
-        return False
+        return None
     V, diagonal, beside = np.zeros((min(_STEPS, v.size) + 1, v.size)), [], []
     V[0] = v / np.linalg.norm(v)
     for k in range(len(V) - 1):
@@ -357,8 +373,15 @@ def _has_negative_curvature(program: NonlinearProgram, border: np.ndarray, solut
     # The direction is a proof, whether or not Lanczos converged, if it meets the constraints: steps beyond the number
     # of directions add vectors of rounding errors, which the projection removes.
     d = project(V[: len(diagonal)].T @ vectors[:, 0])
-    negligible = max(1e-7 * float(np.max(np.abs(H.data), initial=0.0)), 1e-8)
-    return bool(abs(np.linalg.norm(d) - 1.0) < 1e-3 and d @ (H @ d) < -negligible)
+    if abs(np.linalg.norm(d) - 1.0) > 1e-3:
+        return None
+    d *= 0.1 / np.max(np.abs(d))
+    rounding = max(1e-7 * float(np.max(np.abs(H.data), initial=0.0)), 1e-8)
+    if d @ (H @ d) > -max(rounding * (d @ d), 1e-7):
+        return None
+    found = np.zeros(program.n)
+    found[free] = d
+    return found
 
 
 _STEPS = 80  # of the method of Lanczos

@@ -23,7 +23,7 @@ from .._collocate.solvers import (
     Solution,
     casadi,
     minimized,
-    refused_unless_minimum,
+    minimum,
 )
 from .._collocate.transcription import Motion, Transcription, nodes_of, system_at
 from .._common.lookup import positive_number
@@ -335,9 +335,8 @@ class _Search:
         return Transcription(phases, links, meshes, self.method, motions, theta, sizes=sizes)
 
     def _solved(self, transcription: Transcription, is_warm: bool) -> Solution:
-        program = transcription.program
-        solution = minimized(program, transcription.z, self.effort, is_warm=is_warm, options=self.options)
-        return refused_unless_minimum(program, transcription.shared, solution)
+        program, border = transcription.program, transcription.shared
+        return minimum(program, transcription.z, border, self.effort, is_warm=is_warm, options=self.options)
 
     def _conflict(self, transcription: Transcription, solution: Solution) -> tuple[str, ...]:
         """The cause of an infeasible problem, from an elastic one: equations of motion are violated first."""

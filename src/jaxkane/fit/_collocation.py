@@ -47,8 +47,7 @@ from .._collocate.solvers import (
     Solution,
     banded_order,
     casadi,
-    minimized,
-    refused_unless_minimum,
+    minimum,
 )
 from .._collocate.transcription import Layout, Transcription
 from .._common.lookup import positive_number, refuse_unknown
@@ -367,8 +366,7 @@ def solved(problem: Problem, how: Collocation, effort: Effort) -> CollocationFit
     shared, local = transcription.shared_parameters, transcription.local_parameters
     if densities:  # first the motion for the initial guess of the parameters
         program = with_fixed(program, shared, transcription.z)
-    solution = minimized(program, transcription.z, effort)
-    solution = refused_unless_minimum(program, transcription.shared, solution)
+    solution = minimum(program, transcription.z, transcription.shared, effort)
     if densities and solution.ok:
         point, covariance, ok = Marginal(transcription, shared, local).minimum(solution, effort)
         status = "the largest number of steps of the parameters was reached"
