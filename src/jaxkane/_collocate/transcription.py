@@ -755,7 +755,8 @@ def scales_of(layout: Layout, block: EvaluatedBlock, x: np.ndarray) -> np.ndarra
         new = sizes.copy()
         for i in np.nonzero(sizes == 0)[0]:
             effects = np.where(known, slopes[:, i], 0.0) / np.where(known, typical, 1.0)
-            usable = effects > 1e-8 * np.max(effects)
+            largest = max(size for size, kind in zip(sizes, kinds, strict=True) if kind == kinds[i])
+            usable = effects > max(1e-8 * np.max(effects), 1e-8 / largest if largest > 0 else 0.0)
             if usable.any():
                 new[i] = np.exp(-np.mean(np.log(effects[usable])))
         if np.array_equal(new, sizes):  # no rate depends on the others: their sizes are those of their own rates
