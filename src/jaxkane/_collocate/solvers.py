@@ -345,8 +345,10 @@ def minimum(
 
 
 def _downwards(program: NonlinearProgram, border: np.ndarray, solution: Solution) -> np.ndarray | None:
-    """A step (n,) along the active constraints, at most a tenth of a variable's size, by which the cost falls beyond
-    rounding errors. None at a minimum, and if there is no solution."""
+    """A step (n,) along the active constraints that lowers the cost by more than rounding errors.
+
+    It changes no variable by more than a tenth of its size. It is None at a minimum, or if there is no solution.
+    """
     if not solution.ok or solution.is_convex:
         return None
     z, g = solution.z, program.constraints(solution.z)

@@ -741,7 +741,8 @@ def scales_of(layout: Layout, block: EvaluatedBlock, x: np.ndarray) -> np.ndarra
     for row, column, slope in zip(block.pattern.rows, block.pattern.columns, entries, strict=True):
         if column < len(names) and math.isfinite(slope):
             slopes[row, column] = slope
-    # Rounding errors are no sizes. A roll angle of 1e-32 couples the steer torque of a bicycle to its wheels, by 1e-33.
+    # A size must not follow from a rounding error. With a roll angle of 1e-32 in the guess, the steer torque of a
+    # bicycle turns its wheels by 1e-33.
     for kind in {*kinds}:
         same = np.array([each == kind for each in kinds])
         sizes[same & (sizes < 1e-8 * np.max(sizes[same]))] = 0.0
