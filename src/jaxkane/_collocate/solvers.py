@@ -328,7 +328,7 @@ def minimum(
 ) -> Solution:
     """Solve a program by IPOPT. At a saddle point, often due to symmetry, continue in a direction in which it falls.
 
-    If this does not lower the cost, the status is `NOT_A_MINIMUM`.
+    If this does not lower the cost, the status is `NOT_A_MINIMUM`, unless the search was interrupted or its time is up.
 
     **Arguments:** as in `minimized`, and
 
@@ -339,7 +339,8 @@ def minimum(
         beside = np.clip(solution.z + d, program.lower, program.upper)
         better = minimized(program, beside, effort, is_warm=True, options=options)
         if not better.ok or not program.objective(better.z) < program.objective(solution.z):
-            return dataclasses.replace(solution, ok=False, status=NOT_A_MINIMUM)
+            status = better.status if better.status in (INTERRUPTED, TIME_IS_UP) else NOT_A_MINIMUM
+            return dataclasses.replace(solution, ok=False, status=status)
         solution = better
     return solution
 
