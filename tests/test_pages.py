@@ -175,6 +175,9 @@ SEARCHED = {
     "sparse": "optimal_control#Solver", "debugging NaN": "numerics#NaN", "float32": "numerics#Floating-point",
     "tutorial": "index#Getting started", "getting started": "index#Getting started", "memory": "caching#When programs",
     "muscles": "sensors#First-order states",
+    "natural frequency": "stability#Eigenvalues", "PID": "describing#Parameters", "MPC": "optimal_control#Replay",
+    "Monte Carlo": "sweeps#Parameter", "pickle": "simulation#Simulation", "computed torque": "inverse_dynamics#Joint",
+    "inverse kinematics": "joints#Inverse", "CSV": "fit#Trials", "bang-bang": "optimal_control#Free duration",
 }  # fmt: skip
 
 
