@@ -61,6 +61,13 @@ def test_wrong_arguments_of_a_problem(name):
     assert message in str(error.value)
 
 
+def test_a_start_as_a_state_by_name_equals_one_with_arrays():
+    by_name, arrays = jk.State({}, {"v": 0.5}), jk.State([0.0], [0.5])
+    assert problem(start=by_name).ends == problem(start=arrays).ends
+    with pytest.raises(ValueError, match="Sled: q has no v; it has x"):
+        problem(start=jk.State({"v": 0.5}, {}))
+
+
 class Counted(Sled):
     count: int = eqx.field(static=True, default=2)
 

@@ -17,6 +17,7 @@ from .._collocate.transcription import Motion, PhaseProblem
 from .._common.lookup import as_names, real_number, refuse_unknown
 from .._integrate.inputs import as_signals, is_samples
 from .._integrate.jumps import names_of_jumps
+from .._integrate.simulate import as_state
 from .._integrate.trajectory import Trajectory
 from .._kane.arguments import check_is_system, is_concrete, refuse_multipliers
 from .._kane.checks import check_system
@@ -235,7 +236,7 @@ class Problem(PhaseProblem):
         for label in ("start", "end"):
             given = getattr(self, label)
             if isinstance(given, State):
-                y = np.asarray(packed(given), float)
+                y = np.asarray(packed(as_state(self.system, given)), float)
                 if y.shape != (len(self.names),) or not np.all(np.isfinite(y)):
                     raise ValueError(
                         f"Problem: `{label}` must be a State with finite numbers for {', '.join(self.names)}; got "
