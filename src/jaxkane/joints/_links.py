@@ -116,8 +116,8 @@ class Loop:
     """A loop closure: two sites that coincide. With `rigid` their orientations coincide too, and may not differ by half
     a turn.
 
-    Only independent residuals are used, determined at trial coordinates. A spatial loop has three (six if rigid), a
-    planar loop two (three).
+    Only independent residuals are used, chosen at the `pose` of the mechanism. A spatial loop has three (six if rigid),
+    a planar loop two (three).
     """
 
     first: str
@@ -164,7 +164,7 @@ def mechanism(
     - `sites`: named points.
     - `loops`: closed loops, `Loop` and `Coupling`. They become configuration constraints and velocity residuals.
     - `dependent`: the hinges and sliders that are solved for, one for each residual. Default: the best-conditioned
-        choice at trial coordinates.
+        choice at the `pose`.
     - `independent`: joints that are not solved for, e.g. those with motors.
     - `pose`: coordinates by name at which loops are closed approximately. Independent residuals and dependent joints
         are chosen there. Default: near zero coordinates. Residuals that nearly depend on others there are omitted with

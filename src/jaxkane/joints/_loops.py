@@ -422,7 +422,7 @@ class _Trial:
             listed = ", ".join(f"{origins[i]} ({h[i] * self.residual_units[i]:.2g})" for i in redundant)
             warnings.warn(
                 f"{self.structure.name}: these loops have residuals that nearly depend on the others and are omitted "
-                f"(their sizes at trial coordinates in brackets): {listed}.",
+                f"(their sizes at the pose in brackets): {listed}.",
                 UserWarning,
                 stacklevel=5,
             )
