@@ -178,6 +178,7 @@ SEARCHED = {
     "natural frequency": "stability#Eigenvalues", "PID": "describing#Parameters", "MPC": "optimal_control#Replay",
     "Monte Carlo": "sweeps#Parameter", "pickle": "simulation#Simulation", "computed torque": "inverse_dynamics#Joint",
     "inverse kinematics": "joints#Inverse", "CSV": "fit#Trials", "bang-bang": "optimal_control#Free duration",
+    "Sobol": "sweeps#Parameter", "suspension": "index#What it does", "xacro": "bringing_models#URDF",
 }  # fmt: skip
 
 
