@@ -463,7 +463,7 @@ def forward_selection(
         `Candidate`. A `Candidate` combines several of these, or is another system. Each starts where it does not change
         the model.
     - `remove`: names of free parameters that may be removed, or replaced by a candidate, if held-out trials are then
-        predicted better. A parameter that is removed has the value of the system.
+        predicted better. A parameter that is removed keeps its value in the system that was passed to `fit`.
     - `exchange`: whether to also remove and replace selected candidates, and to test pairs if no single candidate is
         accepted. Single candidates and pairs then share `level`. Requires two trials.
     - `depth`: largest number of candidates that are selected.
